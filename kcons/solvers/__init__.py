@@ -1,0 +1,1 @@
+"""Per-cluster solvers: one shape a file; all Numba kernels live here."""
