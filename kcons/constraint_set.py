@@ -1,0 +1,385 @@
+"""Many constraints as one sigma, A and b.
+
+Packs the rows of any number of constraint objects; gives values, a sparse Jacobian and the right-hand
+sides of A v = c and A a = b. It reads only the atoms that a row touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.errors import ConstraintError, InputError
+
+
+class ConstraintSet:
+    """All that is held in one system.
+
+    Parameters
+    ----------
+    constraints : iterable of Constraint
+        What is held. Targets left at None are taken from `positions`.
+    positions : array_like, shape (n_atoms, 3)
+        Initial positions, any consistent unit of length.
+    masses : array_like, shape (n_atoms,)
+        Masses; positive for every constrained atom.
+    cell : array_like, shape (3, 3) or (3,), optional
+        Lattice vectors as rows, or the lengths of an orthorhombic box. Rows that depend on
+        differences of positions then use minimum images.
+    pbc : bool or sequence of three bool
+        Which lattice vectors are periodic; ignored without a cell.
+    time : float
+        Time at which targets are taken from the positions.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, NaN or infinity, unknown atoms, masses that are not positive, a degenerate cell,
+        a periodic row longer than half the box.
+    ConstraintError
+        A row that is undefined at `positions` or cannot be fulfilled.
+
+    References
+    ----------
+    Notes, eqs. 81-92.
+    """
+
+    def __init__(
+        self,
+        constraints: Iterable[Constraint] | Constraint,
+        positions: ArrayLike,
+        masses: ArrayLike,
+        *,
+        cell: ArrayLike | None = None,
+        pbc: bool | Sequence[bool] = True,
+        time: float = 0.0,
+    ) -> None:
+        given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        for item in given:
+            if not isinstance(item, Constraint):
+                raise InputError(f"{item!r} is no kcons constraint", item="constraints")
+        x = _array(positions, "positions")
+        if x.ndim != 2 or x.shape[1] != 3:
+            raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
+        m = _array(masses, "masses")
+        if m.shape != (len(x),):
+            raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
+        self.n_atoms = len(x)
+        self.masses = m
+        self._set_cell(cell, pbc)
+        self._check_atoms(given, x, m)
+
+        self.constraints: tuple[Constraint, ...] = ()
+        starts = np.concatenate([[0], np.cumsum([c.n_rows for c in given], dtype=np.int64)])
+        self.starts: IntArray = starts.astype(np.int64)
+        bound: list[Constraint] = []
+        for start, item in zip(self.starts, given, strict=False):
+            r = self.gather(item, x)
+            item = item.with_masses(m[item.atoms])
+            item.check(r, time, int(start))
+            if item.target is None:
+                item = item.with_target(item.measure(r, time) if item.holonomic else np.zeros(item.n_rows))
+            self._check_half_box(item, int(start), time)
+            bound.append(item)
+        self.constraints = tuple(bound)
+
+    # -- construction ---------------------------------------------------------------------------
+
+    def _set_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool]) -> None:
+        self.lattice: FloatArray | None = None
+        if cell is None:
+            return
+        matrix = _array(cell, "cell")
+        if matrix.shape == (3,):
+            matrix = np.diag(matrix)
+        if matrix.shape != (3, 3):
+            raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
+        periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
+        if not np.all(np.isfinite(matrix)):
+            raise InputError("cell has a NaN or infinity", item="cell")
+        if not periodic.any():
+            return
+        # Directions without periodicity need any independent vector for the inverse to exist.
+        full = _completed(matrix, periodic)
+        inverse = np.linalg.inv(full)
+        inverse[:, ~periodic] = 0.0
+        self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
+
+    def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
+        """Change the cell in place (barostats); targets are unchanged."""
+        self._set_cell(cell, pbc)
+
+    @property
+    def half_width(self) -> float:
+        """Half the smallest perpendicular width of the periodic cell; infinite without one."""
+        if self.lattice is None:
+            return np.inf
+        norms = np.linalg.norm(self.lattice[1], axis=0)
+        return 0.5 / float(norms.max())
+
+    def _check_half_box(self, item: Constraint, start: int, time: float) -> None:
+        if self.lattice is None or item.family != "Distance":
+            return
+        target = item.target.at(time, item.n_rows) if isinstance(item.target, MovingTarget) else item.target
+        assert target is not None
+        too_long = np.flatnonzero(target >= self.half_width)
+        if too_long.size:
+            k = int(too_long[0])
+            raise InputError(
+                f"row {start + k}, {item.row_name(k)}: target {target[k]:g} is not shorter than half the box "
+                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or no cell",
+                item="target",
+                atoms=item.atoms[k],
+            )
+
+    def _check_atoms(self, given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
+        start = 0
+        for item in given:
+            atoms = item.atoms
+            if atoms.size and atoms.max() >= self.n_atoms:
+                row, slot = np.argwhere(atoms >= self.n_atoms)[0]
+                raise InputError(
+                    f"row {start + row}, {item.row_name(int(row))}: there is no atom {atoms[row, slot]}; "
+                    f"the system has atoms 0 to {self.n_atoms - 1}",
+                    item="atoms",
+                    atoms=atoms[row],
+                )
+            used = atoms.ravel()
+            bad = ~np.isfinite(x[used]).all(axis=1)
+            if bad.any():
+                atom = int(used[np.argmax(bad)])
+                raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
+            bad = ~(np.isfinite(m[used]) & (m[used] > 0))
+            if item.family == "FixedAtoms":
+                bad = ~np.isfinite(m[used]) | (m[used] < 0)
+            if bad.any():
+                atom = int(used[np.argmax(bad)])
+                raise InputError(
+                    f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
+                    "(hold it with FixedAtoms, or make it a virtual site)",
+                    item="masses",
+                    atoms=[atom],
+                )
+            start += item.n_rows
+
+    # -- rows -----------------------------------------------------------------------------------
+
+    @property
+    def n_rows(self) -> int:
+        return int(self.starts[-1])
+
+    @property
+    def moving(self) -> bool:
+        """Whether any row depends on time explicitly."""
+        return any(c.moving for c in self.constraints)
+
+    @cached_property
+    def holonomic(self) -> NDArray[np.bool_]:
+        """True for position rows, False for velocity rows, shape (n_rows,)."""
+        return np.concatenate([np.full(c.n_rows, c.holonomic) for c in self.constraints] or [np.zeros(0, bool)])
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """Natural size of each row (the length held, 1 radian for angles), shape (n_rows,)."""
+        return np.concatenate([c.scale() for c in self.constraints] or [np.zeros(0)])
+
+    def locate(self, row: int) -> tuple[Constraint, int]:
+        """The constraint object that holds `row`, and the row's number within it."""
+        k = int(np.searchsorted(self.starts, row, side="right")) - 1
+        return self.constraints[k], int(row - self.starts[k])
+
+    def row_name(self, row: int) -> str:
+        """For example '#3 Distance(4, 5)'."""
+        item, k = self.locate(row)
+        return f"#{row} {item.row_name(k)}"
+
+    def row_atoms(self, row: int) -> IntArray:
+        """Atoms of one row."""
+        item, k = self.locate(row)
+        return item.atoms[k]
+
+    @cached_property
+    def incidence(self) -> sp.csr_array:
+        """Which row touches which atom, shape (n_rows, n_atoms), entries 1."""
+        columns = np.concatenate([c.atoms.ravel() for c in self.constraints] or [np.zeros(0, np.int64)])
+        widths = np.concatenate(
+            [np.full(c.n_rows, c.width, dtype=np.int64) for c in self.constraints] or [np.zeros(0, np.int64)]
+        )
+        indptr = np.concatenate([[0], np.cumsum(widths)])
+        return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
+
+    # -- sigma, A, b ----------------------------------------------------------------------------
+
+    def minimum_image(self, d: FloatArray) -> FloatArray:
+        """Shortest periodic images of difference vectors, shape (..., 3)."""
+        if self.lattice is None:
+            return d
+        return d - np.round(d @ self.lattice[1]) @ self.lattice[0]
+
+    def gather(self, item: Constraint, x: FloatArray) -> FloatArray:
+        """Positions of a constraint's atoms, shape (n_rows, width, 3), made whole across the boundary."""
+        r = x[item.atoms]
+        if self.lattice is not None and item.translation_invariant and item.width > 1:
+            steps = self.minimum_image(np.diff(r, axis=1))
+            r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
+        return r
+
+    def target(self, time: float = 0.0) -> FloatArray:
+        """What each row is held at, shape (n_rows,)."""
+        return self._rows(lambda c: _target_at(c, time))
+
+    def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
+        x = self._positions(x)
+        return self._rows(lambda c: c.measure(self.gather(c, x), time) if c.holonomic else np.zeros(c.n_rows))
+
+    def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
+        x = self._positions(x)
+
+        def sigma(c: Constraint) -> FloatArray:
+            if not c.holonomic:
+                return np.zeros(c.n_rows)
+            difference = c.measure(self.gather(c, x), time) - _target_at(c, time)
+            if c.period is not None:
+                difference -= c.period * np.round(difference / c.period)
+            return difference
+
+        return self._rows(sigma)
+
+    def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
+        """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
+        x = self._positions(x)
+        data, columns, widths = [], [], []
+        for c in self.constraints:
+            data.append(c.gradient(self.gather(c, x), time).ravel())
+            columns.append((3 * c.atoms[:, :, None] + np.arange(3)).ravel())
+            widths.append(np.full(c.n_rows, 3 * c.width, dtype=np.int64))
+        if not data:
+            return sp.csr_array((0, 3 * self.n_atoms))
+        indptr = np.concatenate([[0], np.cumsum(np.concatenate(widths))])
+        return sp.csr_array(
+            (np.concatenate(data), np.concatenate(columns), indptr), shape=(self.n_rows, 3 * self.n_atoms)
+        )
+
+    def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
+        x = self._positions(x)
+
+        def c_of(c: Constraint) -> FloatArray:
+            if not c.holonomic:
+                return _target_at(c, time)
+            rate = _rate_at(c, time)
+            if c.moving:
+                r = self.gather(c, x)
+                rate = rate - c.time_terms(r, np.zeros_like(r), time)[0]
+            return rate
+
+        return self._rows(c_of)
+
+    def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
+        """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
+        x = self._positions(x)
+        v = self._positions(v, "velocities")
+
+        def b_of(c: Constraint) -> FloatArray:
+            r = self.gather(c, x)
+            u = v[c.atoms]
+            curvature = c.curvature(r, u, time)
+            if not c.holonomic:
+                return _rate_at(c, time) - curvature
+            second = c.target.acceleration_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else 0.0
+            return second - curvature - (c.time_terms(r, u, time)[1] if c.moving else 0.0)
+
+        return self._rows(b_of)
+
+    def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
+        x = self._positions(x)
+
+        def floor(c: Constraint) -> FloatArray:
+            gradient = np.linalg.norm(c.gradient(self.gather(c, x), time), axis=2)
+            sizes = np.linalg.norm(x[c.atoms], axis=2)
+            return 2 * np.finfo(float).eps * np.sum(gradient * sizes, axis=1)
+
+        return np.maximum(1e-14 * self.scale, self._rows(floor))
+
+    # -- pieces ---------------------------------------------------------------------------------
+
+    def subset(self, rows: IntArray) -> tuple[ConstraintSet, IntArray]:
+        """The set made of some rows over their own atoms only, and those atoms' numbers in this set.
+
+        `rows` must be sorted. Targets and cell are kept; nothing is checked again.
+        """
+        rows = np.asarray(rows, dtype=np.int64)
+        bounds = np.searchsorted(rows, self.starts)
+        pieces = [
+            item.select(rows[lo:hi] - start)
+            for item, start, lo, hi in zip(self.constraints, self.starts, bounds[:-1], bounds[1:], strict=False)
+            if hi > lo
+        ]
+        atoms = np.unique(np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)]))
+        part = object.__new__(ConstraintSet)
+        part.n_atoms = len(atoms)
+        part.masses = self.masses[atoms]
+        part.lattice = self.lattice
+        part.constraints = tuple(_compact(p, atoms) for p in pieces)
+        part.starts = np.concatenate([[0], np.cumsum([p.n_rows for p in pieces], dtype=np.int64)]).astype(np.int64)
+        return part, atoms
+
+    def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
+        return np.concatenate([function(c) for c in self.constraints] or [np.zeros(0)])
+
+    def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
+        array = np.asarray(x, dtype=np.float64)
+        if array.shape != (self.n_atoms, 3):
+            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
+        return array
+
+    def __len__(self) -> int:
+        return self.n_rows
+
+    def __repr__(self) -> str:
+        return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
+
+
+def _target_at(c: Constraint, time: float) -> FloatArray:
+    if isinstance(c.target, MovingTarget):
+        return c.target.at(time, c.n_rows)
+    if c.target is None:
+        raise ConstraintError(f"{c!r} has no target; put it in a ConstraintSet first")
+    return c.target
+
+
+def _rate_at(c: Constraint, time: float) -> FloatArray:
+    return c.target.rate_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
+
+
+def _array(values: ArrayLike, item: str) -> FloatArray:
+    try:
+        return np.ascontiguousarray(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+
+
+def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
+    """Cell whose non-periodic vectors are replaced by unit vectors normal to the periodic ones."""
+    full = matrix.copy()
+    basis = matrix[periodic]
+    _, singular, vh = np.linalg.svd(basis)
+    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
+        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
+    full[~periodic] = vh[len(basis) :]
+    return full
+
+
+def _compact(item: Constraint, atoms: IntArray) -> Constraint:
+    copy = item.with_target(item.target)
+    copy.atoms = np.searchsorted(atoms, item.atoms)
+    return copy

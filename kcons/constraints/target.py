@@ -1,0 +1,108 @@
+"""What a row is held at: a number, the value found at the start, or a function of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.errors import InputError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+TimeFunction: TypeAlias = Callable[[float], ArrayLike]
+
+
+@dataclass(frozen=True)
+class MovingTarget:
+    """A target that is a given function of time.
+
+    Parameters
+    ----------
+    value, rate, acceleration : callable
+        The target, its first and its second time derivative, each a function of the time that
+        returns a number or an array of one number a row. Derivatives left out are taken from
+        `value` by central differences of eighth order with step `time_step`; give them where
+        more than about ten digits of the acceleration matter.
+    time_step : float
+        Step of the differences, in the caller's unit of time: a small part (about 1/50) of the
+        time over which the target changes.
+    """
+
+    value: TimeFunction
+    rate: TimeFunction | None = None
+    acceleration: TimeFunction | None = None
+    time_step: float = 0.02
+
+    def at(self, time: float, rows: int) -> FloatArray:
+        """Target at `time`, shape (rows,)."""
+        return _per_row(self.value(time), rows, time)
+
+    def rate_at(self, time: float, rows: int) -> FloatArray:
+        """First time derivative, shape (rows,)."""
+        if self.rate is not None:
+            return _per_row(self.rate(time), rows, time)
+        if self.acceleration is not None:
+            raise InputError("a moving target with an acceleration also needs its rate", item="target")
+        h = self.time_step
+        total = np.zeros(rows)
+        for k, c in enumerate(_FIRST, start=1):
+            total += c * (self.at(time + k * h, rows) - self.at(time - k * h, rows))
+        return total / h
+
+    def acceleration_at(self, time: float, rows: int) -> FloatArray:
+        """Second time derivative, shape (rows,)."""
+        if self.acceleration is not None:
+            return _per_row(self.acceleration(time), rows, time)
+        h = self.time_step
+        total = np.zeros(rows)
+        if self.rate is not None:
+            for k, c in enumerate(_FIRST, start=1):
+                total += c * (self.rate_at(time + k * h, rows) - self.rate_at(time - k * h, rows))
+            return total / h
+        centre = self.at(time, rows)
+        for k, c in enumerate(_SECOND, start=1):
+            total += c * ((self.at(time + k * h, rows) - centre) + (self.at(time - k * h, rows) - centre))
+        return total / h**2
+
+
+# Central differences of eighth order: weights of f(t + kh) -/+ f(t - kh), k = 1..4.
+_FIRST = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+_SECOND = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
+
+Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
+
+
+def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.broadcast_to(array, (rows,))
+    except ValueError:
+        raise InputError(
+            f"the target at t = {time:g} has shape {array.shape}; give one number or {rows}", item="target"
+        ) from None
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"the target at t = {time:g} is not finite", item="target")
+    return array
+
+
+def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
+    """Normalise what a user gave: None, an array of shape (rows,), or a `MovingTarget`.
+
+    Raises
+    ------
+    InputError
+        If an explicit target is not finite or has the wrong number of entries.
+    """
+    if target is None or isinstance(target, MovingTarget):
+        return target
+    if callable(target):
+        return MovingTarget(target)
+    array = np.asarray(target, dtype=np.float64)
+    if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, rows)):
+        raise InputError(f"target has shape {array.shape}; give one number or {rows}", item="target")
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"target {target!r} is not finite", item="target")
+    return np.ascontiguousarray(np.broadcast_to(array, (rows,)))

@@ -1,0 +1,128 @@
+"""The exception tree.
+
+Every error names the item that is wrong and says what to do about it. Each class also derives from
+the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data as attributes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class KconsError(Exception):
+    """Root of all errors raised by kcons."""
+
+
+class InputError(KconsError, ValueError):
+    """An argument has the wrong shape, a NaN or infinity, a bad mass, index or cell.
+
+    Attributes
+    ----------
+    item : str
+        The argument or array that is wrong.
+    atoms : tuple of int
+        The atoms concerned, if any.
+    """
+
+    def __init__(self, message: str, *, item: str = "", atoms: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.item = item
+        self.atoms = tuple(int(a) for a in atoms)
+
+
+class ConstraintError(KconsError, ValueError):
+    """A constraint cannot be held as it is written.
+
+    Attributes
+    ----------
+    rows : tuple of int
+        Row numbers concerned.
+    atoms : tuple of int
+        The atoms concerned.
+    """
+
+    def __init__(self, message: str, *, rows: Sequence[int] = (), atoms: Sequence[int] = ()) -> None:
+        super().__init__(message)
+        self.rows = tuple(int(r) for r in rows)
+        self.atoms = tuple(int(a) for a in atoms)
+
+
+class ContradictionError(ConstraintError):
+    """Two constraints ask for different things (two lengths for one pair, triangle inequality)."""
+
+
+class SingularGeometryError(ConstraintError):
+    """A gradient is undefined or the rows are singular only at this geometry."""
+
+
+class OverdeterminedError(ConstraintError):
+    """The rows leave no degree of freedom although something moves."""
+
+
+class ConvergenceError(KconsError, RuntimeError):
+    """No solution was found within the tolerance; positions and velocities are unchanged.
+
+    Attributes
+    ----------
+    residual, tolerance : float
+        Last residual (relative to the scale of the row) and what was asked for.
+    iterations : int
+        Newton iterations done.
+    row : int
+        The worst row, -1 if unknown.
+    atoms : tuple of int
+        Its atoms.
+    cluster : int
+        Number of the cluster, -1 if unknown.
+    step : int or None
+        Step number, where a stepper knows it.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        residual: float = float("nan"),
+        tolerance: float = float("nan"),
+        iterations: int = 0,
+        row: int = -1,
+        atoms: Sequence[int] = (),
+        cluster: int = -1,
+        step: int | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.residual = residual
+        self.tolerance = tolerance
+        self.iterations = iterations
+        self.row = row
+        self.atoms = tuple(int(a) for a in atoms)
+        self.cluster = cluster
+        self.step = step
+
+
+class InfeasibleError(ConvergenceError):
+    """No positions satisfy the constraints: the residual cannot be made smaller."""
+
+
+class NonFiniteError(KconsError, FloatingPointError):
+    """A NaN or infinity appeared during a run.
+
+    Attributes
+    ----------
+    item : str
+        'force', 'position', 'velocity' or 'energy'.
+    atom : int
+        First atom concerned, -1 if it is no per-atom quantity.
+    step : int or None
+        Step number, where known.
+    """
+
+    def __init__(self, message: str, *, item: str = "", atom: int = -1, step: int | None = None) -> None:
+        super().__init__(message)
+        self.item = item
+        self.atom = atom
+        self.step = step
+
+
+class UnsupportedError(KconsError, NotImplementedError):
+    """The host or method cannot do this; the message says what to use instead."""
