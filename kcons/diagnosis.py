@@ -1,0 +1,195 @@
+"""What to tell the user: why a solve failed, and the report on a healthy set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
+from kcons.plan import ClusterKind, Plan
+from kcons.solvers.outcome import Outcome
+
+
+@dataclass(frozen=True)
+class Report:
+    """State of a constraint set at given positions.
+
+    Attributes
+    ----------
+    rows, rank, degrees_of_freedom : int
+    residual : float
+        max |sigma|, natural units.
+    velocity_residual : float
+        max |A v - c| with rows scaled to unit norm; NaN without velocities.
+    worst_row : str
+        Name of the row with the largest |sigma|.
+    kinds : sequence of ClusterKind
+    """
+
+    rows: int
+    rank: int
+    degrees_of_freedom: int
+    residual: float
+    velocity_residual: float
+    worst_row: str
+    kinds: Sequence[ClusterKind]
+
+    def __str__(self) -> str:
+        lines = [
+            f"rows {self.rows}, rank {self.rank}, degrees of freedom {self.degrees_of_freedom}",
+            f"max |sigma| {self.residual:.2e} ({self.worst_row})",
+        ]
+        if not np.isnan(self.velocity_residual):
+            lines.append(f"max |A v - c| {self.velocity_residual:.2e}")
+        lines.append(f"{'solver':<12}{'clusters':>9}{'rows':>9}{'rank':>9}  for example")
+        lines += [f"{k.solver:<12}{k.clusters:>9}{k.rows:>9}{k.rank:>9}  {k.example}" for k in self.kinds]
+        return "\n".join(lines)
+
+
+def make_report(
+    constraint_set: ConstraintSet, plan: Plan, x: FloatArray, v: FloatArray | None, time: float
+) -> Report:
+    """Evaluate the set at `x` (and `v`)."""
+    sigma = np.abs(constraint_set.value(x, time))
+    worst = int(np.argmax(sigma / constraint_set.scale)) if len(sigma) else -1
+    speed = float("nan")
+    if v is not None:
+        jacobian = constraint_set.jacobian(x, time)
+        norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
+        miss = np.abs(jacobian @ v.ravel() - constraint_set.velocity_target(x, time))
+        speed = float(np.max(miss / np.where(norms > 0, norms, 1.0), initial=0.0))
+    return Report(
+        rows=constraint_set.n_rows,
+        rank=plan.rank,
+        degrees_of_freedom=3 * constraint_set.n_atoms - plan.rank,
+        residual=float(np.max(sigma, initial=0.0)),
+        velocity_residual=speed,
+        worst_row=constraint_set.row_name(worst) if worst >= 0 else "no rows",
+        kinds=plan.kinds,
+    )
+
+
+def _named(numbers: IntArray | None, atoms: IntArray) -> list[int]:
+    return [int(a) for a in (atoms if numbers is None else numbers[atoms])]
+
+
+def _not_finite(
+    constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray]
+) -> KconsError | None:
+    touched = np.unique(constraint_set.incidence.indices)
+    for item, array in arrays.items():
+        bad = ~np.isfinite(array[touched]).all(axis=1)
+        if bad.any():
+            atom = int(touched[np.argmax(bad)])
+            (number,) = _named(numbers, np.array([atom]))
+            return InputError(f"{item} of atom {number} is not finite: {array[atom]}", item=item, atoms=[number])
+    return None
+
+
+def _row_label(constraint_set: ConstraintSet, numbers: IntArray | None, row: int) -> tuple[str, list[int]]:
+    item, k = constraint_set.locate(row)
+    atoms = _named(numbers, item.atoms[k])
+    shown = ", ".join(str(a) for a in atoms[:6]) + (", ..." if len(atoms) > 6 else "")
+    return f"#{row} {item.family}({shown})", atoms
+
+
+def positions_failed(
+    constraint_set: ConstraintSet,
+    numbers: IntArray | None,
+    x: FloatArray,
+    ref: FloatArray,
+    outcome: Outcome,
+    row: int,
+    plan: Plan,
+) -> KconsError:
+    """The error for a position projection without solution."""
+    error = _not_finite(constraint_set, numbers, {"position": x, "reference position": ref})
+    if error is not None:
+        return error
+    if row < 0:
+        return ConvergenceError("the position projection did not converge", residual=outcome.residual)
+    name, atoms = _row_label(constraint_set, numbers, row)
+    singular = _coincident(constraint_set, numbers, ref, row)
+    if singular is not None:
+        return singular
+    return ConvergenceError(
+        f"no positions near the given ones fulfil row {name}: relative residual {outcome.residual:.3g} after "
+        f"{outcome.iterations} iterations. The displacement is too large for this geometry; use a smaller "
+        "time step (or optimiser step), or restore_positions for a start that is far off",
+        residual=outcome.residual,
+        tolerance=1e-14,
+        iterations=outcome.iterations,
+        row=row,
+        atoms=atoms,
+        cluster=int(plan.labels[row]),
+    )
+
+
+def _coincident(
+    constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, row: int
+) -> KconsError | None:
+    item, k = constraint_set.locate(row)
+    if item.family != "Distance":
+        return None
+    r = constraint_set.gather(item.select([k]), x)[0]
+    if np.linalg.norm(r[1] - r[0]) > 0:
+        return None
+    i, j = _named(numbers, item.atoms[k])
+    return SingularGeometryError(
+        f"atoms {i} and {j} coincide: distance gradient undefined; move them apart", rows=[row], atoms=[i, j]
+    )
+
+
+def tangents_failed(
+    constraint_set: ConstraintSet,
+    numbers: IntArray | None,
+    x: FloatArray,
+    y: FloatArray,
+    outcome: Outcome,
+    row: int,
+    what: str,
+    plan: Plan,
+) -> KconsError:
+    """The error for a velocity or force projection without solution."""
+    error = _not_finite(constraint_set, numbers, {"position": x, what: y})
+    if error is not None:
+        return error
+    if row < 0:
+        return ConvergenceError(f"the {what} projection did not converge", residual=outcome.residual)
+    name, atoms = _row_label(constraint_set, numbers, row)
+    singular = _coincident(constraint_set, numbers, x, row)
+    if singular is not None:
+        return singular
+    return ConvergenceError(
+        f"the {what} projection leaves a residual of {outcome.residual:.3g} in row {name}: the rows contradict "
+        "each other at these positions (A A+ b differs from b), or a gradient is undefined there",
+        residual=outcome.residual,
+        iterations=outcome.iterations,
+        row=row,
+        atoms=atoms,
+        cluster=int(plan.labels[row]),
+    )
+
+
+def restore_failed(
+    constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, outcome: Outcome, row: int, time: float
+) -> KconsError:
+    """The error for start positions that cannot be brought onto the constraints."""
+    error = _not_finite(constraint_set, numbers, {"position": x})
+    if error is not None:
+        return error
+    name, atoms = _row_label(constraint_set, numbers, row)
+    sum_of_squares = float(np.sum(constraint_set.value(x, time) ** 2))
+    return InfeasibleError(
+        f"infeasible: residual cannot go below {sum_of_squares:.6g} (sum of squares) from these positions; "
+        f"worst row {name}. Check its target against its neighbours', or start nearer to a solution",
+        residual=outcome.residual,
+        iterations=outcome.iterations,
+        row=row,
+        atoms=atoms,
+    )
