@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray, MovingTarget
-from kcons.errors import ConstraintError, InputError
+from kcons.errors import InputError
 
 
 class ConstraintSet:
@@ -85,9 +85,10 @@ class ConstraintSet:
             item.check(r, time, int(start))
             if item.target is None:
                 item = item.with_target(item.measure(r, time) if item.holonomic else np.zeros(item.n_rows))
-            self._check_half_box(item, int(start), time)
+            self._check_half_box(item, r, int(start), time)
             bound.append(item)
         self.constraints = tuple(bound)
+        self._set_scale(x, time)
 
     # -- construction ---------------------------------------------------------------------------
 
@@ -123,23 +124,45 @@ class ConstraintSet:
         norms = np.linalg.norm(self.lattice[1], axis=0)
         return 0.5 / float(norms.max())
 
-    def _check_half_box(self, item: Constraint, start: int, time: float) -> None:
-        if self.lattice is None or item.family != "Distance":
+    def _check_half_box(self, item: Constraint, r: FloatArray, start: int, time: float) -> None:
+        """Minimum images are unique only for vectors shorter than half the box."""
+        if self.lattice is None or not item.half_box_rows:
             return
-        target = item.target.at(time, item.n_rows) if isinstance(item.target, MovingTarget) else item.target
-        assert target is not None
-        too_long = np.flatnonzero(target >= self.half_width)
-        if too_long.size:
-            k = int(too_long[0])
+        if item.family == "Distance":
+            length, what = item.target_at(time)[:, None], "target"
+        else:
+            length, what = np.linalg.norm(np.diff(r, axis=1), axis=2), "distance of neighbouring atoms"
+        too_long = np.argwhere(length >= self.half_width)
+        if len(too_long):
+            k, slot = (int(i) for i in too_long[0])
             raise InputError(
-                f"row {start + k}, {item.row_name(k)}: target {target[k]:g} is not shorter than half the box "
-                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or no cell",
-                item="target",
-                atoms=item.atoms[k],
+                f"row {start + k}, {item.row_name(k)}: {what} {length[k, slot]:g} is not shorter than half the box "
+                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, no cell, or list the "
+                "atoms so that neighbours in the row are neighbours in space",
+                item="target" if what == "target" else "positions",
+                atoms=item.atoms[k, slot : slot + 2].tolist(),
             )
+
+    def _set_scale(self, x: FloatArray, time: float) -> None:
+        """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
+        scale = self._rows(lambda c: c.scale(time))
+        if not np.all(scale > 0):
+            size = self._rows(lambda c: self._reach(c, x, time))
+            extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
+            size = np.where(size > 0, size, extent if extent > 0 else 1.0)
+            scale = np.where(scale > 0, scale, size)
+        self.scale: FloatArray = scale
+
+    def _reach(self, item: Constraint, x: FloatArray, time: float) -> FloatArray:
+        gradient = np.linalg.norm(item.gradient(self.gather(item, x), time), axis=2)
+        return np.sum(gradient * np.linalg.norm(x[item.atoms], axis=2), axis=1)
 
     def _check_atoms(self, given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
         start = 0
+        held = np.zeros(len(x), dtype=bool)
+        for item in given:
+            if item.family == "FixedAtoms":
+                held[item.atoms[item.atoms < len(x)]] = True
         for item in given:
             atoms = item.atoms
             if atoms.size and atoms.max() >= self.n_atoms:
@@ -155,14 +178,13 @@ class ConstraintSet:
             if bad.any():
                 atom = int(used[np.argmax(bad)])
                 raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
-            bad = ~(np.isfinite(m[used]) & (m[used] > 0))
-            if item.family == "FixedAtoms":
-                bad = ~np.isfinite(m[used]) | (m[used] < 0)
+            # Fixed atoms move with infinite mass, whatever theirs is.
+            bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
             if bad.any():
                 atom = int(used[np.argmax(bad)])
                 raise InputError(
                     f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
-                    "(hold it with FixedAtoms, or make it a virtual site)",
+                    "(fix it with FixedAtoms, or make it a virtual site)",
                     item="masses",
                     atoms=[atom],
                 )
@@ -183,11 +205,6 @@ class ConstraintSet:
     def holonomic(self) -> NDArray[np.bool_]:
         """True for position rows, False for velocity rows, shape (n_rows,)."""
         return np.concatenate([np.full(c.n_rows, c.holonomic) for c in self.constraints] or [np.zeros(0, bool)])
-
-    @cached_property
-    def scale(self) -> FloatArray:
-        """Natural size of each row (the length held, 1 radian for angles), shape (n_rows,)."""
-        return np.concatenate([c.scale() for c in self.constraints] or [np.zeros(0)])
 
     def locate(self, row: int) -> tuple[Constraint, int]:
         """The constraint object that holds `row`, and the row's number within it."""
@@ -232,7 +249,7 @@ class ConstraintSet:
 
     def target(self, time: float = 0.0) -> FloatArray:
         """What each row is held at, shape (n_rows,)."""
-        return self._rows(lambda c: _target_at(c, time))
+        return self._rows(lambda c: c.target_at(time))
 
     def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
@@ -246,7 +263,7 @@ class ConstraintSet:
         def sigma(c: Constraint) -> FloatArray:
             if not c.holonomic:
                 return np.zeros(c.n_rows)
-            difference = c.measure(self.gather(c, x), time) - _target_at(c, time)
+            difference = c.measure(self.gather(c, x), time) - c.target_at(time)
             if c.period is not None:
                 difference -= c.period * np.round(difference / c.period)
             return difference
@@ -274,7 +291,7 @@ class ConstraintSet:
 
         def c_of(c: Constraint) -> FloatArray:
             if not c.holonomic:
-                return _target_at(c, time)
+                return c.target_at(time)
             rate = _rate_at(c, time)
             if c.moving:
                 r = self.gather(c, x)
@@ -303,12 +320,8 @@ class ConstraintSet:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
         x = self._positions(x)
 
-        def floor(c: Constraint) -> FloatArray:
-            gradient = np.linalg.norm(c.gradient(self.gather(c, x), time), axis=2)
-            sizes = np.linalg.norm(x[c.atoms], axis=2)
-            return 2 * np.finfo(float).eps * np.sum(gradient * sizes, axis=1)
-
-        return np.maximum(1e-14 * self.scale, self._rows(floor))
+        floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, time))
+        return np.maximum(1e-14 * self.scale, floor)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -329,6 +342,7 @@ class ConstraintSet:
         part.n_atoms = len(atoms)
         part.masses = self.masses[atoms]
         part.lattice = self.lattice
+        part.scale = self.scale[rows]
         part.constraints = tuple(_compact(p, atoms) for p in pieces)
         part.starts = np.concatenate([[0], np.cumsum([p.n_rows for p in pieces], dtype=np.int64)]).astype(np.int64)
         return part, atoms
@@ -347,14 +361,6 @@ class ConstraintSet:
 
     def __repr__(self) -> str:
         return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
-
-
-def _target_at(c: Constraint, time: float) -> FloatArray:
-    if isinstance(c.target, MovingTarget):
-        return c.target.at(time, c.n_rows)
-    if c.target is None:
-        raise ConstraintError(f"{c!r} has no target; put it in a ConstraintSet first")
-    return c.target
 
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:

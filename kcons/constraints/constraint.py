@@ -15,15 +15,15 @@ Both are differentiated to A a = b (notes eqs. 81-92): A_k is `gradient`, and
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
-from kcons.errors import InputError
+from kcons.errors import ConstraintError, InputError
 
 IntArray = NDArray[np.int64]
 
@@ -53,15 +53,50 @@ class Constraint(ABC):
 
     family: ClassVar[str]
     holonomic: ClassVar[bool] = True
-    #: True if q depends on differences of positions alone, so that minimum images apply.
-    translation_invariant: ClassVar[bool] = False
+    #: Atoms a row, where the family fixes it.
+    row_width: ClassVar[int | None] = None
     #: Period of the coordinate (2 pi for dihedrals); sigma is taken to the nearest image.
     period: ClassVar[float | None] = None
-    kind: ClassVar[RowKind] = RowKind.INTERPRETED
+    #: Data held for each row: name -> shape of one row's entry, -1 standing for the width.
+    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    #: Plain numbers or flags that all rows of the object have in common.
+    shared: ClassVar[tuple[str, ...]] = ()
+    #: Python functions the object holds; with one of them it cannot be written to a file.
+    functions: ClassVar[tuple[str, ...]] = ()
+    #: Whether the coordinate depends on the masses of its atoms.
+    uses_masses: ClassVar[bool] = False
+
+    #: True if q depends on differences of positions alone, so that minimum images apply.
+    translation_invariant: bool = False
+    kind: RowKind = RowKind.INTERPRETED
+    #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
+    masses: FloatArray | None = None
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
-        self.atoms: IntArray = _atom_table(atoms, type(self).__name__)
+        self.atoms: IntArray = _atom_table(atoms, type(self).__name__, self.row_width)
         self.target: FloatArray | MovingTarget | None = as_target(target, self.n_rows)
+
+    def _keep(self, **data: ArrayLike) -> None:
+        """Store data listed in `per_row`, broadcast to all rows."""
+        for name, value in data.items():
+            shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
+            try:
+                array = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"{self.family}: {name} has shape {np.shape(value)}; give {shape[1:] or 'one number'} "
+                    f"for all rows or {shape}",
+                    item=name,
+                ) from None
+            if not np.all(np.isfinite(array)):
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise InputError(
+                    f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row]
+                )
+            setattr(self, name, np.ascontiguousarray(array))
+
+    def _settle(self) -> None:
+        """Derive and check what follows from the per-row data; called once, when these were set."""
 
     @property
     def n_rows(self) -> int:
@@ -93,15 +128,29 @@ class Constraint(ABC):
         zero = np.zeros(self.n_rows)
         return zero, zero
 
-    def scale(self) -> FloatArray:
-        """Natural size of each row, shape (n_rows,): the length held, or 1 radian for angles."""
-        if isinstance(self.target, np.ndarray):
-            return np.maximum(np.abs(self.target), np.finfo(float).tiny)
-        return np.ones(self.n_rows)
+    def scale(self, time: float = 0.0) -> FloatArray:
+        """Natural size of each row, shape (n_rows,): the length held, or 1 radian for angles.
+
+        0 where the row has no size of its own; the set then takes the size of the positions.
+        """
+        if self.target is None or not self.holonomic:
+            return np.zeros(self.n_rows)
+        return np.abs(self.target_at(time))
+
+    def target_at(self, time: float) -> FloatArray:
+        """What each row is held at, shape (n_rows,)."""
+        if self.target is None:
+            raise ConstraintError(f"{self!r} has no target; put it in a ConstraintSet first")
+        return self.target.at(time, self.n_rows) if isinstance(self.target, MovingTarget) else self.target
 
     def parameters(self) -> FloatArray:
         """Numbers for the compiled kernels, shape (n_rows, p); see `RowKind`."""
         return np.zeros((self.n_rows, 0))
+
+    @property
+    def half_box_rows(self) -> bool:
+        """Whether minimum images need neighbouring atoms of a row to be closer than half the box."""
+        return self.translation_invariant and self.width > 1
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         """Raise a typed error if a row is undefined at `r` or its target is impossible.
@@ -111,27 +160,35 @@ class Constraint(ABC):
 
     def with_masses(self, masses: FloatArray) -> Constraint:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""
-        return self
+        if not self.uses_masses:
+            return self
+        copy = self.with_target(self.target)
+        copy.masses = np.ascontiguousarray(masses, dtype=np.float64)
+        return copy
 
-    def with_target(self, target: Target) -> Constraint:
+    def with_target(self, target: Target) -> Self:
         """Copy of this object held at another target."""
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy.target = as_target(target, self.n_rows)
         return copy
 
-    def select(self, rows: Sequence[int] | IntArray) -> Constraint:
-        """Copy with some of the rows; families with per-row data extend it."""
+    def select(self, rows: Sequence[int] | IntArray) -> Self:
+        """Copy with some of the rows, their targets and their data."""
         rows = np.asarray(rows, dtype=np.int64)
         copy = self.with_target(None)
         copy.atoms = self.atoms[rows]
+        for name in self.per_row:
+            setattr(copy, name, getattr(self, name)[rows])
+        if self.masses is not None:
+            copy.masses = self.masses[rows]
         if isinstance(self.target, np.ndarray):
             copy.target = self.target[rows]
         elif self.target is not None:
             copy.target = _selected(self.target, rows, self.n_rows)
         return copy
 
-    def renumbered(self, new_index: IntArray) -> Constraint:
+    def renumbered(self, new_index: IntArray) -> Self:
         """Copy with atom a replaced by new_index[a]."""
         copy = self.with_target(self.target)
         copy.atoms = np.asarray(new_index, dtype=np.int64)[self.atoms]
@@ -151,18 +208,40 @@ class Constraint(ABC):
         InputError
             If the object holds Python functions, which cannot be written to a file.
         """
+        held = [name for name in self.functions if getattr(self, name) is not None]
         if isinstance(self.target, MovingTarget):
+            held.append("target")
+        if held:
             raise InputError(
-                f"{self.family} has a target that is a function of time; it cannot be written to a file. "
-                "Attach it again after reading.",
-                item="target",
+                f"{self.family} holds a Python function ({', '.join(held)}); it cannot be written to a file. "
+                "Leave it out, and attach it again after reading",
+                item=held[0],
             )
-        target = None if self.target is None else self.target.tolist()
-        return {"family": self.family, "atoms": self.atoms.tolist(), "target": target, **self._data()}
+        target = None if self.target is None else self.target.tolist()  # type: ignore[union-attr]
+        data = {name: getattr(self, name).tolist() for name in self.per_row}
+        data |= {name: getattr(self, name) for name in self.shared}
+        return {"family": self.family, "atoms": self.atoms.tolist(), "target": target, **data}
 
-    def _data(self) -> dict[str, Any]:
-        """Constructor arguments beyond atoms and target, as plain data."""
-        return {}
+    @classmethod
+    def restored(cls, data: Mapping[str, Any]) -> Self:
+        """The object that `todict` wrote.
+
+        Raises
+        ------
+        InputError
+            If an entry is missing, unknown or of the wrong shape.
+        """
+        names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
+        if cls.functions or set(data) != names:
+            wrong = sorted(names.symmetric_difference(data)) or list(cls.functions)
+            raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
+        item = object.__new__(cls)
+        Constraint.__init__(item, data["atoms"], data["target"])
+        for name in cls.shared:
+            setattr(item, name, data[name])
+        item._keep(**{name: data[name] for name in cls.per_row})
+        item._settle()
+        return item
 
     def __repr__(self) -> str:
         what = self.row_name(0) if self.n_rows == 1 else f"{self.family}({self.n_rows} rows)"
@@ -177,14 +256,26 @@ def _selected(target: MovingTarget, rows: IntArray, n_rows: int) -> MovingTarget
     )
 
 
-def _atom_table(atoms: ArrayLike, name: str) -> IntArray:
-    table = np.asarray(atoms)
-    if table.size and not np.issubdtype(table.dtype, np.integer):
+def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
+    try:
+        table = np.asarray(atoms)
+    except ValueError:
+        raise InputError(
+            f"{name}: rows name different numbers of atoms; use one object for each number", item="atoms"
+        ) from None
+    if table.size == 0:
+        return np.zeros((0, width or (table.shape[1] if table.ndim == 2 else 0)), dtype=np.int64)
+    if not np.issubdtype(table.dtype, np.integer):
         raise InputError(f"{name}: atom indices must be integers, not {table.dtype}", item="atoms")
     table = np.atleast_2d(table.astype(np.int64))
     if table.ndim != 2:
         raise InputError(f"{name}: atoms must have shape (n_rows, width), not {table.shape}", item="atoms")
-    if table.size and table.min() < 0:
+    if width is not None and table.shape[1] != width:
+        raise InputError(
+            f"{name}: a row has {width} atom{'s' if width > 1 else ''}, but atoms has shape {np.shape(atoms)}",
+            item="atoms",
+        )
+    if table.min() < 0:
         row, slot = np.argwhere(table < 0)[0]
         raise InputError(
             f"{name}: row {row} has the negative atom index {table[row, slot]}; count atoms from 0",

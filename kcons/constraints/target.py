@@ -77,6 +77,8 @@ Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
 
 def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
+    if array.ndim > 1 and array.size == rows:
+        array = array.ravel()  # for example (n, 3) for three rows an atom
     try:
         array = np.broadcast_to(array, (rows,))
     except ValueError:
@@ -94,15 +96,21 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
     Raises
     ------
     InputError
-        If an explicit target is not finite or has the wrong number of entries.
+        If an explicit target is no number, not finite, or has the wrong number of entries.
     """
     if target is None or isinstance(target, MovingTarget):
         return target
     if callable(target):
         return MovingTarget(target)
-    array = np.asarray(target, dtype=np.float64)
+    try:
+        array = np.asarray(target, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"target {target!r} is no number or array of numbers", item="target") from None
+    if array.ndim > 1 and array.size == rows:
+        array = array.ravel()
     if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, rows)):
         raise InputError(f"target has shape {array.shape}; give one number or {rows}", item="target")
     if not np.all(np.isfinite(array)):
-        raise InputError(f"target {target!r} is not finite", item="target")
+        row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
+        raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
     return np.ascontiguousarray(np.broadcast_to(array, (rows,)))

@@ -1,0 +1,309 @@
+"""Distances, angles and dihedrals: internal coordinates of a molecule.
+
+All three depend on differences of positions alone, so minimum images apply in periodic cells.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.target import FloatArray, Target
+from kcons.errors import InputError, SingularGeometryError
+
+#: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
+COLLINEAR = 1e-7
+
+
+class Distance(Constraint):
+    """Length of the vector between two atoms, q = |r_0 - r_1|.
+
+    Parameters
+    ----------
+    pairs : array_like of int, shape (n_rows, 2)
+        The two atoms of each row.
+    target : float, array_like, callable of time, MovingTarget or None
+        Length held, in the unit of the positions.
+
+    Notes
+    -----
+    With u = (r_0 - r_1)/q and w = v_0 - v_1: dq/dr_0 = u, v^T (d2q/dr2) v = (|w|^2 - (u.w)^2)/q.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> bond = Distance([[0, 1]])
+    >>> bond.measure(np.array([[[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]]]), 0.0)
+    array([5.])
+    """
+
+    family = "Distance"
+    row_width = 2
+    translation_invariant = True
+    kind = RowKind.DISTANCE
+
+    def __init__(self, pairs: ArrayLike, target: Target = None) -> None:
+        super().__init__(pairs, target)
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return _norm(r[:, 0] - r[:, 1])
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        d = r[:, 0] - r[:, 1]
+        u = d / _norm(d)[:, None]
+        return np.stack([u, -u], axis=1)
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        d = r[:, 0] - r[:, 1]
+        w = v[:, 0] - v[:, 1]
+        q = _norm(d)
+        # |u x w|^2 has no cancellation, unlike |w|^2 - (u.w)^2.
+        across = np.cross(d / q[:, None], w)
+        return _dot(across, across) / q
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0:
+            return
+        k = _first(_norm(r[:, 0] - r[:, 1]) == 0)
+        if k is not None:
+            i, j = self.atoms[k]
+            raise SingularGeometryError(
+                f"atoms {i} and {j} coincide: distance gradient undefined (row {first_row + k}); move them apart",
+                rows=[first_row + k],
+                atoms=[i, j],
+            )
+        if self.target is None:
+            return
+        target = self.target_at(time)
+        k = _first(~(target > 0))
+        if k is not None:
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is not positive; "
+                "give a length greater than zero, or None to hold the present one",
+                item="target",
+                atoms=self.atoms[k],
+            )
+
+
+class Angle(Constraint):
+    """Angle at the middle atom, q = atan2(|u x w|, u.w), u = r_0 - r_1, w = r_2 - r_1, in radian.
+
+    Parameters
+    ----------
+    triples : array_like of int, shape (n_rows, 3)
+        Atoms i, j, k of each row; j is the vertex.
+    target : float, array_like, callable of time, MovingTarget or None
+        Angle held, in radian, between 0 and pi, both excluded.
+
+    Notes
+    -----
+    With e, f the unit vectors along the arms, n = e x f/sin q, e' = e x n and f' = n x f:
+    dq/dr_0 = e'/|u|, dq/dr_2 = f'/|w|. These stay of order one up to 180 degrees, where the gradient of
+    cos q vanishes (2.449 for unit arms). The arms turn with the in-plane rates a = e'.u'/|u| and
+    b = f'.w'/|w|, and the out-of-plane rates alpha = n.u'/|u| and beta = n.w'/|w|, so that
+
+    v^T (d2q/dr2) v = -2 [a (e.u')/|u| + b (f.w')/|w|] + ((alpha^2 + beta^2) cos q - 2 alpha beta)/sin q,
+
+    where u' and w' are the velocities of the arms.
+    """
+
+    family = "Angle"
+    row_width = 3
+    translation_invariant = True
+    kind = RowKind.ANGLE
+
+    def __init__(self, triples: ArrayLike, target: Target = None) -> None:
+        super().__init__(triples, target)
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
+        return np.arctan2(_norm(np.cross(u, w)), _dot(u, w))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        u, w, normal, _ = _arms(r)
+        first = np.cross(u, normal) / _dot(u, u)[:, None]
+        last = np.cross(normal, w) / _dot(w, w)[:, None]
+        return np.stack([first, -first - last, last], axis=1)
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        u, w, n, sine = _arms(r)
+        uu, ww = _dot(u, u), _dot(w, w)
+        lu, lw = np.sqrt(uu), np.sqrt(ww)
+        du, dw = v[:, 0] - v[:, 1], v[:, 2] - v[:, 1]
+        a, b = _dot(np.cross(u, n), du) / uu, _dot(np.cross(n, w), dw) / ww
+        alpha, beta = _dot(n, du) / lu, _dot(n, dw) / lw
+        cosine = _dot(u, w) / (lu * lw)
+        in_plane = -2 * (a * _dot(u, du) / uu + b * _dot(w, dw) / ww)
+        return in_plane + ((alpha**2 + beta**2) * cosine - 2 * alpha * beta) / sine
+
+    def scale(self, time: float = 0.0) -> FloatArray:
+        return np.ones(self.n_rows)
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0:
+            return
+        _refuse_coincident(self, r, first_row)
+        angle = self.measure(r, time)
+        self._refuse_straight(angle, "is", first_row)
+        if self.target is None:
+            return
+        target = self.target_at(time)
+        k = _first((target < -COLLINEAR) | (target > np.pi + COLLINEAR))
+        if k is not None:
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is no angle between 0 and pi; "
+                "targets are in radian",
+                item="target",
+                atoms=self.atoms[k],
+            )
+        self._refuse_straight(target, "has the target", first_row)
+
+    def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
+        k = _first(np.sin(angle) < COLLINEAR)
+        if k is None:
+            return
+        degrees = 180 if angle[k] > 1 else 0
+        remedy = (
+            "use a linear constraint (LinearRelation with the end atoms as bases)"
+            if degrees == 180
+            else "use a linear constraint, or distances"
+        )
+        raise SingularGeometryError(
+            f"angle constraint singular at {degrees} deg, {remedy}: "
+            f"row {first_row + k}, {self.row_name(k)}, {verb} {np.degrees(angle[k]):.9g} deg",
+            rows=[first_row + k],
+            atoms=self.atoms[k],
+        )
+
+
+class Dihedral(Constraint):
+    """Dihedral angle of four atoms in radian, IUPAC sign, smooth through +-180 degrees.
+
+    Parameters
+    ----------
+    quads : array_like of int, shape (n_rows, 4)
+        Atoms i, j, k, l of each row; j-k is the axis.
+    target : float, array_like, callable of time, MovingTarget or None
+        Angle held, in radian; any value, the nearest image modulo 2 pi counts.
+
+    Notes
+    -----
+    With F = r_0 - r_1, G = r_1 - r_2, H = r_3 - r_2, P = F x G, Q = H x G, p = P/|P|^2, s = Q/|Q|^2,
+    g = |G|, along any motion
+
+    dq/dt = -g p.F' + (F.G/g) p.G' - (H.G/g) s.G' + g s.H',
+
+    which gives the gradient, and, differentiated once more at constant velocities, the curvature.
+
+    References
+    ----------
+    A. Blondel and M. Karplus, J. Comput. Chem. 17, 1132 (1996), eq. 27.
+    """
+
+    family = "Dihedral"
+    row_width = 4
+    translation_invariant = True
+    period: ClassVar[float | None] = 2 * np.pi
+    kind = RowKind.DIHEDRAL
+
+    def __init__(self, quads: ArrayLike, target: Target = None) -> None:
+        super().__init__(quads, target)
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        F, G, H = _legs(r)
+        P, Q = np.cross(F, G), np.cross(H, G)
+        return np.arctan2(_dot(np.cross(Q, P), G) / _norm(G), _dot(P, Q))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        F, G, H = _legs(r)
+        P, Q = np.cross(F, G), np.cross(H, G)
+        g = _norm(G)
+        p, s = P / _dot(P, P)[:, None], Q / _dot(Q, Q)[:, None]
+        along_f = -g[:, None] * p
+        along_g = (_dot(F, G) / g)[:, None] * p - (_dot(H, G) / g)[:, None] * s
+        along_h = g[:, None] * s
+        return np.stack([along_f, along_g - along_f, -along_g - along_h, along_h], axis=1)
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        F, G, H = _legs(r)
+        dF, dG, dH = _legs(v)
+        P, Q = np.cross(F, G), np.cross(H, G)
+        dP, dQ = np.cross(dF, G) + np.cross(F, dG), np.cross(dH, G) + np.cross(H, dG)
+        g = _norm(G)
+        dg = _dot(G, dG) / g
+        p, dp = _over_square(P, dP)
+        s, ds = _over_square(Q, dQ)
+        f, h = _dot(F, G) / g, _dot(H, G) / g
+        df = (_dot(dF, G) + _dot(F, dG) - f * dg) / g
+        dh = (_dot(dH, G) + _dot(H, dG) - h * dg) / g
+        first = -dg * _dot(p, dF) - g * _dot(dp, dF) + df * _dot(p, dG) + f * _dot(dp, dG)
+        last = dg * _dot(s, dH) + g * _dot(ds, dH) - dh * _dot(s, dG) - h * _dot(ds, dG)
+        return first + last
+
+    def scale(self, time: float = 0.0) -> FloatArray:
+        return np.ones(self.n_rows)
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0:
+            return
+        _refuse_coincident(self, r, first_row)
+        F, G, H = _legs(r)
+        for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
+            k = _first(_norm(np.cross(first, second)) < COLLINEAR * _norm(first) * _norm(second))
+            if k is not None:
+                i, j, m = self.atoms[k, three]
+                raise SingularGeometryError(
+                    f"dihedral constraint singular: atoms {i}, {j}, {m} of row {first_row + k}, {self.row_name(k)}, "
+                    "are collinear; bend them, or hold a dihedral of other atoms",
+                    rows=[first_row + k],
+                    atoms=self.atoms[k],
+                )
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def _norm(a: FloatArray) -> FloatArray:
+    return np.sqrt(_dot(a, a))
+
+
+def _first(bad: NDArray[np.bool_]) -> int | None:
+    """First True entry, or None."""
+    return int(np.argmax(bad)) if bad.any() else None
+
+
+def _arms(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Arms of an angle, unit normal of their plane, and the sine of the angle."""
+    u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
+    normal = np.cross(u, w)
+    area = _norm(normal)
+    return u, w, normal / area[:, None], area / (_norm(u) * _norm(w))
+
+
+def _legs(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return r[:, 0] - r[:, 1], r[:, 1] - r[:, 2], r[:, 3] - r[:, 2]
+
+
+def _over_square(a: FloatArray, da: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """a/|a|^2 and its derivative."""
+    square = _dot(a, a)[:, None]
+    b = a / square
+    return b, da / square - 2 * (_dot(a, da)[:, None] / square) * b
+
+
+def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int) -> None:
+    """Neighbouring atoms of a row at one point leave an angle undefined."""
+    same = _norm(np.diff(r, axis=1)) == 0
+    if same.any():
+        k, slot = (int(i) for i in np.argwhere(same)[0])
+        i, j = item.atoms[k, slot : slot + 2]
+        raise SingularGeometryError(
+            f"atoms {i} and {j} coincide: gradient of row {first_row + k}, {item.row_name(k)}, undefined; "
+            "move them apart",
+            rows=[first_row + k],
+            atoms=[i, j],
+        )

@@ -1,0 +1,177 @@
+"""Rows linear in the positions: combinations of coordinates, relations between atoms, fixed atoms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.target import FloatArray, Target
+from kcons.errors import InputError
+
+#: Atoms up to which the compiled solvers evaluate a linear row themselves.
+COMPILED_WIDTH = 4
+
+
+class LinearRows(Constraint):
+    """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3).
+
+    They have no curvature. Minimum images apply if a common shift of all atoms leaves every row of the
+    object unchanged (coefficients that sum to zero); otherwise the positions are taken as they are.
+    """
+
+    per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
+    coefficients: FloatArray
+
+    def _settle(self) -> None:
+        c = self.coefficients
+        self.kind = RowKind.LINEAR if self.width <= COMPILED_WIDTH else RowKind.INTERPRETED
+        self.translation_invariant = bool(
+            self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
+        )
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return np.asarray(np.einsum("kai,kai->k", self.coefficients, r))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        return self.coefficients
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        return np.zeros(self.n_rows)
+
+    def scale(self, time: float = 0.0) -> FloatArray:
+        # A coordinate may be zero by accident of the origin: the set takes the size of the positions.
+        return np.zeros(self.n_rows)
+
+    def parameters(self) -> FloatArray:
+        return self.coefficients.reshape(self.n_rows, -1)
+
+
+class LinearCombination(LinearRows):
+    """A combination of Cartesian coordinates, q = sum_a c_a . r_a, one row.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    coefficients : array_like, shape (width, 3) or (n_rows, width, 3)
+        What each coordinate is multiplied with.
+    target : float, array_like, callable of time, MovingTarget or None
+        Value held.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, coefficients that are not finite, or a row whose coefficients are all zero.
+
+    Examples
+    --------
+    Two atoms kept at the same height:
+
+    >>> level = LinearCombination([0, 1], [[0, 0, 1], [0, 0, -1]], target=0.0)
+    >>> level.n_rows
+    1
+    """
+
+    family = "LinearCombination"
+
+    def __init__(self, atoms: ArrayLike, coefficients: ArrayLike, target: Target = None) -> None:
+        super().__init__(atoms, target)
+        self._keep(coefficients=coefficients)
+        self._settle()
+
+    def _settle(self) -> None:
+        super()._settle()
+        empty = ~np.any(self.coefficients, axis=(1, 2))
+        if empty.any():
+            row = int(np.argmax(empty))
+            raise InputError(
+                f"{self.row_name(row)}: all coefficients of row {row} are zero; remove the row",
+                item="coefficients",
+                atoms=self.atoms[row],
+            )
+
+
+class LinearRelation(LinearRows):
+    """An atom at a fixed combination of others, r_a = sum_i w_i r_i: three rows (x, y, z) an atom.
+
+    What holds a linear rigid group (two bases) or a planar one (three bases) where distances alone would
+    be singular: hold the distances between the bases and tie every other atom to them.
+
+    Parameters
+    ----------
+    atoms : int or array_like of int, shape (n,)
+        The dependent atoms.
+    bases : array_like of int, shape (n_bases,) or (n, n_bases)
+        Atoms they are tied to.
+    weights : array_like, shape (n_bases,) or (n, n_bases)
+        w_i. With weights that sum to 1 the relation is independent of the origin, and minimum images apply.
+    target : array_like of shape (n, 3), callable of time, MovingTarget, or None
+        What r_a - sum_i w_i r_i is held at; zero by default, None takes the initial value.
+
+    Examples
+    --------
+    The carbon of CO2 in the middle of its oxygens:
+
+    >>> relation = LinearRelation(0, [1, 2], [0.5, 0.5])
+    >>> relation.n_rows, relation.translation_invariant
+    (3, True)
+    """
+
+    family = "LinearRelation"
+
+    def __init__(self, atoms: ArrayLike, bases: ArrayLike, weights: ArrayLike, target: Target = 0.0) -> None:
+        dependent = np.asarray(atoms).reshape(-1, 1)
+        base = np.atleast_2d(np.asarray(bases))
+        try:
+            base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
+            w = np.broadcast_to(np.asarray(weights, dtype=np.float64), base.shape)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"LinearRelation: {len(dependent)} atoms, bases of shape {np.shape(bases)} and weights of shape "
+                f"{np.shape(weights)} do not fit; give n_bases bases and as many weights, for all atoms or for each",
+                item="weights",
+            ) from None
+        if not np.issubdtype(np.result_type(dependent, base), np.integer) and dependent.size:
+            raise InputError("LinearRelation: atom indices must be integers", item="atoms")
+        super().__init__(np.repeat(np.hstack([dependent, base]).astype(np.int64), 3, axis=0), target)
+        factors = np.hstack([np.ones((len(w), 1)), -w])
+        self._keep(coefficients=np.einsum("na,ij->niaj", factors, np.eye(3)).reshape(-1, self.width, 3))
+        self._settle()
+
+
+class FixedAtoms(LinearRows):
+    """Atoms held at given points: three rows (x, y, z) an atom, in the order of `atoms`.
+
+    The engine gives them infinite mass; their multipliers are the reaction forces.
+
+    Parameters
+    ----------
+    atoms : int or array_like of int, shape (n,)
+        The atoms.
+    target : array_like of shape (n, 3), callable of time returning (n, 3), MovingTarget, or None
+        Where they are held; None takes the initial positions.
+
+    Raises
+    ------
+    InputError
+        If an atom is named twice.
+    """
+
+    family = "FixedAtoms"
+    row_width = 1
+
+    def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
+        column = np.asarray(atoms).reshape(-1, 1)
+        values, counts = np.unique(column, return_counts=True)
+        if np.any(counts > 1):
+            atom = int(values[np.argmax(counts > 1)])
+            raise InputError(f"FixedAtoms names atom {atom} twice; name it once", item="atoms", atoms=[atom])
+        if target is not None and not callable(target) and np.shape(target) == (3,):  # type: ignore[arg-type]
+            target = np.tile(np.asarray(target, dtype=np.float64), len(column))
+        super().__init__(np.repeat(column, 3, axis=0), target)
+        self._keep(coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :])
+        self._settle()
