@@ -1,0 +1,385 @@
+"""The theory, literally and densely: the oracle against which the fast engine is tested.
+
+Pure functions on arrays. A is s x 3N, one row a constraint; M is diagonal, given as the masses of the
+N atoms (or as 3N numbers); f and accelerations have length 3N or shape (N, 3) and come back as they came.
+Cost grows as the cube of 3N: for systems of up to some hundred atoms, and for reading.
+
+The mass-weighted matrix is B = A M^-1/2. Written with B+ in place of an inverse, every formula holds
+for dependent rows as well: z, the acceleration and M_par+ are unique, and lambda is the one of least norm.
+
+Equation numbers are those of the notes (G. R. Kneller, Systemes dynamiques); 'corrected' marks the
+lines where their misprints were put right, see docs/notation.md.
+
+References
+----------
+Bott & Duffin, Trans. AMS 74, 99 (1953). Penrose, Proc. Camb. Phil. Soc. 51, 406 (1955).
+Gauss, J. reine angew. Math. 4, 232 (1829). Kneller, J. Chem. Phys. 125, 114107 (2006).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.errors import ContradictionError, InputError
+
+FloatArray = NDArray[np.float64]
+
+#: Singular values of the row-normalised matrix below this part of the largest count as zero.
+RANK_TOLERANCE = 1e-10
+#: Rows contradict each other where b leaves the range of A by more than this part of its size.
+SOLVABILITY_TOLERANCE = 1e-9
+
+
+class PseudoInverse(NamedTuple):
+    """A Moore-Penrose inverse A+, shape (n, s), and the rank of A."""
+
+    matrix: FloatArray
+    rank: int
+
+
+class PenroseResiduals(NamedTuple):
+    """Largest violation of each of Penrose's four conditions, see `penrose_residuals`."""
+
+    inner: float
+    outer: float
+    left_symmetry: float
+    right_symmetry: float
+
+
+class BottDuffinSolution(NamedTuple):
+    """What solves the Bott-Duffin problem: the acceleration and the constraint force."""
+
+    acceleration: FloatArray
+    constraint_force: FloatArray
+
+
+# -- generalized inverses (appendix A.1) ------------------------------------------------------------
+
+
+def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInverse:
+    """A+, through the singular values of the row-normalised matrix (notes eqs. 154-158).
+
+    The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
+    an orthonormal basis of the row space, A = (A V) V^T is a full-rank factorisation and A+ = V (A V)+.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (s, n)
+    rtol : float
+        Singular values below this part of the largest count as zero.
+
+    Raises
+    ------
+    InputError
+        No matrix, or a NaN or infinity in it.
+    """
+    A = _matrix(matrix)
+    V = row_space(A, rtol)
+    return PseudoInverse(V @ _left_inverse(A @ V), V.shape[1])
+
+
+def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
+    """Number of independent rows, by the singular values of the row-normalised matrix."""
+    return int(row_space(matrix, rtol).shape[1])
+
+
+def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """Orthonormal basis V of the space that the rows span, shape (n, rank); A+A = V V^T."""
+    _, singular, vt = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
+    return np.ascontiguousarray(vt[: _count(singular, rtol)].T)
+
+
+def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """Orthonormal basis of the range of the row-normalised matrix, shape (s, rank)."""
+    w, singular, _ = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
+    return np.ascontiguousarray(w[:, : _count(singular, rtol)])
+
+
+def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[FloatArray, FloatArray]:
+    """A = F G with F (s, r) and G (r, n), both of rank r (notes eq. 159).
+
+    By QR with row exchanges, without any singular values: a second way to the rank and to A+.
+    """
+    A = _matrix(matrix)
+    if A.size == 0:
+        return np.zeros((len(A), 0)), np.zeros((0, A.shape[1]))
+    sizes = _row_sizes(A)
+    Q, R, order = scipy.linalg.qr((A / sizes[:, None]).T, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(R))
+    r = int(np.sum(pivots > rtol * pivots[0])) if pivots[0] > 0 else 0
+    F = np.empty((len(A), r))
+    F[order] = R[:r].T
+    return F * sizes[:, None], np.ascontiguousarray(Q[:, :r].T)
+
+
+def full_rank_pseudo_inverse(F: ArrayLike, G: ArrayLike) -> FloatArray:
+    """A+ = G^T (G G^T)^-1 (F^T F)^-1 F^T of A = F G (notes eq. 160, corrected).
+
+    As it is printed: the condition numbers of F and G enter squared.
+    """
+    F, G = _matrix(F), _matrix(G)
+    return np.asarray(G.T @ np.linalg.solve(G @ G.T, np.linalg.solve(F.T @ F, F.T)))
+
+
+def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> PenroseResiduals:
+    """How far X is from being A+ (notes eqs. 154-157).
+
+    The four conditions A X A = A, X A X = X, (A X)^T = A X, (X A)^T = X A. Each residual is taken with the
+    rows of A scaled to unit length (and X accordingly), relative to the size of the products it is made of:
+    it counts roundings, whatever the units of the rows.
+    """
+    A, X = _matrix(matrix), _matrix(inverse)
+    if X.shape != A.shape[::-1]:
+        raise InputError(f"the inverse of a {A.shape} matrix has shape {A.shape[::-1]}, not {X.shape}", item="inverse")
+    if A.size == 0:
+        return PenroseResiduals(0.0, 0.0, 0.0, 0.0)
+    sizes = _row_sizes(A)
+    U, Y = A / sizes[:, None], X * sizes
+    UY, YU = U @ Y, Y @ U
+    u, y = float(np.linalg.norm(U, 2)), float(np.linalg.norm(Y, 2))
+    # A X = D (U Y) D^-1: its symmetry is one of D and U Y together.
+    ratio = sizes[:, None] / sizes
+    return PenroseResiduals(
+        inner=_relative(UY @ U - U, u * y * u + u),
+        outer=_relative(YU @ Y - Y, y * u * y + y),
+        left_symmetry=_relative((ratio * UY - (ratio * UY).T) / (ratio + ratio.T), u * y),
+        right_symmetry=_relative(YU - YU.T, u * y),
+    )
+
+
+def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """x = A+ b + (1 - A+ A) y, every solution of A x = b as y runs over all vectors (notes eq. 163)."""
+    A = _matrix(matrix)
+    y = np.asarray(y, dtype=np.float64)
+    x = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b") + parallel_projector(A, rtol) @ y.ravel()
+    return np.asarray(x).reshape(y.shape)
+
+
+# -- solvability (eq. 95) ---------------------------------------------------------------------------
+
+
+def solvability_residual(matrix: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """A A+ b - b row by row, rows of A scaled to unit length, shape (s,) (notes eqs. 95, 162)."""
+    A = _matrix(matrix)
+    b = _vector(b, len(A), "b") / _row_sizes(A)
+    W = column_space(A, rtol)
+    return np.asarray(W @ (W.T @ b) - b)
+
+
+def is_solvable(
+    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
+) -> bool:
+    """Whether A A+ b = b: the rows do not contradict each other (notes eq. 95)."""
+    A = _matrix(matrix)
+    size = np.max(np.abs(_vector(b, len(A), "b")) / _row_sizes(A), initial=0.0)
+    return bool(np.all(np.abs(solvability_residual(A, b, rtol)) <= tolerance * size))
+
+
+def require_solvable(
+    matrix: ArrayLike, b: ArrayLike, tolerance: float = SOLVABILITY_TOLERANCE, rtol: float = RANK_TOLERANCE
+) -> None:
+    """Refuse rows that contradict each other.
+
+    Raises
+    ------
+    ContradictionError
+        If A A+ b differs from b (notes eq. 95); it names the rows that are off.
+    """
+    if is_solvable(matrix, b, tolerance, rtol):
+        return
+    miss = np.abs(solvability_residual(matrix, b, rtol))
+    worst = int(np.argmax(miss))
+    rows = np.flatnonzero(miss > 1e-3 * miss[worst])
+    raise ContradictionError(
+        f"the rows contradict each other: A A+ b differs from b by {miss[worst]:.3g} in row {worst} (scaled to unit "
+        f"length). Rows concerned: {', '.join(map(str, rows[:10]))}{', ...' if len(rows) > 10 else ''}; "
+        "remove one of them or change its target",
+        rows=rows.tolist(),
+    )
+
+
+# -- projectors (eqs. 96, 97) -----------------------------------------------------------------------
+
+
+def perpendicular_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """P_perp = A+ A onto the space of constraint forces (notes eq. 97)."""
+    V = row_space(matrix, rtol)
+    return np.asarray(V @ V.T)
+
+
+def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """P_par = 1 - A+ A onto the space of admissible displacements (notes eq. 96)."""
+    P = perpendicular_projector(matrix, rtol)
+    return np.eye(len(P)) - P
+
+
+def velocity_projector(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """M_par+ M = 1 - M^-1/2 B+ B M^1/2, the projector of velocities, orthogonal in the mass metric."""
+    A = _matrix(matrix)
+    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    V = row_space(A / root_m, rtol)
+    return np.asarray(np.eye(A.shape[1]) - (V / root_m[:, None]) @ (V.T * root_m))
+
+
+def project_velocities(
+    matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
+) -> FloatArray:
+    """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
+    A = _matrix(matrix)
+    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    flat = _vector(v, A.shape[1], "v")
+    correction = pseudo_inverse(A / root_m, rtol).matrix @ (A @ flat - np.broadcast_to(c, (len(A),)))
+    return (flat - correction / root_m).reshape(np.shape(v))
+
+
+# -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
+
+
+def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+    """M_par+ = (P_par M P_par)+ = M^-1/2 (1 - B+ B) M^-1/2, shape (3N, 3N) (notes eqs. 106, 107).
+
+    With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
+    """
+    A = _matrix(matrix)
+    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    return parallel_projector(A / root_m, rtol) / np.outer(root_m, root_m)
+
+
+def multipliers(
+    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
+) -> FloatArray:
+    """The multipliers of z = A^T lambda, shape (s,); of least norm, in the rows as they are (notes eqs. 101-103).
+
+    (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
+    """
+    A = _matrix(matrix)
+    m = _mass_diagonal(masses, A.shape[1])
+    B_plus = pseudo_inverse(A / np.sqrt(m), rtol).matrix
+    right = _vector(b, len(A), "b") - A @ (_vector(f, A.shape[1], "f") / m)
+    return np.asarray(B_plus.T @ (B_plus @ right))
+
+
+def constraint_force(
+    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
+) -> FloatArray:
+    """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
+    A = _matrix(matrix)
+    m = _mass_diagonal(masses, A.shape[1])
+    root_m = np.sqrt(m)
+    right = _vector(b, len(A), "b") - A @ (_vector(f, A.shape[1], "f") / m)
+    z = root_m * (pseudo_inverse(A / root_m, rtol).matrix @ right)
+    return np.asarray(z).reshape(np.shape(f))
+
+
+def acceleration(
+    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
+) -> FloatArray:
+    """M_par+ f + M^-1 A^T (A M^-1 A^T)^-1 b, in the shape of f (notes eq. 105, corrected).
+
+    The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
+    """
+    A = _matrix(matrix)
+    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f")
+    driven = (pseudo_inverse(A / root_m, rtol).matrix @ _vector(b, len(A), "b")) / root_m
+    return np.asarray(free + driven).reshape(np.shape(f))
+
+
+def bott_duffin(
+    matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
+) -> BottDuffinSolution:
+    """Acceleration and constraint force as one linear problem (notes eqs. 98-100).
+
+    M (a_par + A+ b) = f + z with a_par in V_par and z in V_perp. Both parts sit in one vector u, with
+    a_par = P_par u and z = P_perp u, and (M P_par - P_perp) u = f - M A+ b has one solution. No mass-weighted
+    matrix and no multipliers: an independent way to the same answer.
+    """
+    A = _matrix(matrix)
+    m = _mass_diagonal(masses, A.shape[1])
+    P_perp = perpendicular_projector(A, rtol)
+    P_par = np.eye(len(m)) - P_perp
+    a_perp = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b")
+    # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
+    unit = float(np.exp(np.mean(np.log(m))))
+    u = np.linalg.solve(m[:, None] * P_par - unit * P_perp, _vector(f, len(m), "f") - m * a_perp)
+    shape = np.shape(f)
+    return BottDuffinSolution((P_par @ u + a_perp).reshape(shape), unit * (P_perp @ u).reshape(shape))
+
+
+def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
+    """Gauss's constraint of a trial acceleration, (1/2) |M^-1/2 (M a - f)|^2 (notes eqs. 89, 123).
+
+    Among all accelerations with A a = b the true one has the least; there it is (1/2) z^T M^-1 z.
+    """
+    a = np.asarray(trial, dtype=np.float64).ravel()
+    m = _mass_diagonal(masses, len(a))
+    return float(0.5 * np.sum((m * a - _vector(f, len(a), "f")) ** 2 / m))
+
+
+# -- pieces -----------------------------------------------------------------------------------------
+
+
+def _matrix(values: ArrayLike) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2:
+        raise InputError(f"a matrix has two axes, not shape {array.shape}", item="matrix")
+    if not np.all(np.isfinite(array)):
+        row = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise InputError(f"row {row} of the matrix has a NaN or infinity", item="matrix")
+    return array
+
+
+def _vector(values: ArrayLike, length: int, item: str) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64).ravel()
+    if len(array) != length:
+        raise InputError(f"{item} must have {length} entries, not {len(array)}", item=item)
+    return array
+
+
+def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
+    """The diagonal of M, shape (n,), from n/3 or n masses (notes eq. 79)."""
+    m = np.asarray(masses, dtype=np.float64).ravel()
+    if 3 * len(m) == n:
+        m = np.repeat(m, 3)
+    if len(m) != n:
+        raise InputError(f"masses must have {n // 3} or {n} entries, not {len(m)}", item="masses")
+    if not np.all(np.isfinite(m) & (m > 0)):
+        raise InputError("masses must be positive and finite; hold an atom by three rows instead", item="masses")
+    return m
+
+
+def _row_sizes(A: FloatArray) -> FloatArray:
+    """Lengths of the rows, 1 for rows that vanish, shape (s,)."""
+    sizes = np.linalg.norm(A, axis=1)
+    return np.where(sizes > 0, sizes, 1.0)
+
+
+def _unit_rows(A: FloatArray) -> FloatArray:
+    return A / _row_sizes(A)[:, None]
+
+
+def _count(singular: FloatArray, rtol: float) -> int:
+    return int(np.sum(singular > rtol * singular[0])) if len(singular) and singular[0] > 0 else 0
+
+
+def _left_inverse(F: FloatArray) -> FloatArray:
+    """F+ = (F^T F)^-1 F^T of a matrix with independent columns.
+
+    By QR with the long rows first and columns exchanged, which keeps the digits of short rows.
+    """
+    if F.size == 0:
+        return np.zeros(F.shape[::-1])
+    order = np.argsort(-np.linalg.norm(F, axis=1), kind="stable")
+    Q, R, columns = scipy.linalg.qr(F[order], mode="economic", pivoting=True)
+    inverse = np.empty(F.shape[::-1])
+    inverse[np.ix_(columns, order)] = scipy.linalg.solve_triangular(R, Q.T)
+    return inverse
+
+
+def _relative(residual: FloatArray, size: float) -> float:
+    largest = float(np.max(np.abs(residual)))
+    return largest / float(size if size > 0 else (np.inf if largest > 0 else 0.0)

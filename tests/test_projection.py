@@ -1,0 +1,481 @@
+"""The dense oracle: Penrose's conditions, projectors, Gauss's principle, closed forms."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kcons import projection
+from kcons.errors import ContradictionError, InputError
+
+
+class Problem(NamedTuple):
+    """A random constrained problem: `rows` of rank `rank` on `atoms` atoms, b in the range of A."""
+
+    A: np.ndarray
+    masses: np.ndarray
+    f: np.ndarray
+    b: np.ndarray
+    rank: int
+    rng: np.random.Generator
+
+
+def make_problem(seed: int, atoms: int, rows: int, rank: int, decades: float, mass_decades: float = 1.0) -> Problem:
+    """Rows of given rank and moderate condition, each multiplied by up to 10^(+-decades)."""
+    rng = np.random.default_rng(seed)
+    n = 3 * atoms
+    rank = min(rank, rows, n)
+    left = np.linalg.qr(rng.normal(size=(rows, rank)))[0] if rank else np.zeros((rows, 0))
+    right = np.linalg.qr(rng.normal(size=(n, rank)))[0] if rank else np.zeros((n, 0))
+    A = left * rng.uniform(0.3, 1.0, rank) @ right.T
+    A *= 10 ** rng.uniform(-decades, decades, (rows, 1))
+    masses = 10 ** rng.uniform(-mass_decades, mass_decades, atoms)
+    return Problem(A, masses, rng.normal(size=(atoms, 3)), A @ rng.normal(size=n), rank, rng)
+
+
+def problems(decades: float = 0.5) -> st.SearchStrategy[Problem]:
+    return st.builds(
+        make_problem,
+        seed=st.integers(0, 2**32 - 1),
+        atoms=st.integers(1, 5),
+        rows=st.integers(0, 9),
+        rank=st.integers(0, 9),
+        decades=st.just(decades),
+    )
+
+
+PROPERTY = settings(max_examples=60, deadline=None)
+LITERAL = [
+    pytest.param(np.zeros((0, 6)), 0, id="no rows"),
+    pytest.param(np.zeros((2, 3)), 0, id="rows of zeros"),
+    pytest.param(np.array([[0.0, 0, 0], [1.0, 2, 2]]), 1, id="a row of zeros among others"),
+    pytest.param(np.array([[1.0, 2, 2], [1.0, 2, 2]]), 1, id="a row twice"),
+    pytest.param(np.array([[1.0, 2, 2], [-3e6, -6e6, -6e6]]), 1, id="a row twice in other units"),
+    pytest.param(np.array([[1.0, 0, 0], [0, 1.0, 0], [1.0, 1.0, 0]]), 2, id="sum of two rows"),
+    pytest.param(np.vstack([np.eye(3), np.ones((4, 3))]), 3, id="more rows than columns"),
+    pytest.param(np.array([[1e-150, 0, 0], [0, 1e150, 0]]), 2, id="300 decades"),
+    pytest.param(np.array([[1.0, 0, 0], [1.0, 1e-8, 0]]), 2, id="nearly dependent, above the cut"),
+    pytest.param(np.array([[1.0, 0, 0], [1.0, 1e-12, 0]]), 1, id="nearly dependent, below the cut"),
+]
+
+
+# -- generalized inverses ---------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(problems(decades=0.5))
+def test_penrose_conditions(p: Problem) -> None:
+    inverse = projection.pseudo_inverse(p.A)
+    assert inverse.rank == p.rank
+    assert max(projection.penrose_residuals(p.A, inverse.matrix)) < 2e-14
+
+
+@PROPERTY
+@given(problems(decades=8))
+def test_penrose_conditions_with_rows_of_wildly_different_scale(p: Problem) -> None:
+    inverse = projection.pseudo_inverse(p.A)
+    assert inverse.rank == p.rank
+    residuals = projection.penrose_residuals(p.A, inverse.matrix)
+    assert max(residuals) < 2e-13
+
+
+@pytest.mark.parametrize(("A", "rank"), LITERAL)
+def test_penrose_conditions_in_literal_cases(A: np.ndarray, rank: int) -> None:
+    inverse = projection.pseudo_inverse(A)
+    assert inverse.rank == rank == projection.rank(A)
+    # Below the cut the discarded part itself, 1e-12, is the residual.
+    cut = 1e-11 if rank == 1 and A[-1, 1] == 1e-12 else 1e-14
+    assert max(projection.penrose_residuals(A, inverse.matrix)) < cut
+
+
+@pytest.mark.parametrize("condition", range(4))
+def test_penrose_residuals_see_each_violation(condition: int) -> None:
+    A = np.array([[1.0, 0, 0], [0, 2.0, 0], [1.0, 2.0, 0]])
+    X = np.linalg.pinv(A)
+    V, W = projection.perpendicular_projector(A), projection.perpendicular_projector(A.T)
+    e, g = np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.7, 0.4])
+    outside_rows, outside_columns = g - V @ g, e - W @ e
+    wrong = [
+        0.9 * X,  # A X A = A fails, and with it X A X = X; the symmetries hold
+        X + np.outer(outside_rows, outside_columns),  # X A X = X alone
+        X + np.outer(V @ g, outside_columns),  # (A X)^T = A X alone
+        X + np.outer(outside_rows, W @ e),  # (X A)^T = X A alone
+    ][condition]
+    residuals = np.array(projection.penrose_residuals(A, wrong))
+    expected = {0: [0, 1], 1: [1], 2: [2], 3: [3]}[condition]
+    assert np.all(residuals[expected] > 1e-3)
+    assert np.all(np.delete(residuals, expected) < 1e-14)
+
+
+@PROPERTY
+@given(problems(decades=0.5))
+def test_singular_values_and_full_rank_factors_agree(p: Problem) -> None:
+    F, G = projection.full_rank_factors(p.A)
+    assert F.shape == (len(p.A), p.rank)
+    assert G.shape == (p.rank, p.A.shape[1])
+    np.testing.assert_allclose(F @ G, p.A, rtol=0, atol=2e-15 * (1 + np.abs(p.A).max(initial=0)))
+    ours = projection.pseudo_inverse(p.A).matrix
+    theirs = projection.full_rank_pseudo_inverse(F, G)
+    assert ours.shape == theirs.shape
+    np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-11 * np.abs(ours).max(initial=1e-300))
+
+
+def test_independent_rows_of_any_scale_keep_all_digits() -> None:
+    """(D U)+ = U+ D^-1 for independent rows, column by column and not only in norm."""
+    p = make_problem(seed=5, atoms=4, rows=6, rank=6, decades=0)
+    scales = 10.0 ** np.array([-40.0, -9, -3, 0, 7, 40])
+    expected = p.A.T @ np.linalg.inv(p.A @ p.A.T) / scales
+    found = projection.pseudo_inverse(p.A * scales[:, None]).matrix
+    error = np.linalg.norm(found - expected, axis=0) / np.linalg.norm(expected, axis=0)
+    assert error.max() < 1e-13
+
+
+def test_rank_does_not_depend_on_units() -> None:
+    rng = np.random.default_rng(2)
+    A = np.vstack([rng.normal(size=(4, 9))] * 2)
+    for scale in (1e-12, 1.0, 1e12):
+        scaled = A.copy()
+        scaled[3] *= scale
+        assert projection.rank(scaled) == 4
+        assert projection.full_rank_factors(scaled)[0].shape[1] == 4
+
+
+@PROPERTY
+@given(problems())
+def test_general_solution_solves_and_reaches_every_solution(p: Problem) -> None:
+    x0 = p.rng.normal(size=p.A.shape[1])
+    y = p.rng.normal(size=p.A.shape[1])
+    b = p.A @ x0
+    x = projection.general_solution(p.A, b, y)
+    np.testing.assert_allclose(p.A @ x, b, rtol=0, atol=1e-13 * (1 + np.abs(b).max(initial=0)))
+    # With y a solution it is that solution; with y = 0 it is the shortest one.
+    np.testing.assert_allclose(projection.general_solution(p.A, b, x0), x0, rtol=0, atol=1e-12)
+    shortest = projection.general_solution(p.A, b, np.zeros_like(y))
+    assert np.linalg.norm(shortest) <= np.linalg.norm(x) * (1 + 1e-12)
+    assert abs(shortest @ (x - shortest)) < 1e-12
+
+
+# -- projectors -------------------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(problems(decades=3))
+def test_projectors(p: Problem) -> None:
+    perpendicular, parallel = projection.perpendicular_projector(p.A), projection.parallel_projector(p.A)
+    np.testing.assert_allclose(perpendicular + parallel, np.eye(p.A.shape[1]), rtol=0, atol=1e-15)
+    for P, dimension in ((perpendicular, p.rank), (parallel, p.A.shape[1] - p.rank)):
+        np.testing.assert_allclose(P @ P, P, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(P.T, P, rtol=0, atol=1e-15)
+        assert np.trace(P) == pytest.approx(dimension, abs=1e-13)
+    unit = p.A / np.maximum(np.linalg.norm(p.A, axis=1, keepdims=True), 1e-300)
+    np.testing.assert_allclose(unit @ perpendicular, unit, rtol=0, atol=1e-13)
+
+
+@PROPERTY
+@given(problems(decades=0.5))
+def test_perpendicular_projector_is_the_product_it_is_named_after(p: Problem) -> None:
+    literal = projection.pseudo_inverse(p.A).matrix @ p.A
+    np.testing.assert_allclose(projection.perpendicular_projector(p.A), literal, rtol=0, atol=1e-12)
+
+
+@PROPERTY
+@given(problems())
+def test_velocity_projection(p: Problem) -> None:
+    m = np.repeat(p.masses, 3)
+    v = p.rng.normal(size=p.f.shape)
+    admissible = p.A @ p.rng.normal(size=len(m))
+    projector = projection.velocity_projector(p.A, p.masses)
+    projected = projection.project_velocities(p.A, p.masses, v)
+    assert projected.shape == v.shape
+    np.testing.assert_allclose(projector @ v.ravel(), projected.ravel(), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(projector @ projector, projector, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(p.A @ projected.ravel(), 0, rtol=0, atol=1e-13)
+    # Energy splits: orthogonal in the mass metric, so it can only decrease.
+    change = (v - projected).ravel()
+    assert abs(np.sum(m * change * projected.ravel())) < 1e-12 * np.sum(m * v.ravel() ** 2)
+    np.testing.assert_allclose(
+        projector, projection.constrained_inverse(p.A, p.masses) * m, rtol=0, atol=1e-14 * m.max() / m.min()
+    )
+    moved = projection.project_velocities(p.A, p.masses, v, admissible)
+    np.testing.assert_allclose(p.A @ moved.ravel(), admissible, rtol=0, atol=1e-12 * (1 + np.abs(v).max()))
+
+
+# -- dynamics ---------------------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(problems())
+def test_constrained_inverse_is_the_pseudo_inverse_of_the_projected_mass(p: Problem) -> None:
+    found = projection.constrained_inverse(p.A, p.masses)
+    P = projection.parallel_projector(p.A)
+    projected_mass = P @ np.diag(np.repeat(p.masses, 3)) @ P
+    values, vectors = np.linalg.eigh(projected_mass)
+    kept = values > 1e-10 * p.masses.max()
+    assert kept.sum() == p.A.shape[1] - p.rank
+    expected = vectors[:, kept] / values[kept] @ vectors[:, kept].T
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * (1 / p.masses).max())
+
+
+@PROPERTY
+@given(seed=st.integers(0, 2**32 - 1), atoms=st.integers(1, 5), rows=st.integers(1, 15))
+def test_independent_rows_give_the_formulas_with_the_inverse(seed: int, atoms: int, rows: int) -> None:
+    rows = min(rows, 3 * atoms)
+    p = make_problem(seed, atoms, rows, rows, decades=0.5)
+    m = np.repeat(p.masses, 3)
+    inverse = np.linalg.inv(p.A / m @ p.A.T)
+    lam = inverse @ (p.b - p.A @ (p.f.ravel() / m))
+    literal = np.diag(1 / m) - (p.A / m).T @ inverse @ (p.A / m)
+    close = 1e-11 * np.abs(1 / m).max()
+    np.testing.assert_allclose(projection.constrained_inverse(p.A, p.masses), literal, rtol=0, atol=close)
+    np.testing.assert_allclose(
+        projection.multipliers(p.A, p.masses, p.f, p.b), lam, rtol=0, atol=1e-11 * np.abs(lam).max()
+    )
+    z = p.A.T @ lam
+    np.testing.assert_allclose(
+        projection.constraint_force(p.A, p.masses, p.f, p.b).ravel(), z, rtol=0, atol=1e-11 * np.abs(z).max()
+    )
+    a = literal @ p.f.ravel() + (p.A / m).T @ inverse @ p.b
+    np.testing.assert_allclose(
+        projection.acceleration(p.A, p.masses, p.f, p.b).ravel(), a, rtol=0, atol=1e-11 * np.abs(a).max()
+    )
+
+
+@PROPERTY
+@given(problems())
+def test_equation_of_motion(p: Problem) -> None:
+    """A a = b, M a = f + z, z = A^T lambda, and Bott & Duffin's linear problem has the same solution."""
+    a = projection.acceleration(p.A, p.masses, p.f, p.b)
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b)
+    lam = projection.multipliers(p.A, p.masses, p.f, p.b)
+    size = np.abs(a).max() + np.abs(z).max() + np.abs(p.f / p.masses[:, None]).max()
+    assert a.shape == z.shape == p.f.shape
+    np.testing.assert_allclose(p.A @ a.ravel(), p.b, rtol=0, atol=1e-13 * size * (1 + np.abs(p.A).max(initial=0)))
+    np.testing.assert_allclose(p.masses[:, None] * a, p.f + z, rtol=0, atol=1e-13 * size * p.masses.max())
+    np.testing.assert_allclose(p.A.T @ lam, z.ravel(), rtol=0, atol=1e-13 * size)
+    solution = projection.bott_duffin(p.A, p.masses, p.f, p.b)
+    np.testing.assert_allclose(solution.acceleration, a, rtol=0, atol=1e-11 * size)
+    np.testing.assert_allclose(solution.constraint_force, z, rtol=0, atol=1e-11 * size * max(1, p.masses.max()))
+
+
+@PROPERTY
+@given(problems())
+def test_gauss_function_is_least_among_admissible_accelerations(p: Problem) -> None:
+    a = projection.acceleration(p.A, p.masses, p.f, p.b)
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b)
+    least = projection.gauss_function(a, p.masses, p.f)
+    half = 0.5 * np.sum(z**2 / p.masses[:, None])
+    assert least == pytest.approx(half, rel=1e-10, abs=1e-24)
+    if p.rank == a.size:
+        return  # nothing else is admissible
+    # Second-order growth: G(a + h d) - G(a) = h^2 (1/2) d^T M d, with no linear term.
+    d = (projection.parallel_projector(p.A) @ p.rng.normal(size=a.size)).reshape(a.shape)
+    growth = 0.5 * np.sum(p.masses[:, None] * d**2)
+    for h in (1.0, -1.0, 0.1, -0.1, 1e-2, -1e-2):
+        change = projection.gauss_function(a + h * d, p.masses, p.f) - least
+        assert change > 0
+        assert change == pytest.approx(h**2 * growth, rel=1e-9, abs=1e-12 * (least + growth))
+
+
+@PROPERTY
+@given(problems())
+def test_dalembert_constraint_force_does_no_work_on_tangent_displacements(p: Problem) -> None:
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b).ravel()
+    any_displacement = p.rng.normal(size=len(z))
+    delta = projection.parallel_projector(p.A) @ any_displacement
+    assert abs(z @ delta) <= 1e-13 * np.linalg.norm(z) * np.linalg.norm(any_displacement)
+
+
+@PROPERTY
+@given(problems(), st.floats(-6, 6))
+def test_scaling_a_row_changes_nothing_but_its_multiplier(p: Problem, exponent: float) -> None:
+    if len(p.A) == 0 or p.rank < len(p.A):
+        return
+    scaled_A, scaled_b = p.A.copy(), p.b.copy()
+    scaled_A[0] *= 10**exponent
+    scaled_b[0] *= 10**exponent
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b)
+    close = 1e-12 * np.abs(z).max()
+    np.testing.assert_allclose(projection.constraint_force(scaled_A, p.masses, p.f, scaled_b), z, rtol=0, atol=close)
+    lam = projection.multipliers(p.A, p.masses, p.f, p.b)
+    found = projection.multipliers(scaled_A, p.masses, p.f, scaled_b)
+    assert found[0] * 10**exponent == pytest.approx(lam[0], rel=1e-10, abs=1e-12 * np.abs(lam).max())
+    np.testing.assert_allclose(found[1:], lam[1:], rtol=0, atol=1e-11 * np.abs(lam).max())
+
+
+@PROPERTY
+@given(problems(), st.data())
+def test_dependent_rows_leave_the_motion_unique_and_the_multipliers_shortest(p: Problem, data: st.DataObject) -> None:
+    if len(p.A) == 0:
+        return
+    extra = data.draw(st.integers(1, 4))
+    mix = p.rng.uniform(-1, 1, (extra, len(p.A)))
+    A, b = np.vstack([p.A, mix @ p.A]), np.concatenate([p.b, mix @ p.b])
+    assert projection.rank(A) == p.rank
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b)
+    close = 1e-11 * (np.abs(z).max() + 1e-3)
+    np.testing.assert_allclose(projection.constraint_force(A, p.masses, p.f, b), z, rtol=0, atol=close)
+    lam = projection.multipliers(A, p.masses, p.f, b)
+    np.testing.assert_allclose(A.T @ lam, z.ravel(), rtol=0, atol=close)
+    # Least norm: orthogonal to every combination of rows that vanishes.
+    np.testing.assert_allclose(projection.parallel_projector(A.T) @ lam, 0, rtol=0, atol=1e-11 * np.abs(lam).max())
+
+
+def test_least_norm_refers_to_the_rows_as_they_are() -> None:
+    """One row twice, the second time with twice the length: A^T lambda fixes l1 + 2 l2, so l = s (1, 2)/5."""
+    row = np.array([1.0, 0, 0])
+    lam = projection.multipliers(np.vstack([row, 2 * row]), [3.0], [-7.0, 0, 0], [0.0, 0.0])
+    np.testing.assert_allclose(lam, [7 / 5, 14 / 5], rtol=1e-14)
+
+
+def test_masses_per_atom_and_per_component_are_the_same() -> None:
+    p = make_problem(seed=8, atoms=3, rows=4, rank=4, decades=0)
+    per_component = np.repeat(p.masses, 3)
+    flat = projection.acceleration(p.A, per_component, p.f.ravel(), p.b)
+    assert flat.shape == (9,)
+    np.testing.assert_array_equal(flat.reshape(3, 3), projection.acceleration(p.A, p.masses, p.f, p.b))
+
+
+# -- closed forms -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", ["square", "length"])
+def test_sphere_closed_form(row: str) -> None:
+    """Notes example 4, eq. 110: a = (1 - x x^T/R^2) f/m - (v.v/R^2) x, whichever coordinate the row holds."""
+    rng = np.random.default_rng(110)
+    for _ in range(20):
+        radius, mass = rng.uniform(0.5, 5), rng.uniform(0.1, 20)
+        x = rng.normal(size=3)
+        x *= radius / np.linalg.norm(x)
+        f, v = rng.normal(size=3), rng.normal(size=3)
+        v -= (v @ x) / radius**2 * x
+        if row == "square":  # sigma = x.x - R^2
+            A, b = 2 * x[None], [-2 * v @ v]
+        else:  # sigma = |x| - R
+            A, b = x[None] / radius, [-v @ v / radius]
+        expected = f / mass - (x @ f) / radius**2 * x / mass - (v @ v) / radius**2 * x
+        np.testing.assert_allclose(
+            projection.acceleration(A, [mass], f, b), expected, rtol=0, atol=1e-14 * np.abs(expected).max()
+        )
+        solution = projection.bott_duffin(A, [mass], f, b)
+        np.testing.assert_allclose(solution.acceleration, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+def test_distance_closed_form() -> None:
+    """Two atoms: z_1 = -z_2 = -n mu (|v_12|^2/d + n.(f_1/m_1 - f_2/m_2)), mu the reduced mass."""
+    rng = np.random.default_rng(83)
+    for _ in range(20):
+        m1, m2 = 10 ** rng.uniform(-2, 2, 2)
+        x, v, f = rng.normal(size=(3, 2, 3))
+        d = x[0] - x[1]
+        length = np.linalg.norm(d)
+        n = d / length
+        u = v[0] - v[1]
+        u -= (u @ n) * n
+        v[0] = v[1] + u
+        reduced = m1 * m2 / (m1 + m2)
+        tension = reduced * (u @ u / length + n @ (f[0] / m1 - f[1] / m2))
+        expected = np.array([-tension * n, tension * n])
+        A, b = 2 * np.concatenate([d, -d])[None], [-2 * u @ u]
+        z = projection.constraint_force(A, [m1, m2], f, b)
+        np.testing.assert_allclose(z, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+        (lam,) = projection.multipliers(A, [m1, m2], f, b)
+        assert lam == pytest.approx(-tension / (2 * length), rel=1e-12)
+
+
+def test_isokinetic_closed_form() -> None:
+    """Notes example 5, eq. 113: A = v^T M, b = 0 gives M a = f - alpha M v, alpha = v.f/2K."""
+    rng = np.random.default_rng(113)
+    masses = np.array([1.0, 2.5, 0.6])
+    v, f = rng.normal(size=(2, 3, 3))
+    row = (masses[:, None] * v).reshape(1, -1)
+    alpha = np.sum(v * f) / np.sum(masses[:, None] * v**2)
+    expected = f / masses[:, None] - alpha * v
+    np.testing.assert_allclose(projection.acceleration(row, masses, f, [0.0]), expected, rtol=0, atol=1e-14)
+
+
+def test_an_atom_held_in_place_takes_the_whole_force() -> None:
+    f = np.array([[1.0, -2, 3], [4, 5, 6]])
+    A = np.eye(6)[:3]
+    z = projection.constraint_force(A, [2.0, 3.0], f, np.zeros(3))
+    np.testing.assert_allclose(z, [-f[0], [0, 0, 0]], rtol=1e-15)
+    np.testing.assert_allclose(
+        projection.acceleration(A, [2.0, 3.0], f, np.zeros(3)), [[0, 0, 0], f[1] / 3], rtol=1e-15
+    )
+
+
+# -- solvability ------------------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(problems(decades=4))
+def test_right_hand_sides_in_the_range_are_solvable(p: Problem) -> None:
+    # b is rounded row by row; scaled to unit rows that is 1e-16 of its size.
+    assert projection.is_solvable(p.A, p.b)
+    projection.require_solvable(p.A, p.b)
+
+
+@PROPERTY
+@given(problems(decades=4))
+def test_right_hand_sides_off_the_range_are_refused(p: Problem) -> None:
+    if p.rank == len(p.A) or p.rank == 0:
+        return
+    unit = p.A / np.linalg.norm(p.A, axis=1, keepdims=True)
+    outside = projection.parallel_projector(unit.T) @ p.rng.normal(size=len(unit))
+    b = p.b + 1e-3 * outside / np.abs(outside).max() * np.linalg.norm(p.A, axis=1)
+    assert not projection.is_solvable(p.A, b)
+    with pytest.raises(ContradictionError, match=r"contradict each other.*remove one"):
+        projection.require_solvable(p.A, b)
+
+
+def test_contradiction_names_its_rows() -> None:
+    A = np.zeros((5, 9))
+    A[[0, 1, 2, 3], [0, 4, 8, 4]] = 1.0
+    A[4, 5] = 1.0
+    with pytest.raises(ContradictionError) as caught:
+        projection.require_solvable(A, [1.0, 2.0, 3.0, 2.5, 0.0])
+    assert caught.value.rows == (1, 3)
+    assert "1, 3" in str(caught.value)
+
+
+def test_a_row_of_zeros_asks_for_nothing_or_for_the_impossible() -> None:
+    A = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    assert projection.is_solvable(A, [0.0, 2.0])
+    assert not projection.is_solvable(A, [1.0, 2.0])
+    with pytest.raises(ContradictionError):
+        projection.require_solvable(A, [1.0, 2.0])
+
+
+# -- errors and architecture ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("masses", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan], [1.0, np.inf], [1.0], np.ones(5)])
+def test_bad_masses_are_refused(masses: list[float]) -> None:
+    with pytest.raises(InputError, match="masses must") as caught:
+        projection.acceleration(np.ones((1, 6)), masses, np.zeros(6), [0.0])
+    assert caught.value.item == "masses"
+
+
+def test_bad_arrays_are_refused() -> None:
+    with pytest.raises(InputError, match="two axes"):
+        projection.pseudo_inverse(np.ones(3))
+    with pytest.raises(InputError, match="row 1"):
+        projection.pseudo_inverse([[1.0, 2.0], [np.nan, 0.0]])
+    with pytest.raises(InputError, match="f must have 6"):
+        projection.multipliers(np.ones((1, 6)), [1.0, 1.0], np.zeros(5), [0.0])
+    with pytest.raises(InputError, match="b must have 1"):
+        projection.constraint_force(np.ones((1, 6)), [1.0, 1.0], np.zeros(6), [0.0, 0.0])
+    with pytest.raises(InputError, match="inverse"):
+        projection.penrose_residuals(np.ones((1, 6)), np.ones((1, 6)))
+
+
+def test_the_oracle_shares_no_code_with_the_engine() -> None:
+    tree = ast.parse(Path(projection.__file__).read_text(encoding="utf-8"))
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert {name for name in imported if name and name.startswith("kcons")} == {"kcons.errors"}
