@@ -382,4 +382,4 @@ def _left_inverse(F: FloatArray) -> FloatArray:
 
 def _relative(residual: FloatArray, size: float) -> float:
     largest = float(np.max(np.abs(residual)))
-    return largest / float(size if size > 0 else (np.inf if largest > 0 else 0.0)
+    return largest / size if size > 0 else (np.inf if largest > 0 else 0.0)
