@@ -6,7 +6,7 @@ the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 
 class KconsError(Exception):
@@ -24,7 +24,7 @@ class InputError(KconsError, ValueError):
         The atoms concerned, if any.
     """
 
-    def __init__(self, message: str, *, item: str = "", atoms: Sequence[int] = ()) -> None:
+    def __init__(self, message: str, *, item: str = "", atoms: Iterable[int] = ()) -> None:
         super().__init__(message)
         self.item = item
         self.atoms = tuple(int(a) for a in atoms)
@@ -41,7 +41,7 @@ class ConstraintError(KconsError, ValueError):
         The atoms concerned.
     """
 
-    def __init__(self, message: str, *, rows: Sequence[int] = (), atoms: Sequence[int] = ()) -> None:
+    def __init__(self, message: str, *, rows: Iterable[int] = (), atoms: Sequence[int] = ()) -> None:
         super().__init__(message)
         self.rows = tuple(int(r) for r in rows)
         self.atoms = tuple(int(a) for a in atoms)
@@ -86,7 +86,7 @@ class ConvergenceError(KconsError, RuntimeError):
         tolerance: float = float("nan"),
         iterations: int = 0,
         row: int = -1,
-        atoms: Sequence[int] = (),
+        atoms: Iterable[int] = (),
         cluster: int = -1,
         step: int | None = None,
     ) -> None:
