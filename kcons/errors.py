@@ -41,7 +41,7 @@ class ConstraintError(KconsError, ValueError):
         The atoms concerned.
     """
 
-    def __init__(self, message: str, *, rows: Iterable[int] = (), atoms: Sequence[int] = ()) -> None:
+    def __init__(self, message: str, *, rows: Iterable[int] = (), atoms: Iterable[int] = ()) -> None:
         super().__init__(message)
         self.rows = tuple(int(r) for r in rows)
         self.atoms = tuple(int(a) for a in atoms)
