@@ -1,0 +1,380 @@
+"""Sparse elimination of A M^-1 A^T: order and pattern found once, numbers filled in at every solve.
+
+Rows are eliminated by minimum degree (leaf first: trees have no fill), then renumbered in postorder of
+the elimination tree, so that clusters, and branches within them, lie together in memory. The pattern
+is symmetric; the numbers need not be (Newton's matrix for positions is not).
+
+Storage, in elimination order: row k has diagonal `diagonal[k]` and, for every later row l = `columns[e]`
+coupled to it, e in [start[k], start[k+1]), the pair upper[e] = A_kl and lower[e] = A_lk. Eliminating k
+changes the pairs of its later rows; `targets` lists, pair by pair, which entry each one changes.
+
+References
+----------
+George & Liu, Computer Solution of Large Sparse Positive Definite Systems (1981), chapters 4 and 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kcons.constraints.constraint import IntArray
+
+UIntArray = NDArray[np.uint32]
+
+#: `nnan` and `ninf` are left out on purpose: a NaN must fail every comparison with a tolerance.
+FAST = {"contract", "arcp", "nsz"}
+
+#: A pivot below this part of its diagonal marks a row that depends on earlier ones.
+PIVOT_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Elimination order and the pattern of the factors.
+
+    Attributes
+    ----------
+    order : ndarray of int, shape (n_rows,)
+        ``order[k]`` is the original row eliminated as number k.
+    clusters : ndarray of int64, shape (n_clusters + 1,)
+        Rows clusters[c] to clusters[c + 1] form cluster c.
+    start : ndarray of int64, shape (n_rows + 1,)
+    columns : ndarray of uint32
+        Later rows coupled to each row.
+    target_start : ndarray of int64, shape (n_rows + 1,)
+    targets : ndarray of uint32
+        Entries changed by eliminating a row, for p < q over its entries: that of (column p, column q).
+    """
+
+    order: IntArray
+    clusters: IntArray
+    start: IntArray
+    columns: UIntArray
+    target_start: IntArray
+    targets: UIntArray
+
+
+def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Pattern:
+    """Order the rows and find the pattern of their factors.
+
+    Parameters
+    ----------
+    row_start, row_atoms : ndarray of int64
+        Atoms of each row, compressed (row k: ``row_atoms[row_start[k]:row_start[k + 1]]``), only those
+        through which rows are coupled: atoms of infinite mass are left out.
+    n_atoms : int
+        Number of atoms.
+    """
+    position, struct_start, struct = _minimum_degree(row_start, row_atoms, n_atoms)
+    order, clusters, start, columns, target_start, targets = _finish(position, struct_start, struct)
+    return Pattern(order, clusters, start, columns, target_start, targets)
+
+
+@nb.njit(cache=True)
+def _minimum_degree(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-def]
+    """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
+    n = len(row_start) - 1
+    atom_start = np.zeros(n_atoms + 1, np.int64)
+    for a in row_atoms:
+        atom_start[a + 1] += 1
+    for a in range(n_atoms):
+        atom_start[a + 1] += atom_start[a]
+    fill = atom_start[:-1].copy()
+    atom_rows = np.empty(len(row_atoms), np.int32)
+    for k in range(n):
+        for p in range(row_start[k], row_start[k + 1]):
+            a = row_atoms[p]
+            atom_rows[fill[a]] = k
+            fill[a] += 1
+
+    mark = np.full(n, -1, np.int32)
+    begin = np.empty(n, np.int64)
+    count = np.zeros(n, np.int32)
+    room = np.empty(n, np.int32)
+    pool = np.empty(max(16, 8 * n), np.int32)
+    used = 0
+    for k in range(n):
+        begin[k] = used
+        mark[k] = k
+        for p in range(row_start[k], row_start[k + 1]):
+            a = row_atoms[p]
+            for q in range(atom_start[a], atom_start[a + 1]):
+                other = atom_rows[q]
+                if mark[other] != k:
+                    mark[other] = k
+                    if used + 1 >= len(pool):
+                        pool = _grown(pool, used)
+                    pool[used] = other
+                    used += 1
+                    count[k] += 1
+        room[k] = count[k]
+
+    # Doubly linked buckets of rows by degree; first in, first out peels all ends of a tree evenly.
+    head = np.full(n + 1, -1, np.int32)
+    tail = np.full(n + 1, -1, np.int32)
+    following = np.full(n, -1, np.int32)
+    preceding = np.full(n, -1, np.int32)
+    for k in range(n):
+        _push(head, tail, following, preceding, count[k], k)
+    position = np.full(n, -1, np.int64)
+    struct_start = np.zeros(n + 1, np.int64)
+    struct = np.empty(max(16, 4 * n), np.int32)
+    struct_used = 0
+    owner = np.empty(n, np.int64)
+    mark[:] = -1
+    lowest = 0
+    for step in range(n):
+        while head[lowest] < 0:
+            lowest += 1
+        k = head[lowest]
+        _unlink(head, tail, following, preceding, lowest, k)
+        position[k] = step
+        owner[step] = k
+        size = count[k]
+        while struct_used + size > len(struct):
+            struct = _grown(struct, struct_used)
+        base = begin[k]
+        for p in range(size):
+            struct[struct_used + p] = pool[base + p]
+        struct_start[step] = struct_used
+        for p in range(size):
+            i = struct[struct_used + p]
+            old = count[i]
+            first = begin[i]
+            # Drop k from i's list, then add those of k's neighbours that i does not know.
+            new = 0
+            for q in range(old):
+                j = pool[first + q]
+                if j != k:
+                    pool[first + new] = j
+                    mark[j] = i
+                    new += 1
+            mark[i] = i
+            missing = 0
+            for q in range(size):
+                if mark[struct[struct_used + q]] != i:
+                    missing += 1
+            if new + missing > room[i]:
+                need = new + missing + 4
+                while used + need > len(pool):
+                    pool = _grown(pool, used)
+                for q in range(new):
+                    pool[used + q] = pool[first + q]
+                begin[i] = used
+                first = used
+                room[i] = need
+                used += need
+            for q in range(size):
+                j = struct[struct_used + q]
+                if mark[j] != i:
+                    pool[first + new] = j
+                    new += 1
+            count[i] = new
+            if new != old:
+                _unlink(head, tail, following, preceding, old, i)
+                _push(head, tail, following, preceding, new, i)
+                if new < lowest:
+                    lowest = new
+        # mark holds row numbers i; rows are marked afresh for each i, but k must not look known.
+        struct_used += size
+    struct_start[n] = struct_used
+    # Patterns are stored by step; hand them back with their owners through `position`.
+    return position, struct_start, struct[:struct_used].copy()
+
+
+@nb.njit(cache=True)
+def _grown(array, used):  # type: ignore[no-untyped-def]
+    larger = np.empty(2 * len(array), array.dtype)
+    larger[:used] = array[:used]
+    return larger
+
+
+@nb.njit(cache=True)
+def _push(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
+    last = tail[degree]
+    preceding[k] = last
+    following[k] = -1
+    if last >= 0:
+        following[last] = k
+    else:
+        head[degree] = k
+    tail[degree] = k
+
+
+@nb.njit(cache=True)
+def _unlink(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
+    before, after = preceding[k], following[k]
+    if before >= 0:
+        following[before] = after
+    else:
+        head[degree] = after
+    if after >= 0:
+        preceding[after] = before
+    else:
+        tail[degree] = before
+
+
+@nb.njit(cache=True)
+def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
+    """Order by branches of the elimination tree, then columns and update targets in that order."""
+    n = len(position)
+    owner = np.empty(n, np.int64)
+    for k in range(n):
+        owner[position[k]] = k
+    # Parent: the earliest later row in the pattern (numbers below are elimination steps).
+    parent = np.full(n, -1, np.int64)
+    for step in range(n):
+        best = n
+        for p in range(struct_start[step], struct_start[step + 1]):
+            other = position[struct[p]]
+            if other < best:
+                best = other
+        if best < n:
+            parent[step] = best
+    step_of, clusters = _interleaved_postorder(parent)
+    new = np.empty(n, np.int64)
+    order = np.empty(n, np.int64)
+    for k in range(n):
+        new[step_of[k]] = k
+        order[k] = owner[step_of[k]]
+
+    start = np.zeros(n + 1, np.int64)
+    target_start = np.zeros(n + 1, np.int64)
+    for k in range(n):
+        step = step_of[k]
+        size = struct_start[step + 1] - struct_start[step]
+        start[k + 1] = start[k] + size
+        target_start[k + 1] = target_start[k] + size * (size - 1) // 2
+    columns = np.empty(start[n], np.uint32)
+    targets = np.empty(target_start[n], np.uint32)
+    for k in range(n):
+        step = step_of[k]
+        found = np.empty(start[k + 1] - start[k], np.int64)
+        for p in range(len(found)):
+            found[p] = new[position[struct[struct_start[step] + p]]]
+        found.sort()
+        for p in range(len(found)):
+            columns[start[k] + p] = found[p]
+    for k in range(n):
+        t = target_start[k]
+        for p in range(start[k], start[k + 1]):
+            e = start[columns[p]]
+            for q in range(p + 1, start[k + 1]):
+                while columns[e] != columns[q]:
+                    e += 1
+                targets[t] = e
+                t += 1
+    return order, clusters, start, columns, target_start, targets
+
+
+@nb.njit(cache=True)
+def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
+    """Children before parents, branch by branch; the two main branches of a tree alternate.
+
+    Rows of different branches do not wait for each other, so alternating them halves the time lost to
+    the latency of the pivots' divisions.
+    """
+    n = len(parent)
+    child = np.full(n, -1, np.int64)
+    sibling = np.full(n, -1, np.int64)
+    size = np.ones(n, np.int64)
+    for step in range(n):
+        if parent[step] >= 0:
+            size[parent[step]] += size[step]
+    for step in range(n - 1, -1, -1):
+        if parent[step] >= 0:
+            sibling[step] = child[parent[step]]
+            child[parent[step]] = step
+    following = child.copy()
+    result = np.empty(n, np.int64)
+    stack = np.empty(n, np.int64)
+    place = np.empty(n, np.int64)
+    buffer = np.empty(n, np.int64)
+    clusters = np.empty(n + 1, np.int64)
+    n_clusters = 0
+    number = 0
+    for root in range(n):
+        if parent[root] >= 0:
+            continue
+        first = number
+        clusters[n_clusters] = first
+        n_clusters += 1
+        top = 0
+        stack[0] = root
+        while top >= 0:
+            node = stack[top]
+            if following[node] >= 0:
+                top += 1
+                stack[top] = following[node]
+                following[node] = sibling[following[node]]
+            else:
+                result[number] = node
+                place[node] = number
+                number += 1
+                top -= 1
+        # Go down from the root to where the tree splits; alternate the biggest branch with the rest.
+        node = root
+        biggest = -1
+        while True:
+            biggest = -1
+            below = 0
+            branch = child[node]
+            while branch >= 0:
+                below += size[branch]
+                if biggest < 0 or size[branch] > size[biggest]:
+                    biggest = branch
+                branch = sibling[branch]
+            if biggest < 0 or 10 * size[biggest] <= 9 * below:
+                break
+            node = biggest
+        if biggest < 0:
+            continue
+        stop = place[node]
+        begin = stop - (size[node] - 1)
+        inner_stop = place[biggest] + 1
+        inner_begin = inner_stop - size[biggest]
+        count = stop - begin
+        inner = inner_stop - inner_begin
+        outer = count - inner
+        a, b = inner_begin, begin
+        if b == inner_begin:
+            b = inner_stop
+        for k in range(count):
+            done_a = a - inner_begin
+            done_b = k - done_a
+            if done_b >= outer or (done_a < inner and done_a * outer <= done_b * inner):
+                buffer[k] = result[a]
+                a += 1
+            else:
+                buffer[k] = result[b]
+                b += 1
+                if b == inner_begin:
+                    b = inner_stop
+        for k in range(count):
+            result[begin + k] = buffer[k]
+    clusters[n_clusters] = n
+    return result, clusters[: n_clusters + 1].copy()
+
+
+@nb.njit(cache=True, fastmath=FAST, inline="always")
+def substitute_forward(first, last, start, columns, lower, right):  # type: ignore[no-untyped-def]
+    """L y = right in place for rows first to last, with unit L."""
+    for k in range(first, last):
+        bk = right[k]
+        for p in range(start[k], start[k + 1]):
+            right[columns[p]] -= lower[p] * bk
+
+
+@nb.njit(cache=True, fastmath=FAST, inline="always")
+def substitute_backward(first, last, start, columns, upper, pivot, right):  # type: ignore[no-untyped-def]
+    """U x = right in place for rows first to last; `pivot` holds reciprocals, 0 for dependent rows."""
+    for k in range(last, first, -1):
+        k -= np.uint64(1)
+        total = right[k]
+        for p in range(start[k], start[k + 1]):
+            total -= upper[p] * right[columns[p]]
+        right[k] = total * pivot[k]
