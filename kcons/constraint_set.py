@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.contradictions import refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 
@@ -43,7 +44,10 @@ class ConstraintSet:
         Wrong shapes, NaN or infinity, unknown atoms, masses that are not positive, a degenerate cell,
         a periodic row longer than half the box.
     ConstraintError
-        A row that is undefined at `positions` or cannot be fulfilled.
+        A row that is undefined at `positions` or cannot be fulfilled; two targets for one coordinate
+        (`ContradictionError`).
+    InfeasibleError
+        Distances that violate the triangle inequality.
 
     References
     ----------
@@ -88,6 +92,7 @@ class ConstraintSet:
             self._check_half_box(item, r, int(start), time)
             bound.append(item)
         self.constraints = tuple(bound)
+        refuse_contradictions(self.constraints, self.starts, time)
         self._set_scale(x, time)
 
     # -- construction ---------------------------------------------------------------------------

@@ -1,32 +1,72 @@
-"""What can be held: one family of constraints a module."""
+"""What can be held: one kind of constraints a module."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfGyration
 from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.custom import Custom, ImplicitSurface
 from kcons.constraints.internal import Angle, Dihedral, Distance
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
+from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
 from kcons.constraints.target import MovingTarget
+from kcons.constraints.velocity import CustomVelocity, KnifeEdge, LinearVelocity, Rolling
 from kcons.errors import InputError
 
 __all__ = [
     "Angle",
+    "CenterDistance",
+    "CenterOfMass",
     "Constraint",
+    "Custom",
+    "CustomVelocity",
+    "Cylinder",
     "Dihedral",
     "Distance",
+    "Ellipsoid",
     "FixedAtoms",
+    "ImplicitSurface",
+    "KnifeEdge",
+    "Line",
     "LinearCombination",
     "LinearRelation",
+    "LinearVelocity",
     "MovingTarget",
+    "Plane",
+    "RadiusOfGyration",
+    "Rolling",
     "RowKind",
+    "Sphere",
+    "Torus",
     "from_dict",
 ]
 
-FAMILIES: dict[str, type[Constraint]] = {
-    family.family: family for family in (Angle, Dihedral, Distance, FixedAtoms, LinearCombination, LinearRelation)
-}
+_CLASSES: tuple[type[Constraint], ...] = (
+    Angle,
+    CenterDistance,
+    CenterOfMass,
+    Custom,
+    CustomVelocity,
+    Cylinder,
+    Dihedral,
+    Distance,
+    Ellipsoid,
+    FixedAtoms,
+    ImplicitSurface,
+    KnifeEdge,
+    Line,
+    LinearCombination,
+    LinearRelation,
+    LinearVelocity,
+    Plane,
+    RadiusOfGyration,
+    Rolling,
+    Sphere,
+    Torus,
+)
+FAMILIES: dict[str, type[Constraint]] = {each.family: each for each in _CLASSES}
 
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:

@@ -55,8 +55,6 @@ class Constraint(ABC):
     holonomic: ClassVar[bool] = True
     #: Atoms a row, where the family fixes it.
     row_width: ClassVar[int | None] = None
-    #: Period of the coordinate (2 pi for dihedrals); sigma is taken to the nearest image.
-    period: ClassVar[float | None] = None
     #: Data held for each row: name -> shape of one row's entry, -1 standing for the width.
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     #: Plain numbers or flags that all rows of the object have in common.
@@ -68,6 +66,8 @@ class Constraint(ABC):
 
     #: True if q depends on differences of positions alone, so that minimum images apply.
     translation_invariant: bool = False
+    #: Period of the coordinate (2 pi for dihedrals); sigma is taken to the nearest image.
+    period: float | None = None
     kind: RowKind = RowKind.INTERPRETED
     #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
     masses: FloatArray | None = None
@@ -90,12 +90,10 @@ class Constraint(ABC):
                 ) from None
             if not np.all(np.isfinite(array)):
                 row = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise InputError(
-                    f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row]
-                )
+                raise InputError(f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row])
             setattr(self, name, np.ascontiguousarray(array))
 
-    def _settle(self) -> None:
+    def _settle(self) -> None:  # noqa: B027 (optional hook)
         """Derive and check what follows from the per-row data; called once, when these were set."""
 
     @property
@@ -152,7 +150,7 @@ class Constraint(ABC):
         """Whether minimum images need neighbouring atoms of a row to be closer than half the box."""
         return self.translation_invariant and self.width > 1
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:  # noqa: B027 (optional hook)
         """Raise a typed error if a row is undefined at `r` or its target is impossible.
 
         `first_row` is the number of this object's first row in its set, for messages.

@@ -5,13 +5,12 @@ All three depend on differences of positions alone, so minimum images apply in p
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.vectors import dot, first_true, norm
 from kcons.errors import InputError, SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
@@ -49,25 +48,25 @@ class Distance(Constraint):
         super().__init__(pairs, target)
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
-        return _norm(r[:, 0] - r[:, 1])
+        return norm(r[:, 0] - r[:, 1])
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         d = r[:, 0] - r[:, 1]
-        u = d / _norm(d)[:, None]
+        u = d / norm(d)[:, None]
         return np.stack([u, -u], axis=1)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         d = r[:, 0] - r[:, 1]
         w = v[:, 0] - v[:, 1]
-        q = _norm(d)
+        q = norm(d)
         # |u x w|^2 has no cancellation, unlike |w|^2 - (u.w)^2.
         across = np.cross(d / q[:, None], w)
-        return _dot(across, across) / q
+        return dot(across, across) / q
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         if self.n_rows == 0:
             return
-        k = _first(_norm(r[:, 0] - r[:, 1]) == 0)
+        k = first_true(norm(r[:, 0] - r[:, 1]) == 0)
         if k is not None:
             i, j = self.atoms[k]
             raise SingularGeometryError(
@@ -78,13 +77,13 @@ class Distance(Constraint):
         if self.target is None:
             return
         target = self.target_at(time)
-        k = _first(~(target > 0))
+        k = first_true(~(target > 0))
         if k is not None:
             raise InputError(
                 f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is not positive; "
                 "give a length greater than zero, or None to hold the present one",
                 item="target",
-                atoms=self.atoms[k],
+                atoms=self.atoms[k].tolist(),
             )
 
 
@@ -120,23 +119,23 @@ class Angle(Constraint):
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-        return np.arctan2(_norm(np.cross(u, w)), _dot(u, w))
+        return np.arctan2(norm(np.cross(u, w)), dot(u, w))
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         u, w, normal, _ = _arms(r)
-        first = np.cross(u, normal) / _dot(u, u)[:, None]
-        last = np.cross(normal, w) / _dot(w, w)[:, None]
+        first = np.cross(u, normal) / dot(u, u)[:, None]
+        last = np.cross(normal, w) / dot(w, w)[:, None]
         return np.stack([first, -first - last, last], axis=1)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         u, w, n, sine = _arms(r)
-        uu, ww = _dot(u, u), _dot(w, w)
+        uu, ww = dot(u, u), dot(w, w)
         lu, lw = np.sqrt(uu), np.sqrt(ww)
         du, dw = v[:, 0] - v[:, 1], v[:, 2] - v[:, 1]
-        a, b = _dot(np.cross(u, n), du) / uu, _dot(np.cross(n, w), dw) / ww
-        alpha, beta = _dot(n, du) / lu, _dot(n, dw) / lw
-        cosine = _dot(u, w) / (lu * lw)
-        in_plane = -2 * (a * _dot(u, du) / uu + b * _dot(w, dw) / ww)
+        a, b = dot(np.cross(u, n), du) / uu, dot(np.cross(n, w), dw) / ww
+        alpha, beta = dot(n, du) / lu, dot(n, dw) / lw
+        cosine = dot(u, w) / (lu * lw)
+        in_plane = -2 * (a * dot(u, du) / uu + b * dot(w, dw) / ww)
         return in_plane + ((alpha**2 + beta**2) * cosine - 2 * alpha * beta) / sine
 
     def scale(self, time: float = 0.0) -> FloatArray:
@@ -151,18 +150,18 @@ class Angle(Constraint):
         if self.target is None:
             return
         target = self.target_at(time)
-        k = _first((target < -COLLINEAR) | (target > np.pi + COLLINEAR))
+        k = first_true((target < -COLLINEAR) | (target > np.pi + COLLINEAR))
         if k is not None:
             raise InputError(
                 f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is no angle between 0 and pi; "
                 "targets are in radian",
                 item="target",
-                atoms=self.atoms[k],
+                atoms=self.atoms[k].tolist(),
             )
         self._refuse_straight(target, "has the target", first_row)
 
     def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
-        k = _first(np.sin(angle) < COLLINEAR)
+        k = first_true(np.sin(angle) < COLLINEAR)
         if k is None:
             return
         degrees = 180 if angle[k] > 1 else 0
@@ -175,7 +174,7 @@ class Angle(Constraint):
             f"angle constraint singular at {degrees} deg, {remedy}: "
             f"row {first_row + k}, {self.row_name(k)}, {verb} {np.degrees(angle[k]):.9g} deg",
             rows=[first_row + k],
-            atoms=self.atoms[k],
+            atoms=self.atoms[k].tolist(),
         )
 
 
@@ -206,7 +205,7 @@ class Dihedral(Constraint):
     family = "Dihedral"
     row_width = 4
     translation_invariant = True
-    period: ClassVar[float | None] = 2 * np.pi
+    period = 2 * np.pi
     kind = RowKind.DIHEDRAL
 
     def __init__(self, quads: ArrayLike, target: Target = None) -> None:
@@ -215,15 +214,15 @@ class Dihedral(Constraint):
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         F, G, H = _legs(r)
         P, Q = np.cross(F, G), np.cross(H, G)
-        return np.arctan2(_dot(np.cross(Q, P), G) / _norm(G), _dot(P, Q))
+        return np.arctan2(dot(np.cross(Q, P), G) / norm(G), dot(P, Q))
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         F, G, H = _legs(r)
         P, Q = np.cross(F, G), np.cross(H, G)
-        g = _norm(G)
-        p, s = P / _dot(P, P)[:, None], Q / _dot(Q, Q)[:, None]
+        g = norm(G)
+        p, s = P / dot(P, P)[:, None], Q / dot(Q, Q)[:, None]
         along_f = -g[:, None] * p
-        along_g = (_dot(F, G) / g)[:, None] * p - (_dot(H, G) / g)[:, None] * s
+        along_g = (dot(F, G) / g)[:, None] * p - (dot(H, G) / g)[:, None] * s
         along_h = g[:, None] * s
         return np.stack([along_f, along_g - along_f, -along_g - along_h, along_h], axis=1)
 
@@ -232,15 +231,15 @@ class Dihedral(Constraint):
         dF, dG, dH = _legs(v)
         P, Q = np.cross(F, G), np.cross(H, G)
         dP, dQ = np.cross(dF, G) + np.cross(F, dG), np.cross(dH, G) + np.cross(H, dG)
-        g = _norm(G)
-        dg = _dot(G, dG) / g
+        g = norm(G)
+        dg = dot(G, dG) / g
         p, dp = _over_square(P, dP)
         s, ds = _over_square(Q, dQ)
-        f, h = _dot(F, G) / g, _dot(H, G) / g
-        df = (_dot(dF, G) + _dot(F, dG) - f * dg) / g
-        dh = (_dot(dH, G) + _dot(H, dG) - h * dg) / g
-        first = -dg * _dot(p, dF) - g * _dot(dp, dF) + df * _dot(p, dG) + f * _dot(dp, dG)
-        last = dg * _dot(s, dH) + g * _dot(ds, dH) - dh * _dot(s, dG) - h * _dot(ds, dG)
+        f, h = dot(F, G) / g, dot(H, G) / g
+        df = (dot(dF, G) + dot(F, dG) - f * dg) / g
+        dh = (dot(dH, G) + dot(H, dG) - h * dg) / g
+        first = -dg * dot(p, dF) - g * dot(dp, dF) + df * dot(p, dG) + f * dot(dp, dG)
+        last = dg * dot(s, dH) + g * dot(ds, dH) - dh * dot(s, dG) - h * dot(ds, dG)
         return first + last
 
     def scale(self, time: float = 0.0) -> FloatArray:
@@ -252,36 +251,23 @@ class Dihedral(Constraint):
         _refuse_coincident(self, r, first_row)
         F, G, H = _legs(r)
         for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
-            k = _first(_norm(np.cross(first, second)) < COLLINEAR * _norm(first) * _norm(second))
+            k = first_true(norm(np.cross(first, second)) < COLLINEAR * norm(first) * norm(second))
             if k is not None:
                 i, j, m = self.atoms[k, three]
                 raise SingularGeometryError(
                     f"dihedral constraint singular: atoms {i}, {j}, {m} of row {first_row + k}, {self.row_name(k)}, "
                     "are collinear; bend them, or hold a dihedral of other atoms",
                     rows=[first_row + k],
-                    atoms=self.atoms[k],
+                    atoms=self.atoms[k].tolist(),
                 )
-
-
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("...i,...i->...", a, b))
-
-
-def _norm(a: FloatArray) -> FloatArray:
-    return np.sqrt(_dot(a, a))
-
-
-def _first(bad: NDArray[np.bool_]) -> int | None:
-    """First True entry, or None."""
-    return int(np.argmax(bad)) if bad.any() else None
 
 
 def _arms(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Arms of an angle, unit normal of their plane, and the sine of the angle."""
     u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
     normal = np.cross(u, w)
-    area = _norm(normal)
-    return u, w, normal / area[:, None], area / (_norm(u) * _norm(w))
+    area = norm(normal)
+    return u, w, normal / area[:, None], area / (norm(u) * norm(w))
 
 
 def _legs(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -290,14 +276,14 @@ def _legs(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _over_square(a: FloatArray, da: FloatArray) -> tuple[FloatArray, FloatArray]:
     """a/|a|^2 and its derivative."""
-    square = _dot(a, a)[:, None]
+    square = dot(a, a)[:, None]
     b = a / square
-    return b, da / square - 2 * (_dot(a, da)[:, None] / square) * b
+    return b, da / square - 2 * (dot(a, da)[:, None] / square) * b
 
 
 def _refuse_coincident(item: Constraint, r: FloatArray, first_row: int) -> None:
     """Neighbouring atoms of a row at one point leave an angle undefined."""
-    same = _norm(np.diff(r, axis=1)) == 0
+    same = norm(np.diff(r, axis=1)) == 0
     if same.any():
         k, slot = (int(i) for i in np.argwhere(same)[0])
         i, j = item.atoms[k, slot : slot + 2]

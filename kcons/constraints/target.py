@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.constraints.differences import first_derivative, second_derivative
 from kcons.errors import InputError
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -46,31 +47,16 @@ class MovingTarget:
             return _per_row(self.rate(time), rows, time)
         if self.acceleration is not None:
             raise InputError("a moving target with an acceleration also needs its rate", item="target")
-        h = self.time_step
-        total = np.zeros(rows)
-        for k, c in enumerate(_FIRST, start=1):
-            total += c * (self.at(time + k * h, rows) - self.at(time - k * h, rows))
-        return total / h
+        return first_derivative(lambda t: self.at(t, rows), time, self.time_step)
 
     def acceleration_at(self, time: float, rows: int) -> FloatArray:
         """Second time derivative, shape (rows,)."""
         if self.acceleration is not None:
             return _per_row(self.acceleration(time), rows, time)
-        h = self.time_step
-        total = np.zeros(rows)
         if self.rate is not None:
-            for k, c in enumerate(_FIRST, start=1):
-                total += c * (self.rate_at(time + k * h, rows) - self.rate_at(time - k * h, rows))
-            return total / h
-        centre = self.at(time, rows)
-        for k, c in enumerate(_SECOND, start=1):
-            total += c * ((self.at(time + k * h, rows) - centre) + (self.at(time - k * h, rows) - centre))
-        return total / h**2
+            return first_derivative(lambda t: self.rate_at(t, rows), time, self.time_step)
+        return second_derivative(lambda t: self.at(t, rows), time, self.time_step)
 
-
-# Central differences of eighth order: weights of f(t + kh) -/+ f(t - kh), k = 1..4.
-_FIRST = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
-_SECOND = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
 
 Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
 

@@ -1,0 +1,134 @@
+"""Constraints that ask for different things, found from their targets alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import ContradictionError, InfeasibleError
+
+#: Relative difference of two targets (radian for angles) that counts as rounding.
+_SAME = 1e-10
+#: Pairs of edges looked at together while searching triangles; bounds the memory.
+_CHUNK = 2_000_000
+
+
+def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: float) -> None:
+    """Raise if targets contradict each other.
+
+    Looks for the same distance, angle or dihedral held at two values, and for triangles of distances
+    that violate the triangle inequality. Vectorised: about 0.1 s for 10^5 distances.
+
+    Parameters
+    ----------
+    items : sequence of Constraint
+        With their targets resolved.
+    starts : ndarray of int
+        Number of the first row of each item.
+    time : float
+        When moving targets are compared.
+
+    Raises
+    ------
+    ContradictionError
+        Two targets for one coordinate.
+    InfeasibleError
+        A triangle with one side longer than the two others together.
+    """
+    for family in ("Distance", "Angle", "Dihedral"):
+        chosen = [(item, start) for item, start in zip(items, starts, strict=False) if item.family == family]
+        if not chosen:
+            continue
+        # A row and its reverse (j, i), (k, j, i), (l, k, j, i) name the same coordinate.
+        atoms = np.concatenate([item.atoms for item, _ in chosen])
+        atoms = np.where((atoms[:, :1] > atoms[:, -1:]), atoms[:, ::-1], atoms)
+        rows = np.concatenate([start + np.arange(item.n_rows) for item, start in chosen])
+        target = np.concatenate([item.target_at(time) for item, _ in chosen])
+        order = np.lexsort(atoms.T[::-1])
+        atoms, rows, target = atoms[order], rows[order], target[order]
+        _refuse_two_targets(atoms, rows, target, chosen[0][0].period)
+        if family == "Distance":
+            _refuse_impossible_triangles(atoms, rows, target)
+
+
+def _refuse_two_targets(atoms: IntArray, rows: IntArray, target: FloatArray, period: float | None) -> None:
+    repeated = np.flatnonzero((atoms[1:] == atoms[:-1]).all(axis=1))
+    difference = target[repeated + 1] - target[repeated]
+    if period is not None:
+        difference -= period * np.round(difference / period)
+    bad = np.abs(difference) > _SAME * np.maximum(np.abs(target[repeated]), np.abs(target[repeated + 1]))
+    if bad.any():
+        k = int(repeated[np.argmax(bad)])
+        raise ContradictionError(
+            f"constraints #{rows[k]} and #{rows[k + 1]} on atoms {tuple(atoms[k].tolist())} have different targets "
+            f"{float(target[k])!r}, {float(target[k + 1])!r}; remove one of them",
+            rows=rows[k : k + 2].tolist(),
+            atoms=atoms[k].tolist(),
+        )
+
+
+def _refuse_impossible_triangles(pairs: IntArray, rows: IntArray, length: FloatArray) -> None:
+    """Triangle inequality over all triangles of held distances; `pairs` sorted, smaller atom first.
+
+    The least sum of squared deviations of a triangle with the excess e = d_3 - d_1 - d_2 is e^2/3: each
+    side takes a third of the excess.
+    """
+    first = np.concatenate([[True], (pairs[1:] != pairs[:-1]).any(axis=1)])
+    pairs, rows, length = pairs[first], rows[first], length[first]
+    if len(pairs) < 3:
+        return
+    for sides in _triangles(pairs):
+        d = length[sides]
+        longest = np.argmax(d, axis=1)
+        top = d[np.arange(len(d)), longest]
+        excess = 2 * top - d.sum(axis=1)
+        bad = excess > _SAME * top
+        if bad.any():
+            t = int(np.argmax(bad))
+            members = rows[sides[t]]
+            atoms = np.unique(pairs[sides[t]])
+            best = float(excess[t]) ** 2 / 3
+            held = ", ".join(f"#{row} = {value:g}" for row, value in zip(members, d[t], strict=True))
+            raise InfeasibleError(
+                f"infeasible: residual cannot go below {best:.6g} (sum of squares); the distances of atoms "
+                f"{tuple(atoms.tolist())} ({held}) violate the triangle inequality by {excess[t]:.6g}. "
+                "Correct the longest or remove it",
+                residual=best,
+                row=int(members[longest[t]]),
+                atoms=atoms.tolist(),
+            )
+
+
+def _triangles(pairs: IntArray) -> Iterator[IntArray]:
+    """Edge numbers of all triangles of a graph, shape (n, 3), a piece at a time.
+
+    Edges point from the atom of lower degree to the one of higher, so that few leave any atom; every
+    pair of edges that leave one atom is looked up.
+    """
+    atoms, ends = np.unique(pairs, return_inverse=True)
+    ends = ends.reshape(pairs.shape)
+    n = len(atoms)
+    degree = np.bincount(ends.ravel(), minlength=n)
+    place = np.empty(n, dtype=np.int64)
+    place[np.lexsort((np.arange(n), degree))] = np.arange(n)
+    low, high = np.sort(place[ends], axis=1).T
+    order = np.lexsort((high, low))
+    low, high = low[order], high[order]
+    key = low * n + high
+    leaving = np.searchsorted(low, np.arange(n + 1))
+    later = leaving[low + 1] - np.arange(len(low)) - 1
+    done = np.concatenate([[0], np.cumsum(later)])
+    at = 0
+    while at < len(low):
+        end = max(at + 1, int(np.searchsorted(done, done[at] + _CHUNK, side="right")) - 1)
+        count = later[at:end]
+        one = np.repeat(np.arange(at, end), count)
+        two = one + 1 + np.arange(len(one)) - np.repeat(done[at:end] - done[at], count)
+        wanted = high[one] * n + high[two]
+        three = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        found = key[three] == wanted
+        yield order[np.stack([one[found], two[found], three[found]], axis=1)]
+        at = end

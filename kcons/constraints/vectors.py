@@ -1,0 +1,42 @@
+"""Arithmetic on arrays of vectors, the last axis being x, y, z."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+
+
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def norm(a: FloatArray) -> FloatArray:
+    return np.sqrt(dot(a, a))
+
+
+def first_true(bad: NDArray[np.bool_]) -> int | None:
+    """First True entry, or None."""
+    return int(np.argmax(bad)) if bad.any() else None
+
+
+def unit(vectors: ArrayLike, name: str) -> FloatArray:
+    """Vectors of length 1 along the given ones, shape (..., 3).
+
+    Raises
+    ------
+    InputError
+        If the last axis is not 3, or a vector is zero or not finite.
+    """
+    try:
+        array = np.asarray(vectors, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be vectors of three numbers, not {vectors!r:.60}", item=name) from None
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise InputError(f"{name} must be vectors of three numbers; its shape is {array.shape}", item=name)
+    length = norm(array)
+    if not np.all(np.isfinite(length) & (length > 0)):
+        raise InputError(f"{name} has a vector that is zero or not finite; give a direction", item=name)
+    return array / length[..., None]
