@@ -352,6 +352,15 @@ class ConstraintSet:
         part.starts = np.concatenate([[0], np.cumsum([p.n_rows for p in pieces], dtype=np.int64)]).astype(np.int64)
         return part, atoms
 
+    def replaced(self, constraints: Sequence[Constraint], positions: FloatArray, time: float) -> ConstraintSet:
+        """The same atoms, masses and cell under other constraints; their targets must be set. Nothing is checked."""
+        other = object.__new__(ConstraintSet)
+        other.n_atoms, other.masses, other.lattice = self.n_atoms, self.masses, self.lattice
+        other.constraints = tuple(constraints)
+        other.starts = np.concatenate([[0], np.cumsum([c.n_rows for c in constraints], dtype=np.int64)]).astype(np.int64)
+        other._set_scale(positions, time)
+        return other
+
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
         return np.concatenate([function(c) for c in self.constraints] or [np.zeros(0)])
 
