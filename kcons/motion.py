@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse.linalg import lsqr
 
 from kcons import diagnosis
 from kcons.constraint_set import ConstraintSet
@@ -18,12 +19,14 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import InputError
-from kcons.plan import Plan, ClusterSolver, make_plan
+from kcons.plan import ClusterSolver, Plan, make_plan
 from kcons.solvers.general import GeneralClusters
 from kcons.solvers.outcome import Outcome
 
 #: Rescues of single clusters by the damped solver within one call, before the call fails.
 MAX_RESCUES = 20
+#: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
+DENSE_ROWS = 1500
 
 
 class Motion:
@@ -118,7 +121,8 @@ class Motion:
         time, reference_time : float
             Times of `x_new` and `x_ref`; `reference_time` defaults to `time`.
         velocities : ndarray, shape (n_atoms, 3), optional
-            Changed in place by (correction)/`dt`, from the multipliers and not from rounded positions.
+            Changed in place by (correction)/`dt`, from the multipliers and not from rounded positions;
+            those of fixed atoms stay as they are.
         dt : float, optional
             Needed with `velocities`.
         out : ndarray, optional
@@ -360,7 +364,11 @@ class Motion:
         return self._accelerate(x, v, f, time)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
-        """lambda of z = A^T lambda, shape (n_rows,), of least norm where rows depend (notes eqs. 103-104)."""
+        """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
+
+        Where rows depend on each other, the solution of least norm; rows of fixed atoms come after the
+        others and supply what is left.
+        """
         return self._accelerate(x, v, f, time)[1]
 
     def constraint_force(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
@@ -385,7 +393,7 @@ class Motion:
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
             a[self._atoms] = local_a
-        lam = -mu
+        lam = self._least_norm(local_x, -mu, time)
         if len(self.plan.pinned):
             # What the fixed atoms' rows supply: M a - f less the other rows' forces.
             lam[self.plan.pinned_rows] = 0.0
@@ -395,6 +403,23 @@ class Motion:
             reaction = self.masses[numbers, None] * local_a[pinned] - force[numbers] - others[pinned]
             lam[self.plan.pinned_rows] = reaction.ravel()
         return a, lam
+
+    def _least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
+        """Multipliers of least norm with the same constraint force, where rows depend on each other."""
+        if not self.plan.dependent:
+            return lam
+        jacobian = self._local.jacobian(x, time)
+        for rows in self.plan.dependent:
+            part = jacobian[rows]
+            transposed = part.T.tocsr()
+            used = np.flatnonzero(np.diff(transposed.indptr))
+            transposed = transposed[used]
+            force = transposed @ lam[rows]
+            if len(rows) <= DENSE_ROWS:
+                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
+            else:
+                lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
+        return lam
 
     def project_forces(self, x: ArrayLike, f: ArrayLike, *, out: FloatArray | None = None) -> FloatArray:
         """f + z with b = 0: what is left of the force on the surface, for optimisers, shape (n_atoms, 3)."""

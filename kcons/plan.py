@@ -6,15 +6,18 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.csgraph
 
+from kcons.clusters import Shape, classify, cluster_labels
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError
-from kcons.solvers.general import GeneralClusters
+from kcons.solvers.distances import SparseDistances
+from kcons.solvers.general import RANK_TOLERANCE, GeneralClusters
+from kcons.solvers.lanes import SmallClusters
 from kcons.solvers.outcome import Outcome
+from kcons.solvers.rows import SparseRows
+from kcons.solvers.water import RigidTriangles
 
 
 class ClusterSolver(Protocol):
@@ -81,6 +84,8 @@ class Plan:
     driven : bool
         Whether admissible velocities solve A v = c with c other than 0.
     kinds : list of ClusterKind
+    dependent : list of ndarray of int
+        Rows of each cluster in which rows may depend on each other.
     """
 
     constraint_set: ConstraintSet
@@ -92,6 +97,7 @@ class Plan:
     rank: int
     driven: bool
     kinds: list[ClusterKind] = field(default_factory=list)
+    dependent: list[IntArray] = field(default_factory=list)
 
     def pinned_targets(self, targets: FloatArray | None, local: ConstraintSet) -> FloatArray:
         """Where fixed atoms are held, shape (len(pinned), 3)."""
@@ -118,19 +124,28 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
     inverse_masses[pinned] = 0.0
     labels = cluster_labels(constraint_set, pinned, pinned_rows)
     _check_rows_between_fixed(constraint_set, positions, labels, pinned_rows, time)
-    rows = np.flatnonzero(labels >= 0)
-    solvers: list[ClusterSolver] = []
-    rank = len(pinned_rows)
-    kinds: list[ClusterKind] = []
-    if len(rows):
-        general = GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
-        solvers.append(general)
-        for members, s in general.singular_values(positions, time):
-            r = int(np.sum(s > 1e-8 * s[0]))
-            rank += r
-            kinds.append(ClusterKind("general", 1, len(members), r, constraint_set.row_name(int(members[0]))))
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
-    return Plan(constraint_set, solvers, labels, pinned, pinned_rows, inverse_masses, rank, driven, kinds)
+    plan = Plan(constraint_set, [], labels, pinned, pinned_rows, inverse_masses, len(pinned_rows), driven, [])
+    for shape in classify(constraint_set, labels, inverse_masses):
+        solver = _solver(shape, constraint_set, inverse_masses, labels, time)
+        if shape.independent:
+            rank = shape.rows.size
+        else:
+            rank = _rank(constraint_set, shape, labels, inverse_masses, positions, solver, time)
+        if rank < shape.rows.size:
+            plan.dependent += _by_cluster(shape.rows.ravel(), labels)
+        plan.solvers.append(solver)
+        plan.rank += rank
+        example = constraint_set.row_name(int(shape.rows.ravel()[0]))
+        plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
+    return plan
+
+
+def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
+    rows = np.sort(rows)
+    order = np.argsort(labels[rows], kind="stable")
+    cuts = np.flatnonzero(np.diff(labels[rows[order]])) + 1
+    return [np.sort(part) for part in np.split(rows[order], cuts)]
 
 
 def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
@@ -144,26 +159,6 @@ def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
     if not atoms:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(atoms), np.concatenate(rows)
-
-
-def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows: IntArray) -> IntArray:
-    """Cluster number of each row: rows that share a movable atom belong together; -1 for rows without one."""
-    incidence = constraint_set.incidence
-    n_rows, n_atoms = incidence.shape
-    free = np.ones(n_atoms)
-    free[pinned] = 0.0
-    links = sp.csr_array((free[incidence.indices], incidence.indices, incidence.indptr), shape=incidence.shape)
-    links.eliminate_zeros()
-    graph = sp.block_array([[None, links], [links.T, None]], format="csr") if n_rows else sp.csr_array((0, 0))
-    labels = np.full(n_rows, -1, dtype=np.int64)
-    if n_rows == 0:
-        return labels
-    found = sp.csgraph.connected_components(graph, directed=False)[1][:n_rows]
-    movable = np.diff(links.indptr) > 0
-    movable[pinned_rows] = False
-    if movable.any():
-        labels[movable] = np.unique(found[movable], return_inverse=True)[1]
-    return labels
 
 
 def _check_rows_between_fixed(
@@ -185,3 +180,127 @@ def _check_rows_between_fixed(
             rows=[row],
             atoms=constraint_set.row_atoms(row),
         )
+
+
+class DistanceClusters:
+    """A solver of distance rows, as a `ClusterSolver`: picks its rows out of arrays over the whole set."""
+
+    def __init__(self, solver: DistanceSolver, targets: FloatArray) -> None:
+        self.name = solver.name
+        self.rows = solver.rows.ravel()
+        self._solver = solver
+        self._lengths = np.ascontiguousarray(targets[self.rows])
+
+    def positions(
+        self,
+        x_new: FloatArray,
+        x_ref: FloatArray,
+        targets: FloatArray | None,
+        lattice: FloatArray | None,
+        velocities: FloatArray | None,
+        inv_dt: float,
+        multipliers: FloatArray | None,
+        time: float,
+        reference_time: float,
+    ) -> Outcome:
+        lengths = self._lengths if targets is None else targets[self.rows]
+        return self._solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, multipliers)
+
+    def tangents(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        rates: FloatArray | None,
+        lattice: FloatArray | None,
+        multipliers: FloatArray | None,
+        time: float,
+    ) -> Outcome:
+        return self._solver.tangents(x, y, None if rates is None else rates[self.rows], lattice, multipliers)
+
+
+class DistanceSolver(Protocol):
+    """The kernels behind `DistanceClusters`; lengths and rates come in the order of `rows`."""
+
+    name: str
+    rows: IntArray
+
+    def positions(
+        self,
+        x_new: FloatArray,
+        x_ref: FloatArray,
+        lengths: FloatArray,
+        lattice: FloatArray | None,
+        velocities: FloatArray | None,
+        inv_dt: float,
+        multipliers: FloatArray | None,
+    ) -> Outcome: ...
+
+    def tangents(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        rates: FloatArray | None,
+        lattice: FloatArray | None,
+        multipliers: FloatArray | None,
+    ) -> Outcome: ...
+
+
+def _solver(
+    shape: Shape, constraint_set: ConstraintSet, inverse_masses: FloatArray, labels: IntArray, time: float
+) -> ClusterSolver:
+    """The table: which solver serves which shape."""
+    rows = shape.rows
+    if shape.kind == "general":
+        return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+    if shape.kind == "mixed":
+        return SparseRows(constraint_set, rows, inverse_masses)
+    targets = constraint_set.target(time)
+    solver: DistanceSolver
+    if shape.kind == "water":
+        solver = RigidTriangles(rows, shape.atoms, targets[rows], inverse_masses[shape.atoms[0]])
+    elif shape.kind == "lanes":
+        solver = SmallClusters(rows, shape.atoms, shape.pairs, targets[rows], inverse_masses[shape.atoms[0]])
+    else:
+        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses)
+    return DistanceClusters(solver, targets)
+
+
+def _rank(
+    constraint_set: ConstraintSet,
+    shape: Shape,
+    labels: IntArray,
+    inverse_masses: FloatArray,
+    positions: FloatArray,
+    solver: ClusterSolver,
+    time: float,
+) -> int:
+    """Independent rows of a shape whose graph does not tell."""
+    if isinstance(solver, SparseRows):
+        return solver.rank(positions, constraint_set.lattice)
+    rows = np.sort(shape.rows.ravel())
+    if shape.kind in ("water", "lanes"):
+        return _rank_of_small(constraint_set, shape, inverse_masses, positions, time)
+    if isinstance(solver, GeneralClusters):
+        general = solver
+    else:
+        general = GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+    return sum(int(np.sum(s > RANK_TOLERANCE * s[0])) for _, s in general.singular_values(positions, time))
+
+
+def _rank_of_small(
+    constraint_set: ConstraintSet, shape: Shape, inverse_masses: FloatArray, positions: FloatArray, time: float
+) -> int:
+    """Rank of many small clusters of distances at once, from the singular values of their B."""
+    ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
+    difference = constraint_set.minimum_image(positions[ends[..., 0]] - positions[ends[..., 1]])
+    n, k = ends.shape[:2]
+    b = np.zeros((n, k, shape.atoms.shape[1], 3))
+    row = np.arange(k)
+    root_w = np.sqrt(inverse_masses[shape.atoms[0]])
+    b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
+    b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
+    b = b.reshape(n, k, -1)
+    size = np.linalg.norm(b, axis=2, keepdims=True)
+    b = np.divide(b, size, out=np.zeros_like(b), where=size > 0)
+    s = np.linalg.svd(b, compute_uv=False)
+    return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))

@@ -310,13 +310,14 @@ class GeneralClusters:
                 jacobian = self.subset.jacobian(x[self.atoms], time)[rows][:, columns].toarray()
                 wanted = wanted - (jacobian[:, pinned] @ flat[columns][pinned]) / size
             sum_mu = np.zeros(len(rows))
+            before = _norm(scaled)
             for _ in range(3):
                 miss = unit @ scaled - wanted
                 step = gram.solve(miss)
                 scaled = scaled - unit.T @ step
                 sum_mu += step
             miss = np.abs(unit @ scaled - wanted)
-            speed = max(_norm(scaled), _norm(wanted), np.finfo(float).tiny)
+            speed = max(before, _norm(scaled), _norm(wanted), np.finfo(float).tiny)
             k = int(np.argmax(miss))
             if not miss[k] <= 1e-11 * speed:
                 return Outcome(False, float(miss[k] / speed), 3, int(rows[k]))

@@ -1,0 +1,249 @@
+"""Which rows belong together, and what shape each cluster has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numba as nb
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray, RowKind
+from kcons.constraints.target import FloatArray
+
+#: Largest cluster, in rows, that goes through the lanes.
+LANES_ROWS = 6
+#: Fewer clusters alike than this are left to the sparse solver, which takes all shapes in one call.
+LANES_CLUSTERS = 8
+#: Widest row, in atoms, that the compiled sparse solver takes.
+COMPILED_WIDTH = 4
+
+ShapeKind = Literal["water", "lanes", "chain", "sparse", "mixed", "general"]
+_NONE = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Clusters that go to one solver.
+
+    Attributes
+    ----------
+    kind : str
+        Key of the solver table in `kcons.plan`.
+    rows : ndarray of int64
+        Row numbers: (n_clusters, K) for 'water' and 'lanes', flat otherwise.
+    clusters : int
+    independent : bool
+        True if the graph alone shows that no row depends on others (trees of distances).
+    atoms : ndarray of int64
+        'water', 'lanes': (n_clusters, n_local); 'chain': atoms in path order, one path after another.
+    pairs : ndarray of int64, shape (K, 2) or (n_rows, 2)
+        'lanes': local atoms of each row; 'sparse': atoms of each row.
+    starts : ndarray of int64
+        'chain': first atom of each path, and the end.
+    """
+
+    kind: ShapeKind
+    rows: IntArray
+    clusters: int
+    independent: bool
+    atoms: IntArray = field(default_factory=lambda: _NONE)
+    pairs: IntArray = field(default_factory=lambda: _NONE)
+    starts: IntArray = field(default_factory=lambda: _NONE)
+
+
+def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows: IntArray) -> IntArray:
+    """Cluster number of each row: rows that share a movable atom belong together; -1 for rows without one."""
+    incidence = constraint_set.incidence
+    n_rows, n_atoms = incidence.shape
+    free = np.ones(n_atoms)
+    free[pinned] = 0.0
+    links = incidence.copy()
+    links.data = free[links.indices]
+    links.eliminate_zeros()
+    graph = sp.block_array([[None, links], [links.T, None]], format="csr") if n_rows else sp.csr_array((0, 0))
+    labels = np.full(n_rows, -1, dtype=np.int64)
+    if n_rows == 0:
+        return labels
+    found = sp.csgraph.connected_components(graph, directed=False)[1][:n_rows]
+    movable = np.diff(links.indptr) > 0
+    movable[pinned_rows] = False
+    if movable.any():
+        labels[movable] = np.unique(found[movable], return_inverse=True)[1]
+    return labels
+
+
+def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: FloatArray) -> Iterator[Shape]:
+    """Sort the clusters by the shape of their graph; vectorised over clusters."""
+    n_clusters = int(labels.max(initial=-1)) + 1
+    if n_clusters == 0:
+        return
+    kinds, pairs = _row_tables(constraint_set)
+    inside = labels >= 0
+    n_rows = np.bincount(labels[inside], minlength=n_clusters)
+    distances_only = np.ones(n_clusters, dtype=bool)
+    np.logical_and.at(distances_only, labels[inside], kinds[inside] == RowKind.DISTANCE)
+    compiled = np.ones(n_clusters, dtype=bool)
+    np.logical_and.at(compiled, labels[inside], kinds[inside] != RowKind.INTERPRETED)
+
+    # Atoms that move belong to one cluster each.
+    atom_label = np.full(constraint_set.n_atoms, -1, dtype=np.int64)
+    incidence = constraint_set.incidence
+    entry_label = np.repeat(labels, np.diff(incidence.indptr))
+    atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
+    movable = inverse_masses > 0
+    atom_label[~movable] = -1
+    n_atoms = np.bincount(atom_label[atom_label >= 0], minlength=n_clusters)
+    anchored = np.zeros(n_clusters, dtype=bool)
+    to_fixed = ~movable[incidence.indices] & (entry_label >= 0)
+    anchored[entry_label[to_fixed]] = True
+
+    tree = distances_only & ((n_rows == n_atoms - 1) | ((n_rows == n_atoms) & anchored))
+    small = distances_only & ~anchored & (n_rows <= LANES_ROWS)
+    left_over = np.zeros(n_clusters, dtype=bool)
+    if small.any():
+        for shape, members in _small_shapes(pairs, labels, small, inverse_masses, tree):
+            if shape is None:
+                left_over[members] = True
+            else:
+                yield shape
+    degree = np.zeros(constraint_set.n_atoms, dtype=np.int64)
+    distance_rows = inside & (kinds == RowKind.DISTANCE)
+    np.add.at(degree, pairs[distance_rows].ravel(), 1)
+    largest = np.zeros(n_clusters, dtype=np.int64)
+    np.maximum.at(largest, atom_label[atom_label >= 0], degree[atom_label >= 0])
+    path = tree & ~anchored & ~small & (largest <= 2)
+    if path.any():
+        rows = np.flatnonzero(inside & path[np.maximum(labels, 0)])
+        yield _paths(rows, pairs[rows], constraint_set.n_atoms, int(path.sum()))
+    sparse = distances_only & ~path & (~small | left_over)
+    for independent in (True, False):
+        chosen = sparse & (tree == independent)
+        if chosen.any():
+            rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
+            yield Shape("sparse", rows, int(chosen.sum()), independent, pairs=pairs[rows])
+    for kind, chosen in (("mixed", compiled & ~distances_only), ("general", ~compiled)):
+        if chosen.any():
+            rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
+            yield Shape("mixed" if kind == "mixed" else "general", rows, int(chosen.sum()), False)
+
+
+def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntArray]:
+    """Kind of each row, and the atoms of the distance rows (-1 elsewhere)."""
+    kinds = np.zeros(constraint_set.n_rows, dtype=np.int64)
+    pairs = np.full((constraint_set.n_rows, 2), -1, dtype=np.int64)
+    for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+        rows = slice(start, start + item.n_rows)
+        if item.holonomic and item.width <= COMPILED_WIDTH:
+            kinds[rows] = item.kind
+        if item.kind == RowKind.DISTANCE:
+            pairs[rows] = item.atoms
+    return kinds, pairs
+
+
+def _small_shapes(
+    pairs: IntArray, labels: IntArray, small: NDArray[np.bool_], w: FloatArray, tree: NDArray[np.bool_]
+) -> Iterator[tuple[Shape | None, IntArray]]:
+    """Groups of small clusters with the same graph and masses; None for those with too few alike."""
+    rows = np.flatnonzero((labels >= 0) & small[np.maximum(labels, 0)])
+    ends = pairs[rows]
+    degree = np.zeros(len(w), dtype=np.int64)
+    np.add.at(degree, ends.ravel(), 1)
+    # Canonical orientation and order, so that equal clusters look equal: centre first, then by mass.
+    a, b = ends[:, 0], ends[:, 1]
+    swap = (
+        (degree[a] < degree[b])
+        | ((degree[a] == degree[b]) & (w[a] > w[b]))
+        | ((degree[a] == degree[b]) & (w[a] == w[b]) & (a > b))
+    )
+    ends = np.where(swap[:, None], ends[:, ::-1], ends)
+    a, b = ends[:, 0], ends[:, 1]
+    order = np.lexsort((b, a, w[b], -degree[b], w[a], -degree[a], labels[rows]))
+    rows, ends = rows[order], ends[order]
+    cluster = labels[rows]
+    numbers, first, sizes = np.unique(cluster, return_index=True, return_counts=True)
+    waiting: list[tuple[Shape, IntArray]] = []
+    for size in np.unique(sizes):
+        chosen = np.flatnonzero(sizes == size)
+        table = first[chosen][:, None] + np.arange(size)
+        flat = ends[table].reshape(len(chosen), -1)
+        met = np.argmax(flat[:, :, None] == flat[:, None, :], axis=2)
+        new = met == np.arange(2 * size)
+        local = np.take_along_axis(np.cumsum(new, axis=1) - 1, met, axis=1)
+        mass_number = np.unique(w[flat], return_inverse=True)[1].reshape(flat.shape)
+        signature = np.concatenate([local, mass_number], axis=1)
+        _, group = np.unique(signature, axis=0, return_inverse=True)
+        group = group.ravel()
+        for g in range(int(group.max()) + 1):
+            members = np.flatnonzero(group == g)
+            one = members[0]
+            where = np.flatnonzero(new[one])
+            atoms = flat[members][:, where]
+            local_pairs = local[one].reshape(-1, 2)
+            triangle = size == 3 and len(where) == 3
+            if triangle and not np.array_equal(local_pairs, [[0, 1], [0, 2], [1, 2]]):
+                triangle = False
+            shape = Shape(
+                "water" if triangle else "lanes",
+                rows[table[members]],
+                len(members),
+                bool(tree[numbers[chosen[one]]]),
+                atoms=atoms,
+                pairs=local_pairs,
+            )
+            waiting.append((shape, numbers[chosen[members]]))
+    few = [s for s, _ in waiting if s.clusters < LANES_CLUSTERS]
+    for shape, members in waiting:
+        # A handful of groups is served in lanes however few their members.
+        if shape.clusters < LANES_CLUSTERS and len(few) > 2:
+            yield None, members
+        else:
+            yield shape, members
+
+
+def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:
+    """Order the rows and atoms of open chains from one end to the other."""
+    order, atoms, starts = _walk(pairs, n_atoms, clusters)
+    return Shape("chain", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
+
+
+@nb.njit(cache=True)
+def _walk(pairs, n_atoms, clusters):  # type: ignore[no-untyped-def]
+    n = len(pairs)
+    bonds = np.full((n_atoms, 2), -1, np.int64)
+    degree = np.zeros(n_atoms, np.int64)
+    for k in range(n):
+        for side in range(2):
+            a = pairs[k, side]
+            bonds[a, degree[a]] = k
+            degree[a] += 1
+    done = np.zeros(n, np.bool_)
+    order = np.empty(n, np.int64)
+    atoms = np.empty(n + clusters, np.int64)
+    starts = np.empty(clusters + 1, np.int64)
+    used, met, path = 0, 0, 0
+    for k in range(n):
+        for side in range(2):
+            a = pairs[k, side]
+            if degree[a] != 1 or done[bonds[a, 0]]:
+                continue
+            starts[path] = met
+            path += 1
+            atoms[met] = a
+            met += 1
+            bond = bonds[a, 0]
+            while bond >= 0 and not done[bond]:
+                done[bond] = True
+                order[used] = bond
+                used += 1
+                a = pairs[bond, 0] + pairs[bond, 1] - a
+                atoms[met] = a
+                met += 1
+                bond = bonds[a, 0] if bonds[a, 0] != bond else bonds[a, 1]
+    starts[path] = met
+    return order, atoms, starts
