@@ -23,6 +23,9 @@ from kcons.motion import Motion
 
 __all__ = ["Observer", "Rattle", "State", "Stepper", "System", "run"]
 
+#: Positions farther from the origin than this many times the size of the system carry their remainder.
+FAR = 128.0
+
 #: Residual of initial positions (relative to the row's scale) and of initial velocities (relative to the
 #: speed) that is still taken for rounding; the first step removes it.
 START_TOLERANCE = 1e-9
@@ -45,6 +48,9 @@ class State:
         forces once, and a run that is continued from a saved state continues bit for bit.
     step : int
         Steps done since the start.
+    remainder : ndarray, shape (n_atoms, 3), or None
+        What rounding took from the positions, kept where they are far from the origin compared with the
+        size of what is held (see `System.initial_state`).
     """
 
     positions: FloatArray
@@ -52,6 +58,7 @@ class State:
     time: float = 0.0
     forces: FloatArray | None = None
     step: int = 0
+    remainder: FloatArray | None = None
 
     def reversed(self) -> State:
         """The same point with opposite velocities."""
@@ -133,6 +140,12 @@ class System:
             Whether to bring positions and velocities that violate the constraints onto them (nearest point
             in the mass metric) instead of raising.
 
+        Notes
+        -----
+        At 1e6 from the origin a position is rounded to 1e-10; a step that puts this right again turns it into
+        velocity, 2e-9 of the energy in 1000 steps. Where all rows are independent of the origin, such states
+        therefore carry the remainder of their positions, and steps are made relative to one of the atoms.
+
         Raises
         ------
         InputError
@@ -161,19 +174,28 @@ class System:
                     atoms=held.row_atoms(row),
                 )
             x = motion.restore_positions(x, time=time)
-        tangent = motion.project_velocities(x, v, time=time)
+        remainder = None
+        local = x
+        if self._is_far(x):
+            shift = x[self._anchor].copy()
+            local = motion.restore_positions(x - shift, time=time)
+            remainder = local - (x - shift)
+        tangent = motion.project_velocities(local, v, time=time)
         away = np.abs(tangent - v)
-        if given and away.max() <= START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
-            return State(x, v, time)  # as given, to the last bit
-        if given and not project:
-            atom = int(np.argmax(away.max(axis=1)))
-            raise InputError(
-                f"initial velocities violate the constraints: atom {atom} moves off them with {away[atom].max():.6g}; "
-                "pass project=True to remove that part (the nearest admissible velocities in the mass metric)",
-                item="velocities",
-                atoms=[atom],
-            )
-        return State(x, tangent, time)
+        if given and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+            if not project:
+                atom = int(np.argmax(away.max(axis=1)))
+                raise InputError(
+                    f"initial velocities violate the constraints: atom {atom} moves off them with "
+                    f"{away[atom].max():.6g}; pass project=True to remove that part (the nearest admissible "
+                    "velocities in the mass metric)",
+                    item="velocities",
+                    atoms=[atom],
+                )
+            v = tangent
+        elif not given:
+            v = tangent
+        return State(x, v, time, remainder=remainder)
 
     def forces(self, x: FloatArray, v: FloatArray, time: float, step: int) -> FloatArray:
         """Applied forces, checked, shape (n_atoms, 3); `step` is named if they are not finite."""
@@ -212,6 +234,18 @@ class System:
         return energy
 
     # -- inner ----------------------------------------------------------------------------------
+
+    @cached_property
+    def _anchor(self) -> int:
+        """The atom that positions are taken relative to where they are far away."""
+        return int(self.motion.constraint_set.incidence.indices[0])
+
+    def _is_far(self, x: FloatArray) -> bool:
+        held = self.motion.constraint_set
+        if held.n_rows == 0 or not all(c.translation_invariant for c in held.constraints):
+            return False
+        near = x[np.unique(held.incidence.indices)]
+        return bool(np.abs(near).max() > FAR * np.abs(near - x[self._anchor]).max())
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
         try:
@@ -309,21 +343,28 @@ class Rattle:
         number = state.step + 1
         time = state.time + dt
         start = system.with_forces(state)
-        assert start.forces is not None
+        first_forces = start.forces
+        assert first_forces is not None
+        shift: FloatArray | None = None
+        if start.remainder is not None:
+            shift = start.positions[system._anchor]
+            start = replace(start, positions=(start.positions - shift) + start.remainder)
         with np.errstate(over="ignore", invalid="ignore"):  # checked below, with the step's number
             half_kick = (0.5 * dt) * system.inverse_masses
-            u = half_kick * start.forces
+            u = half_kick * first_forces
             u += start.velocities
             try:
                 if system._velocity_rows is None:
                     x, u = _drift(system, start, u, dt)
                 else:
                     x, u = system._velocity_rows.drift(start, u, dt)
-                v, forces = _second_kick(system, x, u, half_kick, time, number)
+                positions = x if shift is None else x + shift
+                v, forces = _second_kick(system, positions, x, u, half_kick, time, number)
             except ConvergenceError as error:
-                raise _explained(error, system, state, dt, number) from error
+                raise _explained(error, system, start, dt, number) from error
             _check_finite(v, "velocity", number)
-        return State(x, v, time, forces, number)
+        remainder = None if shift is None else x - (positions - shift)
+        return State(positions, v, time, forces, number, remainder)
 
 
 def _drift(system: System, start: State, u: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -339,24 +380,33 @@ def _drift(system: System, start: State, u: FloatArray, dt: float) -> tuple[Floa
 
 
 def _second_kick(
-    system: System, x: FloatArray, u: FloatArray, half_kick: FloatArray, time: float, number: int
+    system: System,
+    positions: FloatArray,
+    x: FloatArray,
+    u: FloatArray,
+    half_kick: FloatArray,
+    time: float,
+    number: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Half a kick with the forces at the new positions, and A v = c; `u` may be changed."""
+    """Half a kick with the forces at the new positions, and A v = c; `u` may be changed.
+
+    `x` are the positions that the constraints see: the same, or relative to an atom.
+    """
     motion = system.motion
     if not system.velocity_dependent:
-        forces = system.forces(x, u, time, number)
+        forces = system.forces(positions, u, time, number)
         u += half_kick * forces
         return motion.project_velocities(x, u, time=time, out=u), forces
-    v = motion.project_velocities(x, u + half_kick * system.forces(x, u, time, number), time=time)
+    v = motion.project_velocities(x, u + half_kick * system.forces(positions, u, time, number), time=time)
     change = math.inf
     for _ in range(_MAX_ITERATIONS):
-        forces = system.forces(x, v, time, number)
+        forces = system.forces(positions, v, time, number)
         following = motion.project_velocities(x, u + half_kick * forces, time=time)
         last, change = change, float(np.abs(following - v).max(initial=0.0))
         speed = float(np.abs(following).max(initial=0.0))
         v = following
         if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
-            return v, system.forces(x, v, time, number)
+            return v, system.forces(positions, v, time, number)
     raise ConvergenceError(
         f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
         f"after {_MAX_ITERATIONS} iterations; time step too large",
@@ -481,8 +531,9 @@ def _fixed_atoms(motion: Motion) -> IntArray:
 def _check_finite(values: FloatArray, item: str, step: int) -> None:
     flat = values.ravel()
     # The sum of squares is finite unless something is wrong or enormous; only then look at each number.
-    if math.isfinite(np.dot(flat, flat)):
-        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        if math.isfinite(np.dot(flat, flat)):
+            return
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         atom = int(np.argmax(bad))
