@@ -76,10 +76,10 @@ def _refuse_impossible_triangles(pairs: IntArray, rows: IntArray, length: FloatA
     The least sum of squared deviations of a triangle with the excess e = d_3 - d_1 - d_2 is e^2/3: each
     side takes a third of the excess.
     """
-    first = np.concatenate([[True], (pairs[1:] != pairs[:-1]).any(axis=1)])
-    pairs, rows, length = pairs[first], rows[first], length[first]
     if len(pairs) < 3:
         return
+    first = np.concatenate([[True], (pairs[1:] != pairs[:-1]).any(axis=1)])
+    pairs, rows, length = pairs[first], rows[first], length[first]
     for sides in _triangles(pairs):
         d = length[sides]
         longest = np.argmax(d, axis=1)

@@ -1,0 +1,155 @@
+"""One object of every family, several rows each where that is possible, over eight atoms.
+
+`CASES` maps a name to a function that builds the object; `scattered` gives positions at which no row is
+close to singular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kcons import constraints as kc
+
+N_ATOMS = 8
+MASSES = np.array([1.0, 12.0, 16.0, 1.0, 14.0, 32.0, 2.0, 19.0])
+TIME = 0.7
+
+
+def scattered(seed: int) -> np.ndarray:
+    """Random positions, atoms at least 0.8 apart and no three neighbours in the list nearly in a line."""
+    rng = np.random.default_rng(seed)
+    while True:
+        x = rng.uniform(-2.0, 2.0, size=(N_ATOMS, 3))
+        apart = np.linalg.norm(x[:, None] - x[None], axis=2)[np.triu_indices(N_ATOMS, 1)]
+        u = x[:, None] - x[None]
+        unit = u / np.maximum(np.linalg.norm(u, axis=2), 1e-9)[..., None]
+        sines = np.linalg.norm(np.cross(unit[:, :, None], unit[:, None]), axis=3)
+        off = ~np.eye(N_ATOMS, dtype=bool)
+        bent = sines[off[:, :, None] & off[:, None] & off[None]].min()
+        if apart.min() > 0.8 and bent > 0.2 and np.linalg.norm(x[:, :2], axis=1).min() > 0.4:
+            return x
+
+
+def _rotation() -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
+    return q
+
+
+def hoop(atoms: object, omega: float = 0.8, exact: bool = True) -> kc.ImplicitSurface:
+    """A plane through the z axis that turns with omega: -x sin(wt) + y cos(wt) = 0."""
+
+    def function(r, t):
+        return -r[:, 0] * np.sin(omega * t) + r[:, 1] * np.cos(omega * t)
+
+    def normal(r, t):
+        return np.tile([-np.sin(omega * t), np.cos(omega * t), 0.0], (len(r), 1))
+
+    def time_derivatives(r, v, t):
+        s, c = np.sin(omega * t), np.cos(omega * t)
+        rate = -omega * (r[:, 0] * c + r[:, 1] * s)
+        mixed = -omega * (v[:, 0] * c + v[:, 1] * s)
+        return rate, 2 * mixed - omega**2 * function(r, t)
+
+    return kc.ImplicitSurface(
+        atoms,
+        function,
+        normal,
+        (lambda r, v, t: np.zeros_like(r)) if exact else None,
+        time_dependent=True,
+        time_derivatives=time_derivatives if exact else None,
+    )
+
+
+def saddle(atoms: object, exact: bool) -> kc.ImplicitSurface:
+    """z = (x^2 - y^2)/4 + x^3/9."""
+    return kc.ImplicitSurface(
+        atoms,
+        lambda r: r[:, 2] - (r[:, 0] ** 2 - r[:, 1] ** 2) / 4 - r[:, 0] ** 3 / 9,
+        lambda r: np.stack([-r[:, 0] / 2 - r[:, 0] ** 2 / 3, r[:, 1] / 2, np.ones(len(r))], axis=1),
+        (lambda r, v: np.stack([(-1 / 2 - 2 * r[:, 0] / 3) * v[:, 0], v[:, 1] / 2, np.zeros(len(r))], axis=1))
+        if exact
+        else None,
+        target=None,
+    )
+
+
+def spread(atoms: object, exact: bool) -> kc.Custom:
+    """exp(-|r_0 - r_1|^2/8) + |r_1 - r_2|^2/5 cos(t)."""
+
+    def function(r, t):
+        return np.exp(-np.sum((r[0] - r[1]) ** 2) / 8) + np.sum((r[1] - r[2]) ** 2) / 5 * np.cos(t)
+
+    def gradient(r, t):
+        a, b = r[0] - r[1], r[1] - r[2]
+        first = -a / 4 * np.exp(-a @ a / 8)
+        second = 2 * b / 5 * np.cos(t)
+        return np.array([first, second - first, -second])
+
+    def hessian_vector(r, v, t):
+        a, da, db = r[0] - r[1], v[0] - v[1], v[1] - v[2]
+        first = (-da / 4 + a * (a @ da) / 16) * np.exp(-a @ a / 8)
+        second = 2 * db / 5 * np.cos(t)
+        return np.array([first, second - first, -second])
+
+    def time_derivatives(r, v, t):
+        b, db = r[1] - r[2], v[1] - v[2]
+        return -(b @ b) / 5 * np.sin(t), -4 * (b @ db) / 5 * np.sin(t) - (b @ b) / 5 * np.cos(t)
+
+    return kc.Custom(
+        atoms,
+        function,
+        gradient,
+        hessian_vector if exact else None,
+        time_derivatives=time_derivatives if exact else None,
+        time_dependent=True,
+        translation_invariant=True,
+    )
+
+
+def swirl(atoms: object, exact: bool) -> kc.CustomVelocity:
+    """(r_1 + (t, 0, 0)) x r_0 . v_0 + |r_0|^2 e_z . v_1."""
+
+    def coefficients(r, t):
+        return np.array([np.cross(r[1] + [t, 0, 0], r[0]), [0.0, 0.0, r[0] @ r[0]]])
+
+    def derivative(r, v, t):
+        turning = np.cross(v[1] + [1, 0, 0], r[0]) + np.cross(r[1] + [t, 0, 0], v[0])
+        return np.array([turning, [0.0, 0.0, 2 * r[0] @ v[0]]])
+
+    return kc.CustomVelocity(atoms, coefficients, derivative if exact else None, time_dependent=True)
+
+
+CASES: dict[str, Callable[[], kc.Constraint]] = {
+    "Distance": lambda: kc.Distance([[0, 1], [2, 3], [7, 1]]),
+    "Distance moving": lambda: kc.Distance([[0, 1], [2, 3]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
+    "Angle": lambda: kc.Angle([[0, 1, 2], [3, 4, 5], [7, 1, 6]]),
+    "Dihedral": lambda: kc.Dihedral([[0, 1, 2, 3], [7, 6, 2, 4]]),
+    "Sphere": lambda: kc.Sphere([0, 3], [[0.1, 0.2, -0.3], [1.0, 0.0, 3.0]]),
+    "Cylinder": lambda: kc.Cylinder([1, 2], [3.0, 0.2, -0.3], [[1.0, 2.0, 0.5], [0.0, 0.0, -2.0]]),
+    "Torus": lambda: kc.Torus([1, 2, 5], [0.1, 0.0, 0.2], [0.1, 0.2, 1.0], [1.5, 0.9, 3.0]),
+    "Ellipsoid": lambda: kc.Ellipsoid([4, 5], [0.1, 0.2, 0.3], [1.0, 2.0, 3.0], _rotation(), target=None),
+    "Elliptic cylinder": lambda: kc.Ellipsoid([4, 5], [0.0, 0.0, 0.0], [1.0, np.inf, 3.0], target=None),
+    "Plane": lambda: kc.Plane([0, 1], [[1.0, 2.0, 3.0], [0.0, 0.0, 1.0]], offset=[0.2, -0.4]),
+    "Line": lambda: kc.Line([3, 4], [0.1, 0.2, 0.3], [1.0, 1.0, -0.5]),
+    "ImplicitSurface": lambda: saddle([0, 3, 5], exact=True),
+    "ImplicitSurface differenced": lambda: saddle([0, 3, 5], exact=False),
+    "ImplicitSurface moving": lambda: hoop([0, 1], exact=True),
+    "ImplicitSurface moving differenced": lambda: hoop([0, 1], exact=False),
+    "CenterOfMass": lambda: kc.CenterOfMass([[0, 1, 2], [3, 4, 5]], axes=(0, 2)),
+    "CenterDistance": lambda: kc.CenterDistance([[0, 1, 2], [3, 4, 5]], [[3, 4], [6, 7]]),
+    "RadiusOfGyration": lambda: kc.RadiusOfGyration([[0, 1, 2, 3], [4, 5, 6, 7]]),
+    "RadiusOfGyration equal weights": lambda: kc.RadiusOfGyration([0, 1, 2, 3, 5], mass_weighted=False),
+    "Custom": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=True),
+    "Custom differenced": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=False),
+    "LinearCombination": lambda: kc.LinearCombination([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]),
+    "LinearRelation": lambda: kc.LinearRelation([0, 3], [1, 2], [0.3, 0.7]),
+    "FixedAtoms": lambda: kc.FixedAtoms([6, 1]),
+    "FixedAtoms moving": lambda: kc.FixedAtoms([6, 1], lambda t: [[np.sin(t), 0.0, 0.0], [0.0, t**2, np.cos(t)]]),
+    "LinearVelocity": lambda: kc.LinearVelocity([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]], np.sin),
+    "KnifeEdge": lambda: kc.KnifeEdge([0, 3], [1, 4], [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], contact=[0.0, 0.3]),
+    "Rolling": lambda: kc.Rolling([0, 3], [1, 4], [0.7, 1.5], [1.0, 0.2, 0.1], [0.1, 0.0, 1.0]),
+    "CustomVelocity": lambda: swirl([[0, 1], [6, 4]], exact=True),
+    "CustomVelocity differenced": lambda: swirl([[0, 1], [6, 4]], exact=False),
+}

@@ -1,0 +1,184 @@
+"""What every family owes: derivatives that agree, selections, copies, plain data. All families at once."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import FAMILIES, Distance, FixedAtoms, MovingTarget, Sphere, from_dict
+from kcons.errors import InputError
+
+from .cases import CASES, MASSES, N_ATOMS, TIME, scattered
+
+STEPS = 2.0 ** -np.arange(6, 11)
+
+
+def made(name: str):
+    item = CASES[name]()
+    return item.with_masses(MASSES[item.atoms])
+
+
+def slopes(remainder: np.ndarray, round_off: float) -> np.ndarray:
+    """Order in the step of each column; infinite where nothing is left but round-off."""
+    found = [np.polyfit(np.log(STEPS), np.log(np.maximum(column, 1e-300)), 1)[0] for column in remainder.T]
+    return np.where(remainder.max(axis=0) < round_off, np.inf, found)
+
+
+def test_cases_cover_every_family():
+    assert {CASES[name]().family for name in CASES} == set(FAMILIES)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", CASES)
+def test_gradient_and_curvature_by_taylor_remainder(name, seed):
+    """Halving the step divides the remainder by 4 after the gradient, by 8 after the curvature."""
+    item = made(name)
+    r = scattered(seed)[item.atoms]
+    v = np.random.default_rng(seed + 100).normal(size=(N_ATOMS, 3))[item.atoms]
+    rate, second = item.time_terms(r, v, TIME)
+    curvature = item.curvature(r, v, TIME) + second
+    if item.holonomic:
+        values = [item.measure(r + h * v, TIME + h) for h in (0.0, *STEPS)]
+        slope = np.einsum("kai,kai->k", item.gradient(r, TIME), v) + rate
+    else:
+        values = [np.einsum("kai,kai->k", item.gradient(r + h * v, TIME + h), v) for h in (0.0, *STEPS)]
+        slope = curvature
+    remainder = np.array(values[1:]) - values[0] - STEPS[:, None] * slope
+    assert np.all(slopes(np.abs(remainder), 1e-13) > 1.9)
+    if item.holonomic:
+        remainder = remainder - STEPS[:, None] ** 2 / 2 * curvature
+        assert np.all(slopes(np.abs(remainder), 3e-13) > 2.9)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_shapes(name):
+    item = made(name)
+    r = scattered(0)[item.atoms]
+    assert item.measure(r, TIME).shape == (item.n_rows,)
+    assert item.gradient(r, TIME).shape == (item.n_rows, item.width, 3)
+    assert item.curvature(r, np.ones_like(r), TIME).shape == (item.n_rows,)
+    assert item.parameters().shape[0] == item.n_rows
+    assert all(part.shape == (item.n_rows,) for part in item.time_terms(r, r, TIME))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_selected_rows_behave_like_the_rows(name):
+    item = made(name)
+    x = scattered(1)
+    v = scattered(2)
+    rows = np.arange(item.n_rows)[::-1][: max(1, item.n_rows - 1)]
+    part = item.select(rows)
+    assert np.array_equal(part.atoms, item.atoms[rows])
+    full, some = x[item.atoms], x[part.atoms]
+    assert np.allclose(part.measure(some, TIME), item.measure(full, TIME)[rows], rtol=1e-15, atol=1e-15)
+    assert np.allclose(part.gradient(some, TIME), item.gradient(full, TIME)[rows], rtol=1e-14, atol=1e-15)
+    assert np.allclose(
+        part.curvature(some, v[part.atoms], TIME),
+        item.curvature(full, v[item.atoms], TIME)[rows],
+        rtol=1e-9,
+        atol=1e-11,
+    )
+    assert np.array_equal(part.parameters(), item.parameters()[rows])
+    if item.target is not None:
+        assert np.array_equal(part.target_at(TIME), item.target_at(TIME)[rows])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_renumbered_atoms_carry_the_rows_along(name):
+    item = made(name)
+    new_index = np.random.default_rng(3).permutation(N_ATOMS)
+    x = scattered(1)
+    moved = np.empty_like(x)
+    moved[new_index] = x
+    other = item.renumbered(new_index)
+    assert np.array_equal(other.measure(moved[other.atoms], TIME), item.measure(x[item.atoms], TIME))
+    assert np.array_equal(item.atoms, CASES[name]().atoms), "the original must stay as it was"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_plain_data_round_trip(name):
+    item = made(name)
+    if isinstance(item.target, MovingTarget) or any(getattr(item, f) is not None for f in item.functions):
+        with pytest.raises(InputError, match="cannot be written to a file.*attach it again"):
+            item.todict()
+        return
+    x = scattered(1)
+    held = ConstraintSet([item], x, MASSES, time=TIME).constraints[0]
+    again = from_dict(json.loads(json.dumps(held.todict()))).with_masses(MASSES[held.atoms])
+    r = x[held.atoms]
+    assert type(again) is type(held)
+    assert np.array_equal(again.atoms, held.atoms)
+    assert np.array_equal(again.target, held.target)
+    assert np.array_equal(again.measure(r, TIME), held.measure(r, TIME))
+    assert np.array_equal(again.gradient(r, TIME), held.gradient(r, TIME))
+    assert (again.kind, again.translation_invariant) == (held.kind, held.translation_invariant)
+    assert again.todict() == held.todict()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_another_target_leaves_the_original(name):
+    item = made(name)
+    before = item.target
+    other = item.with_target(0.25)
+    assert np.array_equal(other.target, np.full(item.n_rows, 0.25))
+    assert item.target is before
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_common_shift_changes_only_rows_that_say_so(name):
+    item = made(name)
+    r = scattered(1)[item.atoms]
+    shifted = r + np.array([0.3, -0.2, 0.5])
+    unchanged = np.allclose(item.gradient(shifted, TIME), item.gradient(r, TIME), atol=1e-12)
+    if item.holonomic:
+        unchanged = unchanged and np.allclose(item.measure(shifted, TIME), item.measure(r, TIME), atol=1e-12)
+    if item.translation_invariant:
+        assert unchanged
+    elif item.holonomic:
+        assert not unchanged
+
+
+@pytest.mark.parametrize(
+    ("atoms", "message"),
+    [
+        ([[0, 0]], "row 0 names an atom twice"),
+        ([[0, 1], [3, -1]], "row 1 has the negative atom index -1"),
+        ([[0.5, 1.0]], "must be integers"),
+        ([[True, False]], "must be integers"),
+        ([[0, 1, 2]], "a row has 2 atoms"),
+        ([[0, 1], [2]], "different numbers of atoms"),
+        ([[[0, 1]]], "shape"),
+    ],
+)
+def test_bad_atoms_are_named(atoms, message):
+    with pytest.raises(InputError, match=message):
+        Distance(atoms)
+
+
+def test_no_rows_at_all():
+    item = Distance([])
+    assert (item.n_rows, item.width) == (0, 2)
+    held = ConstraintSet([item], np.zeros((3, 3)), np.ones(3))
+    assert held.n_rows == 0
+    assert held.value(np.zeros((3, 3))).shape == (0,)
+
+
+def test_plain_data_that_does_not_fit():
+    data = Sphere([0, 1], [0.0, 0.0, 0.0], 1.0).todict()
+    with pytest.raises(InputError, match="no constraint family"):
+        from_dict({**data, "family": "Spheroid"})
+    with pytest.raises(InputError, match="'center'.* missing or unknown"):
+        from_dict({key: value for key, value in data.items() if key != "center"})
+    with pytest.raises(InputError, match="center has shape"):
+        from_dict({**data, "center": [[0.0, 0.0]]})
+    with pytest.raises(InputError, match="center of row 1 is not finite"):
+        from_dict({**data, "center": [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]})
+
+
+def test_names_and_repr():
+    assert Distance([[4, 5]]).row_name(0) == "Distance(4, 5)"
+    assert repr(Distance([[4, 5], [6, 7]])) == "<Distance(2 rows)>"
+    assert repr(FixedAtoms(3)) == "<FixedAtoms(3 rows)>"

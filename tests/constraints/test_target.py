@@ -1,0 +1,63 @@
+"""Targets: numbers, functions of time, and their derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.constraints.target import MovingTarget, as_target
+from kcons.errors import InputError
+
+
+def test_numbers_are_spread_over_the_rows():
+    assert as_target(2, 3).tolist() == [2.0, 2.0, 2.0]
+    assert as_target([1, 2, 3], 3).dtype == np.float64
+    assert as_target(np.float32(1.5), 2).tolist() == [1.5, 1.5]
+    assert as_target(np.arange(6).reshape(2, 3), 6).tolist() == list(range(6))
+    assert as_target(None, 3) is None
+
+
+@pytest.mark.parametrize("given", [{}, {"rate": np.cos}, {"rate": np.cos, "acceleration": lambda t: -np.sin(t)}])
+def test_derivatives_given_or_differenced(given):
+    target = MovingTarget(np.sin, **given)
+    for time in (0.0, 0.7, 3.0):
+        assert target.rate_at(time, 2) == pytest.approx([np.cos(time)] * 2, abs=1e-13)
+        assert target.acceleration_at(time, 2) == pytest.approx([-np.sin(time)] * 2, abs=1e-11)
+
+
+def test_differences_are_of_eighth_order():
+    steps = np.array([0.4, 0.2, 0.1])
+    errors = [
+        [abs(t.rate_at(0.3, 1)[0] - np.cos(0.3)), abs(t.acceleration_at(0.3, 1)[0] + np.sin(0.3))]
+        for t in (MovingTarget(np.sin, time_step=h) for h in steps)
+    ]
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert np.all(order > 7.8)
+
+
+def test_an_acceleration_without_its_rate_is_refused():
+    with pytest.raises(InputError, match="also needs its rate"):
+        MovingTarget(np.sin, acceleration=np.sin).rate_at(0.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ([1.0, 2.0], r"target has shape \(2,\); give one number or 3"),
+        (np.zeros((2, 2)), r"target has shape \(2, 2\)"),
+        ([1.0, np.nan, 2.0], "the target of row 1 is not finite"),
+        (np.inf, "the target of row 0 is not finite"),
+        ("one", "no number or array of numbers"),
+        ([[1.0], [1.0, 2.0]], "no number or array of numbers"),
+    ],
+)
+def test_bad_targets_are_named(target, message):
+    with pytest.raises(InputError, match=message):
+        as_target(target, 3)
+
+
+def test_bad_values_of_a_function_are_named():
+    with pytest.raises(InputError, match="target at t = 2 is not finite"):
+        MovingTarget(lambda t: np.nan).at(2.0, 1)
+    with pytest.raises(InputError, match=r"target at t = 2 has shape \(3,\); give one number or 2"):
+        MovingTarget(lambda t: [1.0, 2.0, 3.0]).at(2.0, 2)
