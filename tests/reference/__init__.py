@@ -1,0 +1,1 @@
+"""Independent reference solutions and how to read them."""
