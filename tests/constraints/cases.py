@@ -123,7 +123,7 @@ def swirl(atoms: object, exact: bool) -> kc.CustomVelocity:
 
 CASES: dict[str, Callable[[], kc.Constraint]] = {
     "Distance": lambda: kc.Distance([[0, 1], [2, 3], [7, 1]]),
-    "Distance moving": lambda: kc.Distance([[0, 1], [2, 3]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
+    "Distance moving": lambda: kc.Distance([[4, 6], [5, 0]], lambda t: [1 + 0.1 * np.sin(t), 2.0]),
     "Angle": lambda: kc.Angle([[0, 1, 2], [3, 4, 5], [7, 1, 6]]),
     "Dihedral": lambda: kc.Dihedral([[0, 1, 2, 3], [7, 6, 2, 4]]),
     "Sphere": lambda: kc.Sphere([0, 3], [[0.1, 0.2, -0.3], [1.0, 0.0, 3.0]]),

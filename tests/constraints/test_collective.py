@@ -71,7 +71,7 @@ def test_groups_across_the_boundary_are_made_whole():
 
 def test_neighbours_in_a_group_must_be_closer_than_half_the_box():
     x = np.array([[0.0, 0.0, 0.0], [3.9, 3.9, 3.9]])
-    with pytest.raises(InputError, match="distance of neighbouring atoms .* not shorter than half the box"):
+    with pytest.raises(InputError, match=r"distance of neighbouring atoms .* not shorter than half the box"):
         ConstraintSet([RadiusOfGyration([0, 1])], x, np.ones(2), cell=[8.0, 8.0, 8.0])
 
 
@@ -104,9 +104,9 @@ def test_bad_groups_are_refused(make, message):
 
 def test_undefined_gradients_are_refused():
     x = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, -1.0, 0]])
-    with pytest.raises(SingularGeometryError, match="two centres of row 0.*coincide"):
+    with pytest.raises(SingularGeometryError, match=r"two centres of row 0.*coincide"):
         ConstraintSet([CenterDistance([0, 1], [2, 3])], x, np.ones(5))
-    with pytest.raises(SingularGeometryError, match="all atoms of row 0.*coincide"):
+    with pytest.raises(SingularGeometryError, match=r"all atoms of row 0.*coincide"):
         ConstraintSet([RadiusOfGyration([3, 4])], x, np.ones(5))
     with pytest.raises(InputError, match="target -1 is not positive"):
         ConstraintSet([RadiusOfGyration([0, 1], -1.0)], x, np.ones(5))

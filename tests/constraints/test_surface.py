@@ -53,7 +53,7 @@ def test_line_is_two_orthonormal_rows_normal_to_it(direction):
 def test_line_without_a_point_takes_the_initial_ones():
     x = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
     held = ConstraintSet([Line([0, 1], None, [1.0, 0.0, 0.0])], x, np.ones(2))
-    assert np.array_equal(held.value(x + [[7.0, 0, 0], [-3.0, 0, 0]]), np.zeros(4))
+    assert np.array_equal(held.value(x + np.array([[7.0, 0, 0], [-3.0, 0, 0]])), np.zeros(4))
 
 
 def test_ellipsoid_vanishes_on_its_surface_and_has_gradients_of_order_one():

@@ -84,8 +84,9 @@ def test_blade_across_the_boundary():
     x = np.array([[9.9, 0.0, 0.0], [0.4, 0.0, 0.0]])
     item = KnifeEdge(0, 1, [0.0, 0.0, 1.0])
     wrapped = ConstraintSet([item], x, np.ones(2), cell=[10.0] * 3)
-    whole = ConstraintSet([item], x + [[-10.0, 0, 0], [0, 0, 0]], np.ones(2))
-    assert np.allclose(wrapped.jacobian(x).toarray(), whole.jacobian(x + [[-10.0, 0, 0], [0, 0, 0]]).toarray())
+    y = x - np.array([[10.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    whole = ConstraintSet([item], y, np.ones(2))
+    assert np.allclose(wrapped.jacobian(x).toarray(), whole.jacobian(y).toarray())
 
 
 def test_directions_that_do_not_exist():

@@ -1,0 +1,110 @@
+"""Targets that contradict each other."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints.contradictions import _triangles
+from kcons.errors import ContradictionError, InfeasibleError
+
+from .cases import MASSES, scattered
+
+
+def test_one_pair_at_two_lengths():
+    x = scattered(0)
+    with pytest.raises(
+        ContradictionError, match=r"constraints #0 and #1 on atoms \(0, 1\) have different targets 1.0, 1.001"
+    ) as caught:
+        ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.001])], x, MASSES)
+    assert isinstance(caught.value, ValueError)
+    assert (caught.value.rows, caught.value.atoms) == ((0, 1), (0, 1))
+
+
+def test_across_objects_and_against_an_initial_length():
+    x = np.array([[0.0, 0, 0], [1.5, 0, 0], [0, 2.0, 0]])
+    with pytest.raises(ContradictionError, match=r"#1 and #2 on atoms \(0, 1\) have different targets 1.5, 1.2"):
+        ConstraintSet([Distance([[1, 2], [0, 1]]), Distance([[1, 0]], 1.2)], x, np.ones(3))
+
+
+def test_the_same_length_twice_is_accepted():
+    x = scattered(0)
+    held = ConstraintSet([Distance([[0, 1], [1, 0], [0, 1]])], x, MASSES)
+    assert held.n_rows == 3
+    ConstraintSet([Distance([[0, 1], [1, 0]], [1.0, 1.0 + 1e-12])], x, MASSES)
+
+
+def test_angles_and_dihedrals_at_two_values():
+    x = scattered(0)
+    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2\) have different targets 1.0, 1.1"):
+        ConstraintSet([Angle([[0, 1, 2], [2, 1, 0]], [1.0, 1.1])], x, MASSES)
+    with pytest.raises(ContradictionError, match=r"atoms \(0, 1, 2, 3\) have different targets 1.0, 1.1"):
+        ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0]], [1.0, 1.1])], x, MASSES)
+    # Other vertices, other axes and other images are no contradiction.
+    ConstraintSet([Angle([[0, 1, 2], [0, 2, 1]], [1.0, 1.1])], x, MASSES)
+    ConstraintSet([Dihedral([[0, 1, 2, 3], [3, 2, 1, 0], [0, 2, 1, 3]], [1.0, 1.0 + 2 * np.pi, 1.1])], x, MASSES)
+
+
+def test_triangle_inequality():
+    x = scattered(0)
+    with pytest.raises(
+        InfeasibleError, match=r"infeasible: residual cannot go below 0.333333 \(sum of squares\).*\(0, 1, 2\)"
+    ) as caught:
+        ConstraintSet([Distance([[5, 6], [0, 1], [1, 2], [0, 2]], [9.0, 1.0, 1.0, 3.0])], x, MASSES)
+    assert isinstance(caught.value, RuntimeError)
+    assert caught.value.residual == pytest.approx(1 / 3, rel=1e-14)
+    assert (caught.value.row, caught.value.atoms) == (3, (0, 1, 2))
+
+
+@given(excess=st.floats(1e-6, 5), a=st.floats(0.1, 5), b=st.floats(0.1, 5))
+def test_the_quoted_residual_is_the_least(excess, a, b):
+    """Collinear atoms at p, q with p + q against a + b + excess: the sum of squares is least at e/3 each."""
+    share = excess / 3
+    best = share**2 * 2 + (a + b + excess - (a + share) - (b + share)) ** 2
+    with pytest.raises(InfeasibleError) as caught:
+        ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]], [a, b, a + b + excess])], scattered(0), MASSES)
+    assert caught.value.residual == pytest.approx(best, rel=1e-6)
+
+
+def test_flat_triangles_pass():
+    ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]], [0.1, 0.2, 0.1 + 0.2])], scattered(0), MASSES)
+    x = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [1.6, 1.7, 1.8]])
+    ConstraintSet([Distance([[0, 1], [1, 2], [0, 2]])], x, np.ones(3))
+
+
+@given(edges=st.sets(st.tuples(st.integers(0, 9), st.integers(0, 9)).filter(lambda e: e[0] < e[1]), min_size=1))
+def test_triangles_of_any_graph(edges):
+    pairs = np.array(sorted(edges))
+    found = {tuple(sorted(np.unique(pairs[t]).tolist())) for part in _triangles(pairs) for t in part}
+    expected = {
+        three for three in itertools.combinations(range(10), 3) if set(itertools.combinations(three, 2)) <= edges
+    }
+    assert found == expected
+    assert sum(len(part) for part in _triangles(pairs)) == len(expected)
+
+
+def test_every_triangle_is_found_where_memory_is_bounded(monkeypatch):
+    monkeypatch.setattr("kcons.constraints.contradictions._CHUNK", 50)
+    pairs = np.array(list(itertools.combinations(range(30), 2)))
+    parts = list(_triangles(pairs))
+    assert len(parts) > 10
+    assert sum(map(len, parts)) == 30 * 29 * 28 // 6
+
+
+def test_one_bad_water_among_many():
+    n = 2000
+    x = np.random.default_rng(0).normal(size=(3 * n, 3))
+    atoms = np.arange(3 * n).reshape(n, 3)
+    pairs = np.concatenate([atoms[:, [0, 1]], atoms[:, [0, 2]], atoms[:, [1, 2]]])
+    target = np.repeat([1.0, 1.0, 1.5], n)
+    ConstraintSet([Distance(pairs, target)], x, np.ones(3 * n))
+    target[2 * n + 1234] = 2.5
+    with pytest.raises(InfeasibleError, match=rf"#{2 * n + 1234} = 2.5") as caught:
+        ConstraintSet([Distance(pairs, target)], x, np.ones(3 * n))
+    assert caught.value.atoms == (3702, 3703, 3704)
