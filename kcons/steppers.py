@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError
 from kcons.motion import Motion
 
 __all__ = ["Observer", "Rattle", "State", "Stepper", "System", "run"]
@@ -153,6 +153,8 @@ class System:
             False.
         InfeasibleError
             With `project`, if no solution can be reached.
+        OverdeterminedError
+            The rows leave no degree of freedom, and the velocities are not what they prescribe.
         """
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
@@ -183,6 +185,12 @@ class System:
         tangent = motion.project_velocities(local, v, time=time)
         away = np.abs(tangent - v)
         if given and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+            if motion.degrees_of_freedom == 0:
+                raise OverdeterminedError(
+                    f"rank {motion.rank} leaves no degree of freedom, yet atoms move: hold fewer rows, "
+                    "or start without velocities",
+                    rows=range(held.n_rows),
+                )
             if not project:
                 atom = int(np.argmax(away.max(axis=1)))
                 raise InputError(
