@@ -357,7 +357,8 @@ class ConstraintSet:
         other = object.__new__(ConstraintSet)
         other.n_atoms, other.masses, other.lattice = self.n_atoms, self.masses, self.lattice
         other.constraints = tuple(constraints)
-        other.starts = np.concatenate([[0], np.cumsum([c.n_rows for c in constraints], dtype=np.int64)]).astype(np.int64)
+        ends = np.cumsum([c.n_rows for c in constraints], dtype=np.int64)
+        other.starts = np.concatenate([[0], ends]).astype(np.int64)
         other._set_scale(positions, time)
         return other
 
