@@ -23,7 +23,18 @@ from numpy.typing import NDArray
 
 import kcons.constraints as families
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms, LinearCombination, LinearRelation
+from kcons.constraints import (
+    Angle,
+    CenterOfMass,
+    Constraint,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    Line,
+    LinearCombination,
+    LinearRelation,
+    Plane,
+)
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
@@ -39,7 +50,7 @@ REGISTERED_NAME = "KconsConstraints"
 START_TOLERANCE = 1e-6
 
 #: Families whose target is an absolute position: replicas take theirs from where they are.
-_PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass")
+_PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", "Plane", "Line")
 
 #: ASE objects that only add forces, so that they get along with any constraint.
 _FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
@@ -581,18 +592,24 @@ def _linear_triatomic(atoms: Atoms, item: Any) -> list[Constraint]:
 
 
 def _cartesian(atoms: Atoms, item: Any) -> list[Constraint]:
-    index = np.arange(len(atoms))[item.index]
-    return [
-        LinearCombination(index[:, None], np.eye(3)[axis][None, :]) for axis in np.flatnonzero(np.asarray(item.mask))
-    ]
+    index = _indices(atoms, item)[:, None]
+    return [LinearCombination(index, np.eye(3)[axis][None, :]) for axis in np.flatnonzero(item.mask)]
+
+
+def _indices(atoms: Atoms, item: Any) -> IntArray:
+    return np.arange(len(atoms))[item.index]
 
 
 _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
-    "FixAtoms": lambda atoms, item: [FixedAtoms(np.arange(len(atoms))[item.index])],
+    "FixAtoms": lambda atoms, item: [FixedAtoms(_indices(atoms, item))],
     "FixBondLengths": _bond_lengths,
     "FixInternals": _internals,
     "FixLinearTriatomic": _linear_triatomic,
     "FixCartesian": _cartesian,
+    "FixCom": lambda atoms, item: [CenterOfMass(_indices(atoms, item))],
+    "FixSubsetCom": lambda atoms, item: [CenterOfMass(_indices(atoms, item))],
+    "FixedPlane": lambda atoms, item: [Plane(_indices(atoms, item), item.dir)],
+    "FixedLine": lambda atoms, item: [Line(_indices(atoms, item), None, item.dir)],
 }
 
 _REPLACEMENTS = {
