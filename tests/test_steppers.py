@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget
-from kcons.constraints.velocity import KnifeEdge, LinearVelocity
+from kcons.constraints import Angle, Distance, FixedAtoms, KnifeEdge, LinearVelocity, MovingTarget
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.motion import Motion
 from kcons.steppers import Rattle, State, System, run
