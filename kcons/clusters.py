@@ -74,7 +74,9 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     movable = np.diff(links.indptr) > 0
     movable[pinned_rows] = False
     if movable.any():
-        labels[movable] = np.unique(found[movable], return_inverse=True)[1]
+        used = np.zeros(int(found.max()) + 1, dtype=bool)
+        used[found[movable]] = True
+        labels[movable] = (np.cumsum(used) - 1)[found[movable]]
     return labels
 
 

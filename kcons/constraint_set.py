@@ -236,6 +236,11 @@ class ConstraintSet:
         indptr = np.concatenate([[0], np.cumsum(widths)])
         return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
 
+    @cached_property
+    def touched(self) -> IntArray:
+        """Atoms that some row touches, sorted."""
+        return _distinct(self.incidence.indices, self.n_atoms)
+
     # -- sigma, A, b ----------------------------------------------------------------------------
 
     def minimum_image(self, d: FloatArray) -> FloatArray:
@@ -342,7 +347,8 @@ class ConstraintSet:
             for item, start, lo, hi in zip(self.constraints, self.starts, bounds[:-1], bounds[1:], strict=False)
             if hi > lo
         ]
-        atoms = np.unique(np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)]))
+        used = np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)])
+        atoms = _distinct(used, self.n_atoms)
         part = object.__new__(ConstraintSet)
         part.n_atoms = len(atoms)
         part.masses = self.masses[atoms]
@@ -404,3 +410,12 @@ def _compact(item: Constraint, atoms: IntArray) -> Constraint:
     copy = item.with_target(item.target)
     copy.atoms = np.searchsorted(atoms, item.atoms)
     return copy
+
+
+def _distinct(numbers: IntArray, limit: int) -> IntArray:
+    """Sorted distinct numbers below `limit`; by marks where that is cheaper than sorting."""
+    if 10 * len(numbers) < limit:
+        return np.unique(numbers).astype(np.int64)
+    marked = np.zeros(limit, dtype=bool)
+    marked[numbers] = True
+    return np.flatnonzero(marked)

@@ -81,7 +81,7 @@ def _named(numbers: IntArray | None, atoms: IntArray) -> list[int]:
 def _not_finite(
     constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray]
 ) -> KconsError | None:
-    touched = np.unique(constraint_set.incidence.indices)
+    touched = constraint_set.touched
     for item, array in arrays.items():
         bad = ~np.isfinite(array[touched]).all(axis=1)
         if bad.any():

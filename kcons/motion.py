@@ -79,7 +79,7 @@ class Motion:
         self.constraint_set = without_second_order_rows(constraint_set, x, time, convert=degenerate == "convert")
         self.n_atoms = constraint_set.n_atoms
         self.masses = constraint_set.masses
-        touched = np.unique(self.constraint_set.incidence.indices).astype(np.int64)
+        touched = self.constraint_set.touched
         # Few constrained atoms among many: work on a compact copy of them, and on nothing else.
         self._atoms: IntArray | None = None if 2 * len(touched) >= self.n_atoms else touched
         if self._atoms is None:

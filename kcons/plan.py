@@ -117,7 +117,7 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
     """Find the clusters, their rank, and a solver for each."""
     pinned, pinned_rows = _pinned(constraint_set)
     inverse_masses = np.zeros(constraint_set.n_atoms)
-    touched = np.unique(constraint_set.incidence.indices)
+    touched = constraint_set.touched
     inverse_masses[touched] = 1.0
     with np.errstate(divide="ignore"):
         inverse_masses[touched] /= constraint_set.masses[touched]
@@ -131,7 +131,7 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
         if shape.independent:
             rank = shape.rows.size
         else:
-            rank = _rank(constraint_set, shape, labels, inverse_masses, positions, solver, time)
+            rank = _rank(constraint_set, shape, inverse_masses, positions, solver, time)
         if rank < shape.rows.size:
             plan.dependent += _by_cluster(shape.rows.ravel(), labels)
         plan.solvers.append(solver)
@@ -188,7 +188,7 @@ class DistanceClusters:
     def __init__(self, solver: DistanceSolver, targets: FloatArray) -> None:
         self.name = solver.name
         self.rows = solver.rows.ravel()
-        self._solver = solver
+        self.solver = solver
         self._lengths = np.ascontiguousarray(targets[self.rows])
 
     def positions(
@@ -204,7 +204,7 @@ class DistanceClusters:
         reference_time: float,
     ) -> Outcome:
         lengths = self._lengths if targets is None else targets[self.rows]
-        return self._solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, multipliers)
+        return self.solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, multipliers)
 
     def tangents(
         self,
@@ -215,7 +215,7 @@ class DistanceClusters:
         multipliers: FloatArray | None,
         time: float,
     ) -> Outcome:
-        return self._solver.tangents(x, y, None if rates is None else rates[self.rows], lattice, multipliers)
+        return self.solver.tangents(x, y, None if rates is None else rates[self.rows], lattice, multipliers)
 
 
 class DistanceSolver(Protocol):
@@ -268,7 +268,6 @@ def _solver(
 def _rank(
     constraint_set: ConstraintSet,
     shape: Shape,
-    labels: IntArray,
     inverse_masses: FloatArray,
     positions: FloatArray,
     solver: ClusterSolver,
@@ -277,18 +276,17 @@ def _rank(
     """Independent rows of a shape whose graph does not tell."""
     if isinstance(solver, SparseRows):
         return solver.rank(positions, constraint_set.lattice)
-    rows = np.sort(shape.rows.ravel())
-    if shape.kind in ("water", "lanes"):
-        return _rank_of_small(constraint_set, shape, inverse_masses, positions, time)
-    if isinstance(solver, GeneralClusters):
-        general = solver
-    else:
-        general = GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
-    return sum(int(np.sum(s > RANK_TOLERANCE * s[0])) for _, s in general.singular_values(positions, time))
+    if isinstance(solver, DistanceClusters):
+        sparse = solver.solver
+        if isinstance(sparse, SparseDistances):
+            return sparse.rank(positions, constraint_set.lattice)
+        return _rank_of_small(constraint_set, shape, inverse_masses, positions)
+    assert isinstance(solver, GeneralClusters)
+    return sum(int(np.sum(s > RANK_TOLERANCE * s[0])) for _, s in solver.singular_values(positions, time))
 
 
 def _rank_of_small(
-    constraint_set: ConstraintSet, shape: Shape, inverse_masses: FloatArray, positions: FloatArray, time: float
+    constraint_set: ConstraintSet, shape: Shape, inverse_masses: FloatArray, positions: FloatArray
 ) -> int:
     """Rank of many small clusters of distances at once, from the singular values of their B."""
     ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms

@@ -114,6 +114,13 @@ class SparseDistances:
             _natural(self._state, self._solution, -1.0, multipliers)
         return Outcome(True, residual, iterations, worst)
 
+    def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
+        """Independent rows at `x`: those whose pivot does not vanish."""
+        outcome = self.tangents(x, np.zeros_like(x), None, lattice, None)
+        if not outcome.converged:
+            return len(self.rows)
+        return int(np.count_nonzero(self._pivots[::4]))
+
 
 @nb.njit(cache=True)
 def _number_atoms(pairs, clusters, n_atoms):  # type: ignore[no-untyped-def]
