@@ -49,6 +49,9 @@ REGISTERED_NAME = "KconsConstraints"
 #: How far positions may be off a row (relative to its scale) when ASE first moves them.
 START_TOLERANCE = 1e-6
 
+#: Arrays up to this length are compared fastest as bytes.
+_SHORT = 4096
+
 #: Families whose target is an absolute position: replicas take theirs from where they are.
 _PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", "Plane", "Line")
 
@@ -68,23 +71,29 @@ class _Binding:
     n_atoms: int
     mass_array: str
     mass_values: NDArray[Any]
+    mass_bytes: bytes | None  # the same, for short arrays
     periodic: bool
     pbc: bytes
     cell: bytes
-    on_surface: bool = False
+    #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
+    weights: tuple[FloatArray, FloatArray, FloatArray] | None
     others: tuple[Any, ...] = ()
 
     def fits(self, atoms: Atoms) -> bool:
         """Whether number of atoms, cell, periodicity and masses are still the same."""
-        # Every hook comes through here: compare bytes and small arrays, build nothing.
+        # Every hook comes through here: compare bytes, which costs a fraction of a microsecond, and build nothing.
         arrays = atoms.arrays
         if len(arrays["positions"]) != self.n_atoms or atoms.pbc.tobytes() != self.pbc:
             return False
         if self.periodic and atoms.cell.array.tobytes() != self.cell:
             return False
         name = "masses" if "masses" in arrays else "numbers"
+        if name != self.mass_array:
+            return False
         values = arrays[name] if self.all_touched else arrays[name][self.touched]
-        return name == self.mass_array and bool((values == self.mass_values).all())
+        if self.mass_bytes is not None:
+            return bool(values.tobytes() == self.mass_bytes)
+        return bool((values == self.mass_values).all())
 
 
 class Constraints(FixConstraint):
@@ -145,6 +154,7 @@ class Constraints(FixConstraint):
             (a, b, c), n = repeated
             self._repeated = ((a, b, c), n)
         self._binding: _Binding | None = None
+        self._on_surface = False
 
     # -- the engine -----------------------------------------------------------------------------
 
@@ -190,21 +200,24 @@ class Constraints(FixConstraint):
         touched = _touched(held.constraints)
         all_touched = len(touched) == len(atoms)
         name = "masses" if "masses" in atoms.arrays else "numbers"
-        values = atoms.arrays[name]
+        values = atoms.arrays[name] if all_touched else atoms.arrays[name][touched]
         bound = _Binding(
             motion=motion,
             touched=touched,
             all_touched=all_touched,
             n_atoms=len(atoms),
             mass_array=name,
-            mass_values=values.copy() if all_touched else values[touched],
+            mass_values=values.copy(),
+            mass_bytes=values.tobytes() if len(values) <= _SHORT else None,
             periodic=periodic,
             pbc=atoms.pbc.tobytes(),
             cell=atoms.cell.array.tobytes(),
+            weights=_weights(motion) if all_touched else None,
         )
         self.constraints = held.constraints
         self._repeated = None
         self._binding = bound
+        self._on_surface = False
         return bound
 
     def _check_others(self, present: Sequence[Any], bound: _Binding) -> None:
@@ -237,7 +250,7 @@ class Constraints(FixConstraint):
                 item="positions",
                 atoms=held.row_atoms(row),
             )
-        bound.on_surface = True
+        self._on_surface = True
 
     # -- ASE's hooks ----------------------------------------------------------------------------
 
@@ -245,7 +258,7 @@ class Constraints(FixConstraint):
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails."""
         bound = self._bound(atoms)
         old = atoms.arrays["positions"]
-        if not bound.on_surface:
+        if not self._on_surface:
             self._require_on_surface(bound, old)
         try:
             if new.flags.c_contiguous and new.dtype == np.float64:
@@ -261,8 +274,15 @@ class Constraints(FixConstraint):
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0."""
-        # p - A^T (A M^-1 A^T)^-1 A M^-1 p is the velocity projection times the mass.
-        self._project_covector(atoms, momenta)
+        bound = self._bound(atoms)
+        if bound.weights is None or momenta.shape != bound.weights[0].shape:
+            # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
+            self._project_covector(atoms, momenta)
+            return
+        masses, inverse_masses, velocities = bound.weights
+        np.multiply(momenta, inverse_masses, velocities)
+        bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
+        np.multiply(velocities, masses, momenta)
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
@@ -363,14 +383,19 @@ class Constraints(FixConstraint):
     # -- copies and files -----------------------------------------------------------------------
 
     def copy(self) -> Constraints:
-        """Independent copy with the same targets; it builds its own engine."""
-        return Constraints(self.constraints, degenerate=self.degenerate, repeated=self._repeated)
+        """Independent copy with the same targets."""
+        # Calculators copy the atoms at every step, so this is quick. Neither the rows nor an engine ever change;
+        # each object takes a new engine where it needs one.
+        twin = object.__new__(Constraints)
+        twin.__dict__.update(self.__dict__)
+        twin._on_surface = False
+        return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
-        return self.copy()  # the constraint objects themselves never change
+        return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None}
+        return {**self.__dict__, "_binding": None, "_on_surface": False}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -628,6 +653,16 @@ _REPLACEMENTS = {
 def _touched(constraints: Sequence[Constraint]) -> IntArray:
     atoms = [c.atoms.ravel() for c in constraints]
     return np.unique(np.concatenate(atoms)) if atoms else np.zeros(0, dtype=np.int64)
+
+
+def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
+    masses = np.repeat(motion.masses, 3).reshape(-1, 3)
+    for item in motion.constraint_set.constraints:
+        if item.family == "FixedAtoms":
+            masses[item.atoms.ravel()] = np.inf
+    inverse_masses = 1.0 / masses
+    masses[np.isinf(masses)] = 0.0
+    return masses, inverse_masses, np.empty_like(masses)
 
 
 def _same(present: Sequence[Any], known: Sequence[Any]) -> bool:
