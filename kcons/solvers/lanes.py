@@ -192,9 +192,7 @@ def _kernels(n_rows: int) -> tuple[Any, Any]:
                 x, y, z = _point(r, k)
                 a, b, c = _point(s, k)
                 kept = kept and all_within(TINY, dot(x, y, z, a, b, c))
-                better = better and all_within(
-                    absolute(peek(error, k)), peek(squares, k) * (2.0 * worst)
-                )
+                better = better and all_within(absolute(peek(error, k)), peek(squares, k) * (2.0 * worst))
             if not (ok and kept and better):
                 for k in range(n):
                     store(errors, k * WIDTH, peek(error, k))
@@ -351,9 +349,7 @@ def _kernels(n_rows: int) -> tuple[Any, Any]:
     return positions, tangents
 
 
-def _couplings(
-    pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _couplings(pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]) -> NDArray[np.float64]:
     """Change of bond k by a unit pull along bond l: ``D M⁻¹ Dᵀ`` of the graph."""
     incidence = np.zeros((len(pairs), len(inv_mass)))
     rows = np.arange(len(pairs))

@@ -3,7 +3,7 @@
 The displacements that hold a triangle lie in the plane of its reference
 shape, spanned by ``s01`` and ``s02``. Two bond vectors describe the triangle
 (the third is their difference), so a Newton step is four scalar products, a
-3 × 3 solve and four updates.
+3-by-3 solve and four updates.
 """
 
 import numpy as np
@@ -234,9 +234,7 @@ def _tangents(points, vectors, atoms, slots, rates, inv_mass, lattice, kind, mul
             e2 = dot(qx - px, qy - py, qz - pz, vx, vy, vz) - r2
             if iteration > 0:
                 ok = (
-                    all_within(e0 * e0, size * ss)
-                    and all_within(e1 * e1, size * tt)
-                    and all_within(e2 * e2, size * uu)
+                    all_within(e0 * e0, size * ss) and all_within(e1 * e1, size * tt) and all_within(e2 * e2, size * uu)
                 )
                 if ok or iteration == MAX_ITERATIONS:
                     break
@@ -303,9 +301,7 @@ class RigidTriangles:
 
     name = "water"
 
-    def __init__(
-        self, rows: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike
-    ) -> None:
+    def __init__(self, rows: ArrayLike, atoms: ArrayLike, lengths: ArrayLike, inv_mass: ArrayLike) -> None:
         self.rows: NDArray[np.int64] = np.array(rows, dtype=np.int64).reshape(-1)
         self.lengths = np.array(lengths, dtype=np.float64).reshape(-1)
         self._n = len(self.rows) // 3
