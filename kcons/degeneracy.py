@@ -36,8 +36,9 @@ DENSE_LIMIT = 900
 DENSE_ENTRIES = 4_000_000
 #: Triangles whose targets are as flat as this are linear groups wherever their atoms are at the start.
 _FLAT_TARGETS = 1e-12
-#: Blocks that start off their targets and are analysed where they belong.
-_MAX_RESTORED = 100
+#: Blocks of one shape that start off their targets are analysed where they belong, until this many in a
+#: row turn out regular.
+_REGULAR_SAMPLES = 100
 _INTERNAL = frozenset({"Distance", "Angle", "Dihedral", "LinearRelation", "LinearCombination"})
 _LEVELS: tuple[Callable[[Constraint], bool], ...] = (
     lambda item: True,
@@ -79,10 +80,15 @@ def without_second_order_rows(
         bodies += straight
         for rows in stack.rows[suspects & ~done]:
             bodies += find_flat_bodies(LocalRows(constraint_set, rows, positions, time))
+        regular = 0
         for rows in stack.rows[stack.off_target(constraint_set, positions, sigma, time) & ~suspects]:
             block = LocalRows(constraint_set, rows, positions, time).restored()
+            regular += 1
             if block.singular(block.x):
                 bodies += find_flat_bodies(block)
+                regular = 0
+            if regular >= _REGULAR_SAMPLES:
+                break
         if bodies and not convert:
             raise refusal(bodies[0])
     if not bodies:
@@ -207,7 +213,7 @@ class _Stack:
             smallest = np.linalg.svd(unit, compute_uv=False)[:, -1]
             far = far[miss[far] > 0.1 * smallest**2]
         result[:] = False
-        result[far[:_MAX_RESTORED]] = True
+        result[far] = True
         return result
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -333,6 +335,16 @@ def test_puckered_start_with_planar_targets_is_held_as_planar(noise: float) -> N
     assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
 
 
+def test_many_puckered_rings_are_all_found() -> None:
+    """More of them than regular blocks are sampled; noise of 1e-3 on planar targets."""
+    rng = np.random.default_rng(0)
+    flat = np.vstack([turned(ring(4), seed=k) + 20 * rng.standard_normal(3) for k in range(150)])
+    pairs = np.vstack([np.array(pairs_of(4)) + 4 * k for k in range(150)])
+    lengths = ConstraintSet(Distance(pairs), flat, np.ones(600)).target()
+    held = converted(Distance(pairs, lengths), flat + 1e-3 * rng.standard_normal(flat.shape))
+    assert counts(held) == (450, 450)
+
+
 def test_bent_start_with_flat_targets_is_held_as_linear() -> None:
     x = turned([[-1.16, 0, 0], [0, 0.02, 0], [1.16, 0, 0]])
     given = ConstraintSet(Distance(pairs_of(3), [1.16, 2.32, 1.16]), x, np.ones(3))
@@ -490,3 +502,12 @@ def test_many_molecules_are_found_one_by_one() -> None:
     held = converted(Distance(pairs), x)
     assert counts(held) == (600 + 200 + 60, 600 + 20 * 27)
     assert np.abs(held.value(x)).max() < 1e-13
+
+
+def test_documented_examples_run() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "hard-cases.md").read_text(encoding="utf-8")
+    snippets = re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(snippets) >= 5
+    names: dict[str, object] = {}
+    for snippet in snippets:
+        exec(compile(snippet, "docs/hard-cases.md", "exec"), names)
