@@ -593,6 +593,23 @@ def test_what_is_all_normal_projects_to_nothing(name: str) -> None:
     close(motion.project_velocities(s.x, 0 * v), np.zeros_like(v), 1.0, 0.0, "velocities of nothing")
 
 
+@pytest.mark.parametrize("times", [2, 3, 5])
+@pytest.mark.parametrize("masses", [[1.0, 2.0], [1.0, 1.0], [1.7, 23.0]])
+def test_a_bond_given_several_times_is_one_bond(times: int, masses: list[float]) -> None:
+    """Along an axis, with masses of few digits: A M^-1 A^T is singular to the last bit."""
+    x, f = np.array([[1.0, 0, 0], [0.0, 0, 0]]), np.array([[1.0, 2, 3], [-2.0, 1, 0]])
+    v = np.array([[0.0, 1, 0], [0.0, -1, 2]])
+    one = Motion(ConstraintSet(held.Distance([0, 1]), x, masses), x)
+    many = Motion(ConstraintSet(held.Distance([[0, 1]] * times), x, masses), x)
+    assert one.rank == many.rank == 1
+    np.testing.assert_allclose(many.acceleration(x, v, f), one.acceleration(x, v, f), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(many.constraint_force(x, v, f), one.constraint_force(x, v, f), rtol=0, atol=1e-13)
+    lam = one.multipliers(x, v, f)[0] / times
+    np.testing.assert_allclose(many.multipliers(x, v, f), lam, rtol=1e-13)
+    step = x + 0.05 * v
+    np.testing.assert_allclose(many.project_positions(step, x), one.project_positions(step, x), rtol=0, atol=1e-15)
+
+
 def test_an_atom_without_freedom_does_not_move() -> None:
     x = np.array([[2.5, 0.3, 0.7], [1.0, 1.0, 1.0]])
     rows = [held.Torus(0, [0, 0, 0], [0, 0, 1], 2.0), held.Line(0, x[0], [0.2, 0.1, 1.0])]
