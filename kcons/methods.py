@@ -1,0 +1,328 @@
+"""Drivers: one method on one scene, a step at a time.
+
+A `Method` says what it is and what it cannot run; `start` gives a `Run`, which advances by one step and
+knows how much of its time went into constraints.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.constraints import FixBondLengths, FixInternals
+from ase.md.verlet import VelocityVerlet
+from scipy.integrate import DOP853
+
+from kcons.ase import Constraints
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError
+from kcons.motion import Motion
+from kcons.scenes import Scene
+from kcons.steppers import Rattle, State, System
+
+
+class Stopwatch:
+    """Wall time spent inside some methods of one object; calls within calls count once."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth = 0
+
+    def watch(self, target: Any, names: Iterable[str]) -> None:
+        """Replace the methods of this one object by timed ones."""
+        for name in names:
+            if hasattr(target, name):
+                setattr(target, name, self._timed(getattr(target, name)))
+
+    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **options: Any) -> Any:
+            if self._depth:
+                return method(*args, **options)
+            self._depth += 1
+            start = perf_counter()
+            try:
+                return method(*args, **options)
+            finally:
+                self.seconds += perf_counter() - start
+                self._depth -= 1
+
+        return timed
+
+
+#: What the engine is asked for in the course of a step.
+ENGINE_CALLS = ("project_positions", "project_velocities", "project_forces", "acceleration")
+#: ASE's hooks.
+ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribute_forces_md")
+
+
+class Run(ABC):
+    """A trajectory in the making."""
+
+    time: float = 0.0
+
+    def __init__(self) -> None:
+        self.constraints = Stopwatch()
+
+    @abstractmethod
+    def advance(self) -> None:
+        """One step."""
+
+    @property
+    @abstractmethod
+    def finished(self) -> bool:
+        """Whether the horizon is reached."""
+
+    @property
+    @abstractmethod
+    def positions(self) -> FloatArray: ...
+
+    @property
+    @abstractmethod
+    def velocities(self) -> FloatArray: ...
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """A way to run a scene.
+
+    Attributes
+    ----------
+    name, title : str
+    holds : bool
+        False for the floor, which holds nothing: its cost is the least there is, its trajectory is that
+        of another system.
+    adaptive : bool
+        Whether its setting is a tolerance instead of a time step.
+    """
+
+    name: str
+    title: str
+    holds: bool = True
+    adaptive: bool = False
+
+    def refuses(self, scene: Scene) -> str | None:
+        """Why this method cannot run the scene, or None."""
+        return scene.refusals.get(self.name)
+
+    def settings(self, scene: Scene) -> tuple[float, ...]:
+        """Time steps or tolerances to run, the cheapest first."""
+        return tuple(scene.tolerances if self.adaptive else scene.time_steps)
+
+    @abstractmethod
+    def start(self, scene: Scene, setting: float) -> Run:
+        """Everything up to the first step."""
+
+
+# -- kcons ------------------------------------------------------------------------------------------
+
+
+class _CoreRun(Run):
+    def __init__(self, scene: Scene, motion: Motion, dt: float) -> None:
+        super().__init__()
+        self.constraints.watch(motion, ENGINE_CALLS)
+        self._system = System(motion, scene.potential.forces)
+        self._stepper = Rattle()
+        self._state = self._system.with_forces(State(scene.positions, scene.velocities))
+        self._dt = dt
+        self._steps = round(scene.horizon / dt)
+
+    def advance(self) -> None:
+        self._state = self._stepper.step(self._system, self._state, self._dt)
+        self.time = self._state.time
+
+    @property
+    def finished(self) -> bool:
+        return self._state.step >= self._steps
+
+    @property
+    def positions(self) -> FloatArray:
+        return self._state.positions
+
+    @property
+    def velocities(self) -> FloatArray:
+        return self._state.velocities
+
+
+class CoreRattle(Method):
+    """`kcons.steppers.Rattle`, arrays in and arrays out."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        motion = Motion(scene.constraint_set, scene.positions)
+        return _CoreRun(scene, motion, setting)
+
+
+class CoreVerlet(Method):
+    """The same stepper with nothing held: what a step costs before any constraint."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
+        return _CoreRun(scene, nothing, setting)
+
+
+# -- ASE --------------------------------------------------------------------------------------------
+
+
+class _AseRun(Run):
+    def __init__(self, scene: Scene, dt: float, constraint: Any | None) -> None:
+        super().__init__()
+        self._atoms = scene.atoms()
+        if constraint is not None:
+            self._atoms.set_constraint(constraint)
+            # set_constraint keeps the object itself, so that its hooks can be timed.
+            self.constraints.watch(self._atoms.constraints[0], ASE_HOOKS)
+        self._dynamics = VelocityVerlet(self._atoms, timestep=dt)
+        self._dt = dt
+        self._done = 0
+        self._steps = round(scene.horizon / dt)
+        scene.potential.forces(self._atoms.positions)
+
+    def advance(self) -> None:
+        self._dynamics.step()
+        self._done += 1
+        self.time = self._done * self._dt
+
+    @property
+    def finished(self) -> bool:
+        return self._done >= self._steps
+
+    @property
+    def positions(self) -> FloatArray:
+        return np.asarray(self._atoms.get_positions())
+
+    @property
+    def velocities(self) -> FloatArray:
+        return np.asarray(self._atoms.get_velocities())
+
+
+class AseKcons(Method):
+    """ASE's VelocityVerlet with `kcons.ase.Constraints`."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        held = Constraints(scene.constraint_set.constraints)
+        return _AseRun(scene, setting, held)
+
+
+class AseVerlet(Method):
+    """ASE's VelocityVerlet with nothing held."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _AseRun(scene, setting, None)
+
+
+class AseBonds(Method):
+    """ASE's VelocityVerlet with FixBondLengths at its own tolerance, angles held by their end distances."""
+
+    def refuses(self, scene: Scene) -> str | None:
+        return super().refuses(scene) or (None if scene.bonds is not None else "it holds distances only")
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        assert scene.bonds is not None
+        lengths = _distances(scene.atoms(), scene.bonds)
+        return _AseRun(scene, setting, FixBondLengths(scene.bonds, bondlengths=lengths))
+
+
+class AseInternals(Method):
+    """ASE's VelocityVerlet with FixInternals at its own tolerance."""
+
+    def refuses(self, scene: Scene) -> str | None:
+        return super().refuses(scene) or (None if scene.bonds is not None else "it holds internal coordinates only")
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        bonds = scene.bonds if scene.angle_bonds is None else scene.angle_bonds
+        assert bonds is not None
+        atoms = scene.atoms()
+        lengths = _distances(atoms, bonds)
+        pairs = [[float(d), [int(i), int(j)]] for d, (i, j) in zip(lengths, bonds, strict=True)]
+        triples = [[float(atoms.get_angle(*t)), [int(a) for a in t]] for t in scene.angles]
+        return _AseRun(scene, setting, FixInternals(bonds=pairs, angles_deg=triples or None))
+
+
+def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
+    x = atoms.positions
+    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1))
+
+
+# -- SciPy ------------------------------------------------------------------------------------------
+
+
+class _OdeRun(Run):
+    def __init__(self, scene: Scene, rtol: float) -> None:
+        super().__init__()
+        motion = Motion(scene.constraint_set, scene.positions)
+        self.constraints.watch(motion, ENGINE_CALLS)
+        shape, half = scene.positions.shape, scene.positions.size
+
+        def rate(t: float, y: FloatArray) -> FloatArray:
+            x, v = y[:half].reshape(shape), y[half:].reshape(shape)
+            return np.concatenate([y[half:], motion.acceleration(x, v, scene.potential.forces(x, t), t).ravel()])
+
+        speed = float(np.sqrt(np.mean(scene.velocities**2)))
+        # Errors are measured against one unit of length and the thermal speed, not against each entry.
+        scale = np.concatenate([np.ones(half), np.full(half, speed if speed > 0 else 1.0)])
+        start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])
+        self._shape, self._half = shape, half
+        self._solver = DOP853(rate, 0.0, start, scene.horizon, rtol=max(rtol, 1e-13), atol=rtol * scale)
+
+    def advance(self) -> None:
+        message = self._solver.step()
+        if self._solver.status == "failed":
+            raise KconsError(f"DOP853 gave up at t = {self._solver.t:g}: {message}")
+        self.time = float(self._solver.t)
+
+    @property
+    def finished(self) -> bool:
+        return bool(self._solver.status == "finished")
+
+    @property
+    def positions(self) -> FloatArray:
+        return np.asarray(self._solver.y[: self._half]).reshape(self._shape)
+
+    @property
+    def velocities(self) -> FloatArray:
+        return np.asarray(self._solver.y[self._half :]).reshape(self._shape)
+
+
+class ProjectedOde(Method):
+    """SciPy's DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105): nothing stops a drift."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _OdeRun(scene, setting)
+
+
+METHODS: Mapping[str, Method] = {
+    method.name: method
+    for method in (
+        CoreRattle("rattle", "kcons RATTLE"),
+        AseKcons("ase-kcons", "ASE Verlet + kcons"),
+        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths"),
+        AseInternals("ase-internals", "ASE Verlet + FixInternals"),
+        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True),
+        CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
+        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False),
+    )
+}
+
+
+def chosen(names: Iterable[str] | None = None) -> list[Method]:
+    """Methods by name, all of them by default.
+
+    Raises
+    ------
+    InputError
+        Unknown name.
+    """
+    if names is None:
+        return list(METHODS.values())
+    picked = []
+    for name in names:
+        if name not in METHODS:
+            raise InputError(f"there is no method {name!r}; there are {', '.join(METHODS)}", item="methods")
+        picked.append(METHODS[name])
+    return picked

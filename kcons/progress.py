@@ -1,0 +1,42 @@
+"""Progress bars for the command line."""
+
+from __future__ import annotations
+
+import sys
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from kcons.compare import Watcher
+
+
+class Bars(Watcher):
+    """A bar on the terminal for the piece of work in hand; a line for each piece where there is no terminal."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        self._bars = Progress(*columns, console=self._console, transient=True)
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def begin(self, what: str, total: float) -> None:
+        if not self._console.is_terminal:
+            print(what, file=sys.stderr, flush=True)
+        self._task = self._bars.add_task(what, total=total)
+
+    def advance(self, done: float) -> None:
+        if self._task is not None:
+            self._bars.update(self._task, completed=done)
+
+    def end(self) -> None:
+        if self._task is not None:
+            self._bars.remove_task(self._task)
+            self._task = None

@@ -1,0 +1,223 @@
+"""What a comparison looks like: a table, a plot, a JSON file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from kcons.compare import Comparison, Measurement, duration
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Colour-blind safe (Okabe and Ito), and a marker each.
+STYLES = {
+    "rattle": ("#0072B2", "o"),
+    "ase-kcons": ("#56B4E9", "s"),
+    "ase-bonds": ("#D55E00", "^"),
+    "ase-internals": ("#CC79A7", "v"),
+    "dop853": ("#009E73", "D"),
+    "verlet": ("#7f7f7f", "|"),
+    "ase-verlet": ("#b0b0b0", "|"),
+}
+
+EXPLANATION = (
+    "error: root-mean-square distance an atom from the reference at t = {horizon:g} {time}; reference: {how}{good}.",
+    "|σ|: largest violation of a held value after the last step, in {length} or rad. "
+    "|Av|: largest velocity off the constraints, over v_rms.",
+    "slope: linear fit of the total energy, in {energy}/{long_time} a degree of freedom; "
+    "in brackets where below twice its standard error.",
+    "time, constraints: median wall time of a step and of its constraints. "
+    "forces, wall: force evaluations and wall time for one simulated {long_time}.",
+    "floor: the same step with nothing held, the least a step can cost; it is another system, so no error is stated.",
+)
+
+#: Characters that all columns take.
+WIDTH = 128
+
+#: Columns left out where there is no room for all.
+DISPENSABLE = ("max |Av|", "slope", "constraints")
+
+
+def table(comparison: Comparison, *, narrow: bool = False) -> Table:
+    """One line for each method and time step; `narrow` leaves some columns out."""
+    units = comparison.scene["units"]
+    length, time, energy, long_time = (units[key] for key in ("length", "time", "energy", "long_time"))
+    headers = {
+        "step": time,
+        "error": length,
+        "max |σ|": f"{length}, rad",
+        "max |Av|": "/v_rms",
+        "slope": f"{energy}/{long_time}",
+        "time": "a step",
+        "constraints": "a step",
+        "forces": f"a {long_time}",
+        "wall": f"a {long_time}",
+    }
+    kept = [name for name in headers if not (narrow and name in DISPENSABLE)]
+    shown = Table(title=comparison.scene["title"], title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1))
+    shown.add_column("method", no_wrap=True)
+    for name in kept:
+        shown.add_column(f"{name}\n{headers[name]}", justify="right", no_wrap=True)
+    notes = _note_numbers(comparison)
+    previous = ""
+    for m in comparison.measurements:
+        if m.method != previous and previous:
+            shown.add_section()
+        cells = _cells(m, notes.get(m.note))
+        shown.add_row(m.title if m.method != previous else "", *(cells[name] for name in kept))
+        previous = m.method
+    return shown
+
+
+def _cells(m: Measurement, note: int | None) -> dict[str, str | Text]:
+    slope = "" if m.energy_slope is None else f"{m.energy_slope:.1e}"
+    if m.energy_slope is not None and abs(m.energy_slope) < 2 * (m.energy_slope_error or 0.0):
+        slope = f"({slope})"
+    setting = "" if m.setting == 0 else f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:g}"
+    return {
+        "step": setting,
+        "error": _verdict(m, note),
+        "max |σ|": "" if m.constraint_residual is None else f"{m.constraint_residual:.0e}",
+        "max |Av|": "" if m.velocity_residual is None else f"{m.velocity_residual:.0e}",
+        "slope": slope,
+        "time": "" if m.step_seconds is None else duration(m.step_seconds),
+        "constraints": "" if m.constraint_seconds is None or m.status == "floor" else duration(m.constraint_seconds),
+        "forces": "" if m.evaluations_per_time is None else _count(m.evaluations_per_time),
+        "wall": "" if m.seconds_per_time is None else duration(m.seconds_per_time),
+    }
+
+
+def _verdict(m: Measurement, note: int | None) -> str | Text:
+    """The error, or in a word why there is none and which note tells more."""
+    if m.status == "ok":
+        return "" if m.error is None else f"{m.error:.2e}"
+    if m.status == "floor":
+        return "-"
+    word = f"{m.steps} step only" if m.status == "partial" and m.steps == 1 else m.status
+    return Text(f"{word} [{note}]" if note else word, style="red" if m.status == "failed" else "yellow")
+
+
+def _count(number: float) -> str:
+    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+
+
+def _note_numbers(comparison: Comparison) -> dict[str, int]:
+    """Notes in the order of their first appearance, numbered from 1."""
+    return {note: k for k, note in enumerate(dict.fromkeys(m.note for m in comparison.measurements if m.note), 1)}
+
+
+def explanation(comparison: Comparison) -> str:
+    """What the columns mean, and the orders that were observed."""
+    units = comparison.scene["units"]
+    error = comparison.reference["error"]
+    known = {
+        "horizon": comparison.scene["horizon"],
+        "how": comparison.reference["how"],
+        "good": f", good to {error:.0e} {units['length']}" if error else "",
+        **units,
+    }
+    lines = [line.format(**known) for line in EXPLANATION]
+    lines[:0] = [f"[{number}] {note}" for note, number in _note_numbers(comparison).items()]
+    orders = []
+    for name, title in {m.method: m.title for m in comparison.measurements}.items():
+        order = comparison.observed_order(name)
+        if order is not None:
+            orders.append(f"{title} {order:.2f}")
+    if orders:
+        lines.append("observed order (error ∝ stepᵖ): " + ", ".join(orders))
+    return "\n".join(lines)
+
+
+def plot(comparison: Comparison, path: Path) -> None:
+    """Error against force evaluations and against wall time, both axes logarithmic, as a PNG file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    units = comparison.scene["units"]
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    for axes, cost in ((left, "evaluations_per_time"), (right, "seconds_per_time")):
+        for name in dict.fromkeys(m.method for m in comparison.measurements):
+            colour, marker = STYLES.get(name, ("black", "x"))
+            done = [m for m in comparison.of(name) if m.error and getattr(m, cost)]
+            if done:
+                axes.loglog(
+                    [getattr(m, cost) for m in done],
+                    [m.error for m in done],
+                    color=colour,
+                    marker=marker,
+                    # Where two methods do the same, both stay visible.
+                    markerfacecolor="none" if name != "rattle" else colour,
+                    markersize=6 if name == "rattle" else 9,
+                    markeredgewidth=1.6,
+                    label=done[0].title,
+                )
+        if comparison.reference["error"] > 0:
+            axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
+    _mark_costs_without_error(right, comparison)
+    left.set_xlabel(f"force evaluations per simulated {units['long_time']}")
+    right.set_xlabel(f"wall time per simulated {units['long_time']} / s")
+    left.set_ylabel(f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}")
+    for axes in (left, right):
+        axes.grid(True, which="major", linewidth=0.5, alpha=0.5)
+    if comparison.reference["error"] > 0:
+        left.text(
+            0.02,
+            comparison.reference["error"],
+            "error of the reference",
+            transform=left.get_yaxis_transform(),
+            fontsize=8,
+            va="bottom",
+        )
+    handles, labels = right.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+    environment = comparison.environment
+    figure.suptitle(comparison.scene["title"], fontsize=11)
+    right.set_title(f"{environment['cpu']}, 1 thread; {environment['date']}", fontsize=8, loc="right")
+    figure.savefig(path, dpi=150)
+
+
+def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
+    """Floors, and methods stopped for the budget: vertical lines at what they cost."""
+    for name in dict.fromkeys(m.method for m in comparison.measurements):
+        colour, _ = STYLES.get(name, ("black", "x"))
+        for status, dashes, remark in (("floor", "-", ""), ("partial", "--", " (stopped for the budget)")):
+            for k, m in enumerate(comparison.of(name, status)):  # type: ignore[arg-type]
+                if m.seconds_per_time:
+                    # A floor at each time step would be many lines; the coarsest step is the least cost.
+                    label = f"{m.title}{remark}, step {m.setting:g} {comparison.scene['units']['time']}"
+                    if k == 0:
+                        axes.axvline(m.seconds_per_time, color=colour, linestyle=dashes, linewidth=1.2, label=label)
+
+
+def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:
+    """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
+    data.write_text(json.dumps(_plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    plot(comparison, picture)
+    written = [data, picture]
+    if tables:
+        text.write_text("\n".join(tables) + "\n", encoding="utf-8")
+        written.append(text)
+    return written
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: it becomes null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value

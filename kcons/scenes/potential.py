@@ -1,0 +1,115 @@
+"""Energies and forces of a scene, the same for every method that runs it.
+
+A `Potential` remembers its last point, so that a host asking twice pays once, and counts and times what
+it evaluates. `PotentialCalculator` hands it to ASE.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from kcons.constraints.target import FloatArray
+
+Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
+
+
+class Potential:
+    """Energy and forces as a function of the positions.
+
+    Parameters
+    ----------
+    evaluate : callable
+        Positions, shape (n_atoms, 3), to (energy, forces of the same shape).
+    name : str
+        What it is, for the report.
+
+    Attributes
+    ----------
+    evaluations : int
+        Points evaluated so far.
+    seconds : float
+        Wall time they took.
+    """
+
+    def __init__(self, evaluate: Evaluate, name: str) -> None:
+        self._evaluate = evaluate
+        self.name = name
+        self.evaluations = 0
+        self.seconds = 0.0
+        self._last: FloatArray | None = None
+        self._energy = 0.0
+        self._forces: FloatArray | None = None
+
+    def forces(self, x: FloatArray, time: float = 0.0) -> FloatArray:
+        """Forces at `x`, shape (n_atoms, 3); a copy."""
+        self._update(x)
+        assert self._forces is not None
+        return self._forces.copy()
+
+    def energy(self, x: FloatArray, time: float = 0.0) -> float:
+        """Potential energy at `x`."""
+        self._update(x)
+        return self._energy
+
+    def forget(self) -> None:
+        """Start counting anew; the next point is evaluated whatever it is."""
+        self._last = None
+        self.evaluations = 0
+        self.seconds = 0.0
+
+    def _update(self, x: FloatArray) -> None:
+        if self._last is not None and np.array_equal(self._last, x):
+            return
+        start = perf_counter()
+        energy, forces = self._evaluate(x)
+        self.seconds += perf_counter() - start
+        self.evaluations += 1
+        self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
+
+
+class PotentialCalculator:
+    """A `Potential` as an ASE calculator.
+
+    It adds as little as can be: ASE's own base class copies the atoms and their constraints at every
+    step, which would be counted as the cost of the method under test.
+    """
+
+    implemented_properties = ("energy", "forces")
+    name = "potential"
+
+    def __init__(self, potential: Potential) -> None:
+        self.potential = potential
+        self.parameters: dict[str, Any] = {}
+
+    def get_forces(self, atoms: Atoms) -> FloatArray:
+        return self.potential.forces(atoms.positions)
+
+    def get_potential_energy(self, atoms: Atoms, force_consistent: bool = False) -> float:
+        return self.potential.energy(atoms.positions)
+
+    def get_property(self, name: str, atoms: Atoms, allow_calculation: bool = True) -> Any:
+        if name in ("energy", "free_energy"):
+            return self.get_potential_energy(atoms)
+        if name == "forces":
+            return self.get_forces(atoms)
+        raise NotImplementedError(f"a scene has energy and forces, no {name}")
+
+    def calculation_required(self, atoms: Atoms, properties: list[str]) -> bool:
+        return True
+
+
+def of_calculator(atoms: Atoms, calculator: Any, name: str) -> Potential:
+    """The potential that an ASE calculator gives for these atoms (without their constraints)."""
+    copy = Atoms(atoms.symbols, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc, masses=atoms.get_masses())
+    copy.calc = calculator
+
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
+        copy.positions[:] = x
+        return float(copy.get_potential_energy()), np.asarray(copy.get_forces())
+
+    return Potential(evaluate, name)

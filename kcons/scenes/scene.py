@@ -1,0 +1,243 @@
+"""The contract of a scene: a system to run, small or at size N, that knows its own solution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from ase import Atoms, units
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.motion import Motion
+from kcons.scenes.potential import Potential, PotentialCalculator
+from kcons.steppers import Rattle, State, System
+
+
+@dataclass(frozen=True)
+class Units:
+    """Names of the units that a scene's numbers carry, and how long their units of time are internally.
+
+    Time steps are shown in `time`; costs and slopes are stated per `long_time`.
+    """
+
+    length: str
+    energy: str
+    time: str
+    time_unit: float
+    long_time: str
+    long_time_unit: float
+
+
+#: What ASE computes in; times are shown in femtoseconds.
+ASE_UNITS = Units("Å", "eV", "fs", units.fs, "ps", 1000 * units.fs)
+#: Radius, m v0² and R/v0 of the scenes that have no unit of their own.
+REDUCED = Units("R", "ε", "τ", 1.0, "τ", 1.0)
+
+#: Progress: called with (steps done, steps in all).
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Where the trajectory is at the horizon.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n_atoms, 3)
+    error : float
+        Estimated root-mean-square error an atom; 0 for closed forms.
+    how : str
+        How it was obtained.
+    """
+
+    positions: FloatArray
+    error: float
+    how: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One system with its start, its forces and its reference solution.
+
+    Attributes
+    ----------
+    name, title : str
+    constraint_set : ConstraintSet
+        What is held; also the masses and the cell.
+    positions, velocities : ndarray, shape (n_atoms, 3)
+        Start, on the constraints and tangent to them.
+    potential : Potential
+    symbols : str or sequence of str
+        For ASE.
+    horizon : float
+        Time at which trajectories are compared; short enough that chaos does not decide.
+    time_steps : sequence of float
+        Default steps, internal units; each divides the horizon.
+    tolerances : sequence of float
+        Default relative tolerances for adaptive integrators.
+    units : Units
+    bonds : ndarray of int, shape (n, 2), or None
+        Pairs whose distances, all held, are the same thing as the constraint set; None if there are none.
+    angles : ndarray of int, shape (n, 3)
+        With `angle_bonds`, the same as bonds and angles.
+    angle_bonds : ndarray of int, shape (n, 2), or None
+        The bonds that go with `angles`; None takes `bonds`.
+    refusals : mapping
+        Method name -> why it cannot run this scene.
+    solution : callable, optional
+        The reference in closed form or by an independent integrator; without it the scene is converged by
+        RATTLE at `reference_step` with extrapolation.
+    reference_step : float
+    """
+
+    name: str
+    title: str
+    constraint_set: ConstraintSet
+    positions: FloatArray
+    velocities: FloatArray
+    potential: Potential
+    symbols: str | Sequence[str]
+    horizon: float
+    time_steps: Sequence[float]
+    tolerances: Sequence[float] = (1e-2, 1e-4, 1e-6)
+    units: Units = ASE_UNITS
+    bonds: IntArray | None = None
+    angles: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
+    angle_bonds: IntArray | None = None
+    refusals: Mapping[str, str] = field(default_factory=dict)
+    solution: Callable[[], Reference] | None = None
+    reference_step: float = 0.0
+    cell: FloatArray | None = None
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The engine for this scene, set up once."""
+        return Motion(self.constraint_set, self.positions)
+
+    @property
+    def masses(self) -> FloatArray:
+        return self.constraint_set.masses
+
+    @property
+    def n_atoms(self) -> int:
+        return len(self.positions)
+
+    def atoms(self) -> Atoms:
+        """ASE atoms at the start, with the scene's forces and nothing held."""
+        atoms = Atoms(self.symbols, positions=self.positions, masses=self.masses)
+        if self.cell is not None:
+            atoms.set_cell(self.cell)
+            atoms.pbc = True
+        atoms.calc = PotentialCalculator(self.potential)
+        atoms.set_velocities(self.velocities)
+        return atoms
+
+    def with_time_steps(self, shown: Sequence[float]) -> Scene:
+        """The same scene with other steps, in the unit of time it shows.
+
+        Raises
+        ------
+        InputError
+            A step that is not positive, or does not divide the horizon.
+        """
+        steps = []
+        for dt in shown:
+            internal = dt * self.units.time_unit
+            if not (np.isfinite(internal) and 0 < internal <= self.horizon * (1 + 1e-9)):
+                raise InputError(
+                    f"time step {dt:g} {self.units.time}: give a positive step of at most the horizon, "
+                    f"{self.horizon / self.units.time_unit:g} {self.units.time}",
+                    item="dt",
+                )
+            count = self.horizon / internal
+            if abs(count - round(count)) > 1e-6 * count:
+                raise InputError(
+                    f"time step {dt:g} {self.units.time} does not divide the horizon of "
+                    f"{self.horizon / self.units.time_unit:g} {self.units.time}; try "
+                    f"{self.horizon / self.units.time_unit / max(1, round(count)):g}",
+                    item="dt",
+                )
+            steps.append(internal)
+        return replace(self, time_steps=tuple(sorted(set(steps), reverse=True)))
+
+    def shortened(self, factor: int) -> Scene:
+        """The same scene with its horizon divided by `factor` and only the steps that still divide it."""
+        horizon = self.horizon / factor
+        steps = tuple(dt for dt in self.time_steps if abs(horizon / dt - round(horizon / dt)) < 1e-6 and dt < horizon)
+        return replace(self, horizon=horizon, time_steps=steps or (horizon / 4, horizon / 8))
+
+    def reference(self, progress: Progress | None = None) -> Reference:
+        """The solution at the horizon."""
+        if self.solution is not None:
+            return self.solution()
+        return converged(self, self.reference_step or min(self.time_steps) / 2, progress=progress)
+
+    def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
+        """Root-mean-square distance an atom."""
+        return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
+
+    def residuals(self, x: FloatArray, v: FloatArray) -> tuple[float, float]:
+        """max |sigma| in natural units, and max |A v - c| / v_rms with rows scaled to unit norm."""
+        report = self.motion.report(x, v)
+        speed = float(np.sqrt(np.mean(v**2)))
+        return report.residual, report.velocity_residual / speed if speed > 0 else report.velocity_residual
+
+
+def converged(scene: Scene, dt: float, *, levels: int = 3, progress: Progress | None = None) -> Reference:
+    """RATTLE at dt, dt/2, ... with Romberg extrapolation: its error has even powers of dt only.
+
+    The error estimate is the difference between the last two extrapolations of the finest row.
+    """
+    steps = max(1, round(scene.horizon / dt))
+    table: list[FloatArray] = []
+    total = sum(steps << k for k in range(levels))
+    done = 0
+    system = System(scene.motion, scene.potential.forces)
+    for level in range(levels):
+        count = steps << level
+        state = State(scene.positions, scene.velocities)
+        for _ in range(count):
+            state = Rattle().step(system, state, scene.horizon / count)
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        row = [state.positions]
+        for k, coarse in enumerate(table, start=1):
+            row.append(row[-1] + (row[-1] - coarse) / (4.0**k - 1.0))
+        table = row
+    finest = scene.horizon / (steps << (levels - 1)) / scene.units.time_unit
+    return Reference(
+        table[-1],
+        scene.deviation(table[-1], table[-2]),
+        f"RATTLE down to {finest:.3g} {scene.units.time}, extrapolated (order {2 * levels})",
+    )
+
+
+def thermal_velocities(
+    motion: Motion,
+    positions: FloatArray,
+    temperature: float,
+    seed: int,
+    *,
+    at_rest: bool = True,
+) -> FloatArray:
+    """Maxwellian velocities at `temperature` (kelvin), tangent to the constraints, total momentum removed.
+
+    Scaled so that the kinetic energy is exactly g k_B T/2.
+    """
+    rng = np.random.default_rng(seed)
+    masses = motion.masses[:, None]
+    v = rng.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
+    if at_rest:
+        v -= np.sum(masses * v, axis=0) / masses.sum()
+    v = motion.project_velocities(positions, v)
+    freedom = motion.degrees_of_freedom - (3 if at_rest else 0)
+    kinetic = 0.5 * float(np.sum(masses * v**2))
+    if freedom > 0 and kinetic > 0:
+        v *= np.sqrt(0.5 * freedom * units.kB * temperature / kinetic)
+    return v

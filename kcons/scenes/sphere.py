@@ -1,0 +1,102 @@
+"""Particles on spheres, in reduced units (m = R = 1): moving freely, and as spherical pendulums.
+
+Both solutions are independent of the engine: great circles in closed form, and the pendulum's own
+equation of motion integrated to twelve digits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Sphere
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.scenes.potential import Evaluate, Potential
+from kcons.scenes.scene import REDUCED, Reference, Scene
+
+RADIUS = 1.0
+NO_SPHERE = "ASE has no constraint that holds an atom on a sphere"
+
+
+def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
+    """`size` independent particles, each on its own sphere of radius 1.
+
+    Parameters
+    ----------
+    size : int
+    seed : int
+        Of places and velocities; speeds lie between 0.5 and 1.
+    gravity : float
+        Acceleration along -z; 0 gives free particles.
+
+    Raises
+    ------
+    InputError
+        No particle.
+    """
+    if size < 1:
+        raise InputError(f"a scene needs at least one particle, not {size}", item="size")
+    rng = np.random.default_rng(seed)
+    n: FloatArray = rng.standard_normal((size, 3))
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    v = np.cross(n, rng.standard_normal((size, 3)))
+    v *= rng.uniform(0.5, 1.0, (size, 1)) / np.linalg.norm(v, axis=1)[:, None]
+    centers = 4.0 * np.stack([np.arange(size), np.zeros(size), np.zeros(size)], axis=1)
+    x = np.asarray(centers + RADIUS * n, dtype=float)
+    masses = np.ones(size)
+    horizon = 4.0
+
+    def great_circles() -> Reference:
+        speed = np.linalg.norm(v, axis=1)[:, None]
+        angle = speed * horizon / RADIUS
+        ends = RADIUS * (np.cos(angle) * n + np.sin(angle) * v / speed)
+        return Reference(np.asarray(centers + ends, dtype=float), 0.0, "great circles")
+
+    def pendulums() -> Reference:
+        ends = [swing(RADIUS * n[k], v[k], gravity, horizon) for k in range(size)]
+        coarse = [swing(RADIUS * n[k], v[k], gravity, horizon, rtol=1e-11) for k in range(size)]
+        error = float(np.sqrt(np.mean(np.sum((np.array(ends) - coarse) ** 2, axis=1))))
+        return Reference(centers + np.array(ends), error, "the pendulum's own equation, DOP853 at rtol 2.3e-14")
+
+    what = f"spherical pendulums, g = {gravity:g}" if gravity else "free particles on spheres"
+    return Scene(
+        name="sphere-pendulum" if gravity else "sphere",
+        title=f"{size} {what}; units R, τ = R/v0, ε = m v0²",
+        constraint_set=ConstraintSet(Sphere(np.arange(size), centers, RADIUS), x, masses),
+        positions=x,
+        velocities=v,
+        potential=Potential(_weight(gravity), "uniform field" if gravity else "no forces"),
+        symbols=["X"] * size,
+        horizon=horizon,
+        time_steps=(0.2, 0.1, 0.05, 0.025),
+        tolerances=(1e-3, 1e-6, 1e-9),
+        units=REDUCED,
+        refusals={"ase-bonds": NO_SPHERE, "ase-internals": NO_SPHERE},
+        solution=pendulums if gravity else great_circles,
+    )
+
+
+def swing(x: FloatArray, v: FloatArray, gravity: float, time: float, *, rtol: float = 2.3e-14) -> FloatArray:
+    """Where a spherical pendulum, hung at the origin, is after `time`, shape (3,).
+
+    x'' = g - (g.x + v.v) x/|x|^2, the closed form of the projected equation (notes eq. 110).
+    """
+    g = np.array([0.0, 0.0, -gravity])
+
+    def rate(_: float, y: FloatArray) -> FloatArray:
+        r, u = y[:3], y[3:]
+        return np.concatenate([u, g - (g @ r + u @ u) / (r @ r) * r])
+
+    end = solve_ivp(rate, (0.0, time), np.concatenate([x, v]), method="DOP853", rtol=rtol, atol=1e-15).y[:3, -1]
+    return np.asarray(end * (np.linalg.norm(x) / np.linalg.norm(end)))
+
+
+def _weight(gravity: float) -> Evaluate:
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
+        f = np.zeros_like(x)
+        f[:, 2] = -gravity
+        return gravity * float(x[:, 2].sum()), f
+
+    return evaluate
