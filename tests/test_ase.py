@@ -12,7 +12,7 @@ import ase.constraints
 import numpy as np
 import pytest
 from ase import Atoms, units
-from ase.build import bulk, molecule, sort
+from ase.build import molecule, sort
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
@@ -21,10 +21,7 @@ from ase.constraints import (
     FixBondLengths,
     FixCartesian,
     FixCom,
-    FixedLine,
     FixedPlane,
-    FixInternals,
-    FixLinearTriatomic,
     Hookean,
     dict2constraint,
 )
@@ -35,7 +32,7 @@ from ase.md.langevin import Langevin
 from ase.md.verlet import VelocityVerlet
 from ase.optimize import BFGS
 
-from kcons.ase import Constraints, constrain, from_ase_constraints, rigid_water
+from kcons.ase import Constraints, constrain, rigid_water
 from kcons.constraints import (
     Angle,
     Dihedral,
@@ -800,121 +797,6 @@ def test_nan_force_in_dynamics_is_an_error():
     with pytest.raises(KconsError, match="not finite"):
         VelocityVerlet(atoms, 1 * units.fs).run(1)
     assert np.array_equal(atoms.positions, before)
-
-
-# -- translating and finding ------------------------------------------------------------------------
-
-
-def test_from_ase_constraints():
-    atoms = molecule("CH3CH2OH")
-    atoms.set_constraint(
-        [
-            FixAtoms([8]),
-            FixBondLengths([[0, 1]]),
-            FixBondLengths([[1, 2]], bondlengths=[1.43]),
-            FixInternals(
-                bonds=[[None, [2, 3]]], angles_deg=[[110.0, [0, 1, 2]]], dihedrals_deg=[[200.0, [3, 2, 1, 0]]]
-            ),
-            FixedPlane([4], (0, 0, 2)),
-            FixedLine([5], (0, 1, 0)),
-            FixCartesian([6], (True, False, True)),
-            FixCom(),
-        ]
-    )
-    rows = from_ase_constraints(atoms)
-    assert [c.family for c in rows] == [
-        "FixedAtoms",
-        "Distance",
-        "Distance",
-        "Distance",
-        "Angle",
-        "Dihedral",
-        "Plane",
-        "Line",
-        "LinearCombination",
-        "LinearCombination",
-        "CenterOfMass",
-    ]
-    assert rows[2].target == pytest.approx([1.43])
-    assert rows[4].target == pytest.approx([np.radians(110)])
-    assert rows[5].target == pytest.approx([np.radians(200)])
-    assert rows[1].target is None
-    assert np.array_equal(atoms.positions, molecule("CH3CH2OH").positions)
-    atoms.set_constraint()
-    held = constrain(atoms, rows, project=True)
-    assert atoms.get_angle(0, 1, 2) == pytest.approx(110.0, abs=1e-10)
-    assert atoms.get_dihedral(3, 2, 1, 0) == pytest.approx(200.0, abs=1e-10)
-    assert held.get_removed_dof(atoms) == 3 + 1 + 1 + 1 + 1 + 1 + 1 + 2 + 2 + 3
-
-
-def test_from_fix_linear_triatomic():
-    atoms = molecule("CO2")  # C, O, O
-    atoms.set_constraint(FixLinearTriatomic([[1, 0, 2]]))
-    rows = from_ase_constraints(atoms)
-    atoms.set_constraint()
-    held = constrain(atoms, rows)
-    assert atoms.get_number_of_degrees_of_freedom() == 5
-    atoms.calc = Free()
-    thermalize(atoms, 500)
-    kinetic = atoms.get_kinetic_energy()
-    VelocityVerlet(atoms, 1 * units.fs).run(100)
-    assert atoms.get_angle(1, 0, 2) == pytest.approx(180, abs=1e-5)
-    assert off(atoms, held) <= 1e-13
-    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-10)
-
-
-def test_own_object_is_translated_to_its_rows():
-    atoms, held = rigid(2)
-    assert from_ase_constraints(atoms) == list(held.constraints)
-
-
-@pytest.mark.parametrize(
-    "other",
-    [Hookean(a1=0, a2=1, rt=1.0, k=1.0), FixInternals(bondcombos=[[None, [[0, 1, 1.0], [0, 2, -1.0]]]])],
-    ids=lambda v: type(v).__name__,
-)
-def test_unknown_ase_constraints_are_named(other):
-    atoms = molecule("H2O")
-    atoms.set_constraint(other)
-    with pytest.raises(UnsupportedError, match=f"{type(other).__name__}.*Custom"):
-        from_ase_constraints(atoms)
-
-
-def test_rigid_water_finds_water_only():
-    atoms = molecule("H2O") + molecule("CH3CH2OH") + molecule("OH") + bulk("Cu") + molecule("H2O")
-    n = len(atoms)
-    atoms.positions[:3] += 20
-    atoms.positions[n - 3 :] -= 20
-    rows = rigid_water(atoms).atoms
-    assert np.array_equal(rows, [[0, 1], [0, 2], [1, 2], [n - 3, n - 2], [n - 3, n - 1], [n - 2, n - 1]])
-
-
-def test_rigid_water_spares_hydronium():
-    atoms = Atoms("OH3", positions=[[0, 0, 0], [0.98, 0, 0], [-0.49, 0.85, 0], [-0.49, -0.85, 0]])
-    with pytest.raises(InputError, match="no water found"):
-        rigid_water(atoms)
-
-
-def test_rigid_water_across_a_boundary():
-    atoms = molecule("H2O")
-    atoms.set_cell([8, 8, 8])
-    atoms.pbc = True
-    atoms.positions -= atoms.positions[0]
-    atoms.wrap()
-    assert rigid_water(atoms).n_rows == 3
-
-
-def test_rigid_water_geometry():
-    atoms = molecule("H2O")
-    assert rigid_water(atoms, (1.0, 90.0)).target == pytest.approx([1.0, 1.0, np.sqrt(2)])
-    assert rigid_water(atoms).target is None
-    with pytest.raises(InputError, match="geometry"):
-        rigid_water(atoms, "spc")
-
-
-def test_no_water():
-    with pytest.raises(InputError, match="no water found"):
-        rigid_water(molecule("CH4"))
 
 
 # -- documents --------------------------------------------------------------------------------------

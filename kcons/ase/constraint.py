@@ -1,11 +1,4 @@
-"""Constraints on ASE `Atoms`: one object that owns everything that is held.
-
-ASE applies constraint objects one after another, so that two objects on the same atoms undo each other's
-work. `Constraints` therefore holds the whole set and solves it as one. Units are ASE's (Angstrom, eV,
-amu); targets are in Angstrom and radian.
-
-Importing this module registers the object with ASE, which makes files that contain it readable.
-"""
+"""The constraint object for ASE."""
 
 from __future__ import annotations
 
@@ -18,30 +11,18 @@ import ase.constraints
 import numpy as np
 from ase import Atoms
 from ase.constraints.constraint import FixConstraint
-from ase.geometry import find_mic
 from numpy.typing import NDArray
 
 import kcons.constraints as families
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import (
-    Angle,
-    CenterOfMass,
-    Constraint,
-    Dihedral,
-    Distance,
-    FixedAtoms,
-    Line,
-    LinearCombination,
-    LinearRelation,
-    Plane,
-)
+from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
 from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion import Motion
 
-__all__ = ["Constraints", "constrain", "from_ase_constraints", "rigid_water"]
+__all__ = ["Constraints", "constrain"]
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
@@ -57,8 +38,6 @@ _PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", 
 
 #: ASE objects that only add forces, so that they get along with any constraint.
 _FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
-
-TIP3P = (0.9572, 104.52)
 
 
 @dataclass
@@ -494,148 +473,6 @@ def constrain(
         raise
     return held
 
-
-def rigid_water(
-    atoms: Atoms, geometry: Literal["tip3p"] | tuple[float, float] | None = None, *, reach: float = 1.3
-) -> Distance:
-    """Hold all water molecules rigid: three distances each.
-
-    A water is an oxygen followed in the list of atoms by two hydrogens that are within `reach` of it
-    (minimum image), and not by a third.
-
-    Parameters
-    ----------
-    atoms : ase.Atoms
-    geometry : 'tip3p', (float, float) or None
-        O-H length and H-O-H angle in degrees; 'tip3p' is (0.9572, 104.52). None holds each molecule as it
-        is.
-    reach : float
-        Longest O-H distance that counts as a bond, in Angstrom.
-
-    Raises
-    ------
-    InputError
-        If there is no water.
-    """
-    z = atoms.numbers
-    oxygen = np.flatnonzero((z[:-2] == 8) & (z[1:-1] == 1) & (z[2:] == 1)) if len(z) > 2 else np.zeros(0, int)
-
-    def bonded(hydrogen: IntArray) -> NDArray[np.bool_]:
-        vectors = atoms.positions[hydrogen] - atoms.positions[oxygen]
-        return np.asarray(find_mic(vectors, atoms.cell, atoms.pbc)[1] <= reach)
-
-    if len(oxygen):
-        third = np.minimum(oxygen + 3, len(z) - 1)
-        more = (oxygen + 3 < len(z)) & (z[third] == 1)
-        more &= bonded(third)
-        oxygen = oxygen[bonded(oxygen + 1) & bonded(oxygen + 2) & ~more]
-    if len(oxygen) == 0:
-        raise InputError(
-            "no water found: an oxygen must be followed by its two hydrogens in the list of atoms "
-            f"(within {reach:g} Angstrom); reorder the atoms, or hold them with Distance",
-            item="atoms",
-        )
-    o, h1, h2 = oxygen, oxygen + 1, oxygen + 2
-    pairs = np.stack([np.stack([o, h1], 1), np.stack([o, h2], 1), np.stack([h1, h2], 1)], axis=1).reshape(-1, 2)
-    if geometry is None:
-        return Distance(pairs)
-    if isinstance(geometry, str):
-        if geometry.lower() != "tip3p":
-            raise InputError(f"unknown water geometry {geometry!r}; give 'tip3p' or (length, angle)", item="geometry")
-        geometry = TIP3P
-    length, angle = geometry
-    lengths = [length, length, 2 * length * np.sin(np.radians(angle) / 2)]
-    return Distance(pairs, np.tile(lengths, len(oxygen)))
-
-
-def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
-    """What the ASE constraints on `atoms` hold, as kcons constraints.
-
-    Knows FixAtoms, FixBondLengths, FixInternals (bonds, angles, dihedrals), FixLinearTriatomic, FixCom,
-    FixSubsetCom, FixedPlane, FixedLine and FixCartesian. The atoms are not changed::
-
-        held = from_ase_constraints(atoms)
-        atoms.set_constraint()
-        constrain(atoms, held)
-
-    Raises
-    ------
-    UnsupportedError
-        For any other ASE constraint, named.
-    """
-    result: list[Constraint] = []
-    for item in atoms.constraints:
-        if isinstance(item, Constraints):
-            result.extend(item.constraints)
-            continue
-        name = type(item).__name__
-        if name not in _TRANSLATORS:
-            raise UnsupportedError(
-                f"{name} has no counterpart in kcons; known are {', '.join(sorted(_TRANSLATORS))}. "
-                "A Custom constraint holds any function with a gradient"
-            )
-        result.extend(_TRANSLATORS[name](atoms, item))
-    return result
-
-
-def _bond_lengths(atoms: Atoms, item: Any) -> list[Constraint]:
-    return [Distance(np.asarray(item.pairs).reshape(-1, 2), item.bondlengths)]
-
-
-def _internals(atoms: Atoms, item: Any) -> list[Constraint]:
-    if item.bondcombos:
-        raise UnsupportedError(
-            "FixInternals holds combinations of bond lengths (bondcombos); use a Custom constraint for them"
-        )
-    result: list[Constraint] = []
-    for rows, family, unit in (
-        (item.bonds, Distance, 1.0),
-        (item.angles, Angle, np.pi / 180),
-        (item.dihedrals, Dihedral, np.pi / 180),
-    ):
-        given = [row for row in rows if row[0] is not None]
-        open_rows = [row for row in rows if row[0] is None]
-        if given:
-            result.append(family([list(row[1]) for row in given], [row[0] * unit for row in given]))
-        if open_rows:
-            result.append(family([list(row[1]) for row in open_rows]))
-    return result
-
-
-def _linear_triatomic(atoms: Atoms, item: Any) -> list[Constraint]:
-    n, o, m = np.asarray(item.triples).T
-    if item.bondlengths is None:
-        x = atoms.positions
-        lengths = np.stack([find_mic(x[end] - x[o], atoms.cell, atoms.pbc)[1] for end in (n, m)], axis=1)
-    else:
-        lengths = np.asarray(item.bondlengths)
-    total = lengths.sum(axis=1)
-    # The middle atom divides the line in the ratio of the two lengths.
-    weights = lengths[:, ::-1] / total[:, None]
-    ends = np.stack([n, m], axis=1)
-    return [Distance(ends, total), LinearRelation(o, ends, weights)]
-
-
-def _cartesian(atoms: Atoms, item: Any) -> list[Constraint]:
-    index = _indices(atoms, item)[:, None]
-    return [LinearCombination(index, np.eye(3)[axis][None, :]) for axis in np.flatnonzero(item.mask)]
-
-
-def _indices(atoms: Atoms, item: Any) -> IntArray:
-    return np.arange(len(atoms))[item.index]
-
-
-_TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
-    "FixAtoms": lambda atoms, item: [FixedAtoms(_indices(atoms, item))],
-    "FixBondLengths": _bond_lengths,
-    "FixInternals": _internals,
-    "FixLinearTriatomic": _linear_triatomic,
-    "FixCartesian": _cartesian,
-    "FixCom": lambda atoms, item: [CenterOfMass(_indices(atoms, item))],
-    "FixSubsetCom": lambda atoms, item: [CenterOfMass(_indices(atoms, item))],
-    "FixedPlane": lambda atoms, item: [Plane(_indices(atoms, item), item.dir)],
-    "FixedLine": lambda atoms, item: [Line(_indices(atoms, item), None, item.dir)],
-}
 
 _REPLACEMENTS = {
     "FixAtoms": ", with FixedAtoms for what FixAtoms held",

@@ -1,0 +1,14 @@
+"""Constraints on ASE `Atoms`: one object that owns everything that is held.
+
+ASE applies constraint objects one after another, so that two objects on the same atoms undo each other's
+work. `Constraints` therefore holds the whole set and solves it as one. Units are ASE's (Angstrom, eV,
+amu); targets are in Angstrom and radian.
+
+Importing this package registers the object with ASE, which makes files that contain it readable.
+"""
+
+from kcons.ase.constraint import Constraints, constrain
+from kcons.ase.translation import from_ase_constraints
+from kcons.ase.water import rigid_water
+
+__all__ = ["Constraints", "constrain", "from_ase_constraints", "rigid_water"]

@@ -1,0 +1,70 @@
+"""Rigid water in an `Atoms` object."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from ase import Atoms
+from ase.geometry import find_mic
+from numpy.typing import NDArray
+
+from kcons.constraints import Distance
+from kcons.constraints.constraint import IntArray
+from kcons.errors import InputError
+
+#: O-H length in Angstrom and H-O-H angle in degrees. Jorgensen et al., J. Chem. Phys. 79, 926 (1983).
+TIP3P = (0.9572, 104.52)
+
+
+def rigid_water(
+    atoms: Atoms, geometry: Literal["tip3p"] | tuple[float, float] | None = None, *, reach: float = 1.3
+) -> Distance:
+    """Hold all water molecules rigid: three distances each.
+
+    A water is an oxygen followed in the list of atoms by two hydrogens that are within `reach` of it
+    (minimum image), and not by a third.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+    geometry : 'tip3p', (float, float) or None
+        O-H length and H-O-H angle in degrees; 'tip3p' is (0.9572, 104.52). None holds each molecule as it
+        is.
+    reach : float
+        Longest O-H distance that counts as a bond, in Angstrom.
+
+    Raises
+    ------
+    InputError
+        If there is no water.
+    """
+    z = atoms.numbers
+    oxygen = np.flatnonzero((z[:-2] == 8) & (z[1:-1] == 1) & (z[2:] == 1)) if len(z) > 2 else np.zeros(0, int)
+
+    def bonded(hydrogen: IntArray) -> NDArray[np.bool_]:
+        vectors = atoms.positions[hydrogen] - atoms.positions[oxygen]
+        return np.asarray(find_mic(vectors, atoms.cell, atoms.pbc)[1] <= reach)
+
+    if len(oxygen):
+        third = np.minimum(oxygen + 3, len(z) - 1)
+        more = (oxygen + 3 < len(z)) & (z[third] == 1)
+        more &= bonded(third)
+        oxygen = oxygen[bonded(oxygen + 1) & bonded(oxygen + 2) & ~more]
+    if len(oxygen) == 0:
+        raise InputError(
+            "no water found: an oxygen must be followed by its two hydrogens in the list of atoms "
+            f"(within {reach:g} Angstrom); reorder the atoms, or hold them with Distance",
+            item="atoms",
+        )
+    o, h1, h2 = oxygen, oxygen + 1, oxygen + 2
+    pairs = np.stack([np.stack([o, h1], 1), np.stack([o, h2], 1), np.stack([h1, h2], 1)], axis=1).reshape(-1, 2)
+    if geometry is None:
+        return Distance(pairs)
+    if isinstance(geometry, str):
+        if geometry.lower() != "tip3p":
+            raise InputError(f"unknown water geometry {geometry!r}; give 'tip3p' or (length, angle)", item="geometry")
+        geometry = TIP3P
+    length, angle = geometry
+    lengths = [length, length, 2 * length * np.sin(np.radians(angle) / 2)]
+    return Distance(pairs, np.tile(lengths, len(oxygen)))
