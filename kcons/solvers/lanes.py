@@ -12,9 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.simd import (
-    FASTMATH,
+from kcons.solvers.groups import (
     MAX_ITERATIONS,
     NO_NUMBERS,
     NO_POINTS,
@@ -23,28 +21,32 @@ from kcons.solvers.simd import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
-    WIDTH,
-    absolute,
-    all_within,
     dot,
-    gather,
-    gather_differences,
-    keep_points,
     lane_tables,
     lattice_kind,
     lattice_numbers,
     minimum_image,
+    restore_points,
+    worst_row,
+)
+from kcons.solvers.outcome import Outcome
+from kcons.solvers.simd import (
+    FASTMATH,
+    WIDTH,
+    absolute,
+    all_within,
+    gather,
+    gather_differences,
+    keep_points,
     not_positive,
     peek,
     poke,
-    restore_points,
     scatter,
     scatter_points,
     splat,
     square_root,
     stack,
     store,
-    worst_row,
 )
 
 LARGEST = 6

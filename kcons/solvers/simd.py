@@ -1,4 +1,4 @@
-"""A number eight doubles wide for Numba kernels, and what kernels share.
+"""A number eight doubles wide for Numba kernels.
 
 Kernels written with it read like scalar code and are vector code by
 construction: nothing depends on what the auto-vectoriser recognises, and
@@ -14,27 +14,16 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models, register_default
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 WIDTH = 8
 """Doubles a lane vector holds: one AVX-512 register, two AVX2 registers."""
-
-MAX_ITERATIONS = 50
-POSITION_TOLERANCE = 4e-15
-"""Accepted ``|r² - d²| / 2d²``; round-off of bond vectors stays below 1e-15."""
-TANGENT_TOLERANCE = 1e-15
-"""Accepted ``|u·y_ij - c|``, relative to the cluster's own relative motion."""
-
-TINY = 1e-300
-"""Smallest scalar product taken for positive."""
 
 FASTMATH = {"contract", "arcp", "nsz"}
 """No 'nnan' (it calls NaN converged) and no 'reassoc' (it undoes differences)."""
@@ -161,6 +150,35 @@ def store(typingctx, array, start, value):
     return types.void(array, types.int64, lanes_type), codegen
 
 
+def _vectors(context: Any, builder: Any, array_type: Any, array: Any, start: Any) -> Any:
+    pointer = builder.gep(_data(context, builder, array_type, array), [start])
+    return builder.bitcast(pointer, ir.PointerType(_VECTOR))
+
+
+@intrinsic
+def load_triple(typingctx, array, start):
+    """Three vectors one after another in a flat float64 array."""
+
+    def codegen(context, builder, sig, args):
+        base = _vectors(context, builder, sig.args[0], *args)
+        triple = [builder.load(builder.gep(base, [_INT64(k)]), align=8) for k in range(3)]
+        return context.make_tuple(builder, sig.return_type, triple)
+
+    return _TRIPLE(array, types.int64), codegen
+
+
+@intrinsic
+def store_triple(typingctx, array, start, x, y, z):
+    """Inverse of `load_triple`."""
+
+    def codegen(context, builder, sig, args):
+        base = _vectors(context, builder, sig.args[0], *args[:2])
+        for k in range(3):
+            builder.store(args[2 + k], builder.gep(base, [_INT64(k)]), align=8)
+
+    return types.void(array, types.int64, *(lanes_type,) * 3), codegen
+
+
 def _pointers(context: Any, builder: Any, sig: Any, args: Any, shift: Any = None) -> list[Any]:
     """Pointers ``array + table[start + lane] + shift`` for every lane."""
     base = _data(context, builder, sig.args[0], args[0])
@@ -258,8 +276,7 @@ def keep_points(typingctx, points, table, start, undo, saved):
 
     def codegen(context, builder, sig, args):
         columns = _columns(builder, _load_rows(context, builder, sig, args))
-        base = builder.gep(_data(context, builder, sig.args[3], args[3]), [args[4]])
-        base = builder.bitcast(base, ir.PointerType(_VECTOR))
+        base = _vectors(context, builder, sig.args[3], *args[3:])
         for k, column in enumerate(columns):
             builder.store(column, builder.gep(base, [_INT64(k)]), align=8)
         return context.make_tuple(builder, sig.return_type, columns)
@@ -359,7 +376,7 @@ def where_greater(typingctx, left, right, value, otherwise):
     return lanes_type(*(lanes_type,) * 4), codegen
 
 
-def _moved_by(name: str, mask: list[int], doc: str) -> Callable[..., Any]:
+def _shifted(mask: list[int]) -> Callable[..., Any]:
     @intrinsic
     def function(typingctx, value):
         def codegen(context, builder, sig, args):
@@ -367,12 +384,27 @@ def _moved_by(name: str, mask: list[int], doc: str) -> Callable[..., Any]:
 
         return lanes_type(lanes_type), codegen
 
-    function.__name__, function.__doc__ = name, doc
     return function
 
 
-from_previous = _moved_by("from_previous", [WIDTH, *range(WIDTH - 1)], "What the lane before holds; 0 in the first.")
-from_next = _moved_by("from_next", [*range(1, WIDTH + 1)], "What the lane after holds; 0 in the last.")
+# What the lane before, or after, holds; 0 at the end.
+from_previous = _shifted([WIDTH, *range(WIDTH - 1)])
+from_next = _shifted([*range(1, WIDTH + 1)])
+
+
+@intrinsic
+def product_difference(typingctx, a, b, c, d):
+    """``a * b - c * d`` with the second product rounded, the first not.
+
+    Spelt out, so that it gives the same number wherever it is repeated.
+    """
+
+    def codegen(context, builder, sig, args):
+        a, b, c, d = args
+        second = builder.fneg(builder.fmul(c, d))
+        return _call(builder, f"llvm.fma.v{WIDTH}f64", _VECTOR, [a, b, second])
+
+    return lanes_type(*(lanes_type,) * 4), codegen
 
 
 @intrinsic
@@ -407,102 +439,3 @@ def poke(typingctx, room, entry, value):
         builder.store(args[2], builder.gep(args[0], [args[1]]))
 
     return types.void(room, types.int64, lanes_type), codegen
-
-
-NO_POINTS = np.zeros((0, 3))
-NO_NUMBERS = np.zeros(0)
-NO_LATTICE = np.zeros((2, 3, 3))
-OPEN, ORTHORHOMBIC, TRICLINIC = 0, 1, 2
-
-
-def lattice_kind(lattice: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], int]:
-    """The lattice as kernels take it, and which minimum image it needs."""
-    if lattice is None:
-        return NO_LATTICE, OPEN
-    cell, inverse = lattice
-    diagonal = np.count_nonzero(cell) + np.count_nonzero(inverse) == (
-        np.count_nonzero(cell.diagonal()) + np.count_nonzero(inverse.diagonal())
-    )
-    return lattice, ORTHORHOMBIC if diagonal else TRICLINIC
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def dot(ax, ay, az, bx, by, bz):
-    """Scalar product of two triples."""
-    return ax * bx + ay * by + az * bz
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def lattice_numbers(lattice):
-    """Cell and inverse as plain numbers.
-
-    An array handed to a function inside a loop costs reference counting,
-    and a call there makes every vector register spill.
-    """
-    return (
-        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
-        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
-        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
-        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
-        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
-        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
-    )
-
-
-@njit(fastmath=FASTMATH, forceinline=True)
-def minimum_image(x, y, z, cell, kind):
-    """Shortest periodic copy of a bond shorter than half the cell."""
-    a, b, c, p, q, r = cell
-    if kind == ORTHORHOMBIC:
-        x = x - nearest(x * p[0]) * a[0]
-        y = y - nearest(y * q[1]) * b[1]
-        z = z - nearest(z * r[2]) * c[2]
-    elif kind == TRICLINIC:
-        i = nearest(x * p[0] + y * q[0] + z * r[0])
-        j = nearest(x * p[1] + y * q[1] + z * r[1])
-        k = nearest(x * p[2] + y * q[2] + z * r[2])
-        x = x - (i * a[0] + j * b[0] + k * c[0])
-        y = y - (i * a[1] + j * b[1] + k * c[1])
-        z = z - (i * a[2] + j * b[2] + k * c[2])
-    return x, y, z
-
-
-SAVED = 3 * WIDTH
-"""Doubles that `shift_points` keeps of one point in eight lanes."""
-
-
-@njit(fastmath=FASTMATH)
-def restore_points(points, table, undo, groups, n_local, stride, first):
-    """Write back what `keep_points` kept of the first `groups` groups."""
-    for group in range(groups):
-        for k in range(n_local):
-            saved = (group * stride + first + k) * SAVED
-            x, y, z = load(undo, saved), load(undo, saved + WIDTH), load(undo, saved + 2 * WIDTH)
-            scatter_points(points, table, (group * n_local + k) * WIDTH, x, y, z)
-
-
-def lane_tables(atoms: NDArray[np.int64], n_rows: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Offsets of rows by (group, lane), and of points by (group, local atom, lane).
-
-    The last group is filled up with the last cluster: its lanes compute and
-    write the same numbers twice, which needs no special code.
-    """
-    n_groups = -(-len(atoms) // WIDTH)
-    slots = np.minimum(np.arange(n_groups * WIDTH), len(atoms) - 1)
-    by_lane = atoms[slots].reshape(n_groups, WIDTH, -1).transpose(0, 2, 1)
-    return (n_rows * slots).astype(np.uint32), (3 * by_lane).astype(np.uint32).reshape(-1)
-
-
-@njit(fastmath=FASTMATH, error_model="numpy")
-def worst_row(errors, sizes, n_rows):
-    """Largest ``error / size`` of a group and its row ``n_rows * lane + k``."""
-    worst, row = -1.0, 0
-    for lane in range(WIDTH):
-        for k in range(n_rows):
-            error, size = abs(errors[k * WIDTH + lane]), sizes[k * WIDTH + lane]
-            ratio = 0.0 if error == 0.0 else error / size
-            if not ratio <= worst:
-                worst, row = ratio, n_rows * lane + k
-                if worst != worst:
-                    return worst, row
-    return worst, row

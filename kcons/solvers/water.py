@@ -10,9 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.simd import (
-    FASTMATH,
+from kcons.solvers.groups import (
     MAX_ITERATIONS,
     NO_NUMBERS,
     NO_POINTS,
@@ -21,24 +19,28 @@ from kcons.solvers.simd import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
-    WIDTH,
-    absolute,
-    all_within,
     dot,
-    gather_differences,
-    gather_points,
-    keep_points,
     lane_tables,
     lattice_kind,
     lattice_numbers,
     minimum_image,
-    not_positive,
     restore_points,
+    worst_row,
+)
+from kcons.solvers.outcome import Outcome
+from kcons.solvers.simd import (
+    FASTMATH,
+    WIDTH,
+    absolute,
+    all_within,
+    gather_differences,
+    gather_points,
+    keep_points,
+    not_positive,
     scatter_points,
     splat,
     square_root,
     store,
-    worst_row,
 )
 
 PAIRS = ((0, 1), (0, 2), (1, 2))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.chain import SHORT, Chains
+from kcons.solvers.chain import Chains
+from kcons.solvers.strips import SHORT
 
 
 def steps(shape, n, rng):

@@ -1,0 +1,445 @@
+"""Open chains of held distances, of any length.
+
+A chain is cut into eight pieces, one a lane, of equal length. The bond between
+two pieces is a *separator*: once the separators' multipliers are known, the
+pieces are independent. Each lane eliminates its tridiagonal piece and what
+couples it to the separators at its two ends; a tridiagonal system of seven
+separators remains. So the division that every pivot waits for is shared by
+eight rows. Short chains take one lane each, eight chains at a time.
+
+A sweep substitutes back along the pieces, and as it passes moves the bonds,
+measures their residuals and eliminates for the next Newton step in the
+opposite direction: a Newton step reads the chain once.
+"""
+
+import numpy as np
+from numba import njit
+
+from kcons.solvers.groups import MAX_ITERATIONS, OPEN, POSITION_TOLERANCE, TINY, dot, lattice_numbers, minimum_image
+from kcons.solvers.simd import (
+    FASTMATH,
+    WIDTH,
+    absolute,
+    all_within,
+    from_next,
+    from_previous,
+    gather,
+    gather_points,
+    load,
+    load_triple,
+    product_difference,
+    scatter_points,
+    splat,
+    square_root,
+    store,
+    store_triple,
+    where_greater,
+    where_zero,
+)
+
+TANGENT_TOLERANCE = 2e-15
+"""Accepted ``|u·y_ij - c|``, relative to the root mean square of the chain's."""
+
+# Fields of a slot: vectors of WIDTH doubles, one a lane. Slot t of a lane holds
+# the bond from its atom t to t + 1; the last slot's bond is the separator.
+_S, _R, _TARGET, _F, _C, _L, _FIRST, _LATER = (WIDTH * k for k in (0, 3, 6, 7, 8, 9, 10, 11))
+SLOT = 12 * WIDTH
+
+
+@njit(fastmath=FASTMATH, forceinline=True)
+def flushed(value):
+    """What couples far ends decays; as denormal numbers it would cost 300 cycles a row."""
+    return where_greater(absolute(value), splat(1e-200), value, splat(0.0))
+
+
+@njit(fastmath=FASTMATH)
+def lane_sum(value, small):
+    """Sum over the lanes."""
+    store(small, 0, value)
+    return small[:WIDTH].sum()
+
+
+@njit(fastmath=FASTMATH)
+def _reduce(small, upward):
+    """Solve for the separators; `small` holds eight vectors of `WIDTH` numbers.
+
+    0 diagonal, 1 right-hand side, and what each lane's elimination adds:
+    2, 3, 4 to its head row's diagonal, right-hand side and coupling to its
+    tail; 5, 6, 7 to its tail row's. The solution replaces vector 1.
+    """
+    head, tail = (1, 0) if upward else (0, 1)
+    factor = 0.0
+    for j in range(WIDTH - 1):
+        small[0, j] += small[2, j + head] + small[5, j + tail]
+        small[1, j] += small[3, j + head] + small[6, j + tail]
+        if j > 0:
+            # Lane j lies between the separators j - 1 and j.
+            lower = small[7, j] if upward else small[4, j]
+            upper = small[4, j] if upward else small[7, j]
+            factor = lower / small[0, j - 1]
+            small[0, j] -= factor * upper
+            small[1, j] -= factor * small[1, j - 1]
+    for j in range(WIDTH - 2, -1, -1):
+        value = small[1, j]
+        if j < WIDTH - 2:
+            value -= (small[4, j + 1] if upward else small[7, j + 1]) * small[1, j + 1]
+        small[1, j] = value / small[0, j]
+    small[1, WIDTH - 1] = 0.0
+
+
+@njit(fastmath=FASTMATH, forceinline=True)
+def _length_error(rx, ry, rz, sx, sy, sz, square, real):
+    """Right-hand side, gradient product, the same where there is a bond, relative residual."""
+    error = 0.5 * (square - dot(rx, ry, rz, rx, ry, rz) * real)
+    inner = dot(rx, ry, rz, sx, sy, sz)
+    return error, inner, where_zero(real, 1.0, inner), absolute(error) / where_zero(real, 1.0, square)
+
+
+@njit(fastmath=FASTMATH, forceinline=True)
+def _rate_error(rx, ry, rz, sx, sy, sz, rate, real):
+    """The same for relative velocities r; the residual is that along the unit bond."""
+    error = rate - dot(rx, ry, rz, sx, sy, sz)
+    inner = dot(sx, sy, sz, sx, sy, sz)
+    positive = where_zero(real, 1.0, inner)
+    return error, inner, positive, absolute(error) / square_root(positive)
+
+
+@njit(fastmath=FASTMATH, error_model="numpy")
+def _solve(
+    base, other, atoms, rows, present, weights, given, cell, kind, first, n_slots, whole, tangent, limit, work, small
+):
+    """Newton iteration on one strip of eight pieces.
+
+    Bonds s come from the points `base`; r, from `other`, is what the
+    multipliers change: bonds to bring to the lengths `given`, or relative
+    velocities to bring to those rates along s. The slots before `whole` have a
+    bond in every lane.
+
+    Returns whether all is well, the worst residual, its slot and lane, and the
+    number of solves.
+    """
+    m = n_slots - 1
+    end, seam = first + m * WIDTH, m * SLOT
+    zero, one = splat(0.0), splat(1.0)
+    driven = given.shape[0] > 0
+
+    # The separators, and the bond that the first sweep begins with.
+    real = load(present, end)
+    ax, ay, az = gather_points(base, atoms, first)
+    bx, by, bz = gather_points(base, atoms, end)
+    zx, zy, zz = (bx - from_next(ax)) * real, (by - from_next(ay)) * real, (bz - from_next(az)) * real
+    bx, by, bz = gather_points(base, atoms, first + WIDTH)
+    ux, uy, uz = ax - bx, ay - by, az - bz
+    ax, ay, az = gather_points(other, atoms, first)
+    cx, cy, cz = gather_points(other, atoms, end)
+    cx, cy, cz = (cx - from_next(ax)) * real, (cy - from_next(ay)) * real, (cz - from_next(az)) * real
+    dx, dy, dz = gather_points(other, atoms, first + WIDTH)
+    vx, vy, vz = ax - dx, ay - dy, az - dz
+    if kind != OPEN:
+        zx, zy, zz = minimum_image(zx, zy, zz, cell, kind)
+        ux, uy, uz = minimum_image(ux, uy, uz, cell, kind)
+        if not tangent:
+            cx, cy, cz = minimum_image(cx, cy, cz, cell, kind)
+            vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
+    store_triple(work, seam + _S, zx, zy, zz)
+    store_triple(work, seam + _R, cx, cy, cz)
+    count, scale = real, dot(cx, cy, cz, cx, cy, cz)
+    seam_target = gather(given, rows, end, 0) * real if driven else zero
+    if tangent:
+        scale = scale + seam_target * seam_target
+        seam_target = seam_target * square_root(dot(zx, zy, zz, zx, zy, zz))
+    else:
+        seam_target = seam_target * seam_target
+
+    shared = zero  # multipliers of the separators, each in the lane before it
+    ok, finite, iteration, least, peak, peak_slot = False, False, 0, zero, zero, zero
+    for iteration in range(MAX_ITERATIONS + 1):
+        opening, upward = iteration == 0, iteration % 2 == 0
+        peak, peak_slot, least, total = splat(-1.0), zero, one, zero
+        # p: what lies before a row in the order of the sweep; q: after the last row.
+        px, py, pz, p = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(shared)
+        qx, qy, qz, q = zx, zy, zz, shared
+        slot, stride, atom, step, onward = 0, SLOT, first, WIDTH, WIDTH
+        if not upward:
+            px, py, pz, p, qx, qy, qz, q = qx, qy, qz, q, px, py, pz, p
+            slot, stride, atom, step, onward = seam - SLOT, -SLOT, end - WIDTH, -WIDTH, 0
+        sign = 1.0 if upward else -1.0
+        if opening:
+            sx, sy, sz, now = ux, uy, uz, zero
+        else:
+            sx, sy, sz = load_triple(work, slot + _S)
+            now = load(work, slot + _F) - load(work, slot + _C) * p - load(work, slot + _L) * q
+        w = load(weights, atom + WIDTH - onward)
+        w_first, hx, hy, hz = w, sx, sy, sz
+        # Displacement, times sign, of the atom between two rows.
+        ex = w * product_difference(sx, now, px, p)
+        ey = w * product_difference(sy, now, py, p)
+        ez = w * product_difference(sz, now, pz, p)
+        fx, fy, fz = ex, ey, ez
+        f, c, l = zero, zero, splat(-1.0)
+        gamma, head_diagonal, head_right = one, zero, zero
+        for row in range(m):
+            nx, ny, nz, then = qx, qy, qz, q
+            if opening:
+                rx, ry, rz = vx, vy, vz
+                real = load(present, atom)
+                target = gather(given, rows, atom, 0) * real if driven else zero
+                count = count + real
+                scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
+                target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent else target)
+                store_triple(work, slot + _S, sx, sy, sz)
+                store(work, slot + _TARGET, target)
+                if row + 1 < m:
+                    ax, ay, az = bx, by, bz
+                    bx, by, bz = gather_points(base, atoms, atom + 2 * WIDTH)
+                    nx, ny, nz = ax - bx, ay - by, az - bz
+                    cx, cy, cz = dx, dy, dz
+                    dx, dy, dz = gather_points(other, atoms, atom + 2 * WIDTH)
+                    vx, vy, vz = cx - dx, cy - dy, cz - dz
+                    if kind != OPEN:
+                        nx, ny, nz = minimum_image(nx, ny, nz, cell, kind)
+                        if not tangent:
+                            vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
+            else:
+                rx, ry, rz = load_triple(work, slot + _R)
+                target = load(work, slot + _TARGET)
+                if iteration == 1:
+                    store(work, slot + _FIRST, now)
+                elif iteration == 2:
+                    store(work, slot + _LATER, now)
+                else:
+                    store(work, slot + _LATER, load(work, slot + _LATER) + now)
+                real = one if atom < whole else load(present, atom)
+                if row + 1 < m:
+                    ahead = slot + stride
+                    nx, ny, nz = load_triple(work, ahead + _S)
+                    then = load(work, ahead + _F) - load(work, ahead + _C) * now - load(work, ahead + _L) * q
+            w_exit = load(weights, atom + onward)
+            ox = w_exit * product_difference(nx, then, sx, now)
+            oy = w_exit * product_difference(ny, then, sy, now)
+            oz = w_exit * product_difference(nz, then, sz, now)
+            rx, ry, rz = rx + (ex - ox), ry + (ey - oy), rz + (ez - oz)
+            store_triple(work, slot + _R, rx, ry, rz)
+            if tangent:
+                error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
+                rx, ry, rz = sx, sy, sz
+            else:
+                error, inner, positive, ratio = _length_error(rx, ry, rz, sx, sy, sz, target, real)
+            least = where_greater(least, positive, positive, least)
+            total = total + ratio
+            peak_slot = where_greater(ratio, peak, splat(float(slot)), peak_slot)
+            peak = where_greater(ratio, peak, ratio, peak)
+            both = (w + w_exit) * real
+            back = w * dot(rx, ry, rz, px, py, pz)
+            pivot = 1.0 / (where_zero(both, 1.0, both * inner) + back * c)
+            f = (error + back * f) * pivot
+            l = flushed(back * l * pivot)
+            c = -w_exit * dot(rx, ry, rz, nx, ny, nz) * pivot
+            store_triple(work, slot + _F, f, c, l)
+            head_diagonal = head_diagonal + gamma * l
+            head_right = head_right + gamma * f
+            gamma = flushed(-gamma * c)
+            px, py, pz, sx, sy, sz, now = sx, sy, sz, nx, ny, nz, then
+            ex, ey, ez, w = ox, oy, oz, w_exit
+            slot += stride
+            atom += step
+        # The separators: move, measure, and add what the pieces pass on.
+        real = load(present, end) * sign
+        rx, ry, rz = load_triple(work, seam + _R)
+        if upward:
+            gx, gy, gz, fx, fy, fz = ex, ey, ez, from_next(fx), from_next(fy), from_next(fz)
+        else:
+            gx, gy, gz, fx, fy, fz = fx, fy, fz, from_next(ex), from_next(ey), from_next(ez)
+        rx, ry, rz = rx + real * (gx - fx), ry + real * (gy - fy), rz + real * (gz - fz)
+        store_triple(work, seam + _R, rx, ry, rz)
+        if iteration == 1:
+            store(work, seam + _FIRST, shared)
+        elif iteration == 2:
+            store(work, seam + _LATER, shared)
+        elif iteration > 2:
+            store(work, seam + _LATER, load(work, seam + _LATER) + shared)
+        real = load(present, end)
+        if tangent:
+            error, inner, positive, ratio = _rate_error(rx, ry, rz, zx, zy, zz, seam_target, real)
+            rx, ry, rz = zx, zy, zz
+        else:
+            error, inner, positive, ratio = _length_error(rx, ry, rz, zx, zy, zz, seam_target, real)
+        least = where_greater(least, positive, positive, least)
+        total = total + ratio
+        peak_slot = where_greater(ratio, peak, splat(float(seam)), peak_slot)
+        peak = where_greater(ratio, peak, ratio, peak)
+        if opening and tangent:
+            limit = limit * np.sqrt(lane_sum(scale, small) / lane_sum(count, small))
+        # Comparisons drop NaN, sums keep it.
+        finite = all_within(total, 1e300)
+        if opening:
+            finite = finite and all_within(TINY, least)
+        ok = finite and all_within(peak, limit)
+        if ok or not finite or iteration == MAX_ITERATIONS:
+            break
+        both = (load(weights, end) + from_next(load(weights, first))) * real
+        # Couplings of the rows at both ends of a lane: A(head, first), A(tail, last).
+        gx, gy, gz = from_previous(rx), from_previous(ry), from_previous(rz)
+        if upward:
+            rx, ry, rz, gx, gy, gz = gx, gy, gz, rx, ry, rz
+        head = -w_first * dot(rx, ry, rz, hx, hy, hz)
+        tail = -w * dot(gx, gy, gz, px, py, pz)
+        store(small, 0, where_zero(both, 1.0, both * inner))
+        store(small, WIDTH, error)
+        store_triple(small, 2 * WIDTH, -head * head_diagonal, -head * head_right, head * gamma)
+        store_triple(small, 5 * WIDTH, -tail * c, -tail * f, -tail * l)
+        _reduce(small.reshape(8, WIDTH), upward)
+        shared = load(small, WIDTH)
+    store(small, 0, peak)
+    store(small, WIDTH, peak_slot)
+    lane = np.argmax(small[:WIDTH])
+    worst, place = small[lane], int(small[WIDTH + lane]) // SLOT
+    kept = all_within(TINY, least)
+    if not (finite and kept):
+        # NaN escapes comparisons, and a bond turned round has no residual: look.
+        for k in range(n_slots * WIDTH):
+            at = (k // WIDTH) * SLOT + k % WIDTH
+            inner_product = 0.0
+            for axis in range(0, 3 * WIDTH, WIDTH):
+                s, r = work[at + _S + axis], work[at + _R + axis]
+                inner_product += s * s + 0.0 * r if tangent else s * r
+            if present[first + k] > 0.0 and not inner_product > 0.0:
+                worst, place, lane = np.inf, k // WIDTH, k % WIDTH
+                break
+    return ok and kept, worst, place * WIDTH + lane, iteration
+
+
+@njit(fastmath=FASTMATH)
+def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, first, n_slots, solves, undo, keep):
+    """Add the displacements of a strip, keeping what was there.
+
+    The first solve's part is repeated as the sweep computed it, number for
+    number: multipliers of a straight chain are much larger than displacements,
+    and the later solves corrected just this rounding.
+    """
+    move = velocities.shape[0] > 0
+    seam = (n_slots - 1) * SLOT
+    px, py, pz = load_triple(work, seam + _S)
+    px, py, pz = from_previous(px), from_previous(py), from_previous(pz)
+    p, later_p = from_previous(load(work, seam + _FIRST)), splat(0.0)
+    if solves > 1:
+        later_p = from_previous(load(work, seam + _LATER))
+    later = splat(0.0)
+    for t in range(n_slots):
+        at, slot = first + t * WIDTH, t * SLOT
+        sx, sy, sz = load_triple(work, slot + _S)
+        now, w = load(work, slot + _FIRST), load(weights, at)
+        dx = w * product_difference(px, p, sx, now)
+        dy = w * product_difference(py, p, sy, now)
+        dz = w * product_difference(pz, p, sz, now)
+        if solves > 1:
+            later = load(work, slot + _LATER)
+            dx = dx - w * (sx * later - px * later_p)
+            dy = dy - w * (sy * later - py * later_p)
+            dz = dz - w * (sz * later - pz * later_p)
+        px, py, pz, p, later_p = sx, sy, sz, now, later
+        x, y, z = gather_points(points, atoms, at)
+        vx, vy, vz = x, y, z
+        if move:
+            vx, vy, vz = gather_points(velocities, atoms, at)
+        if keep:
+            store_triple(undo, 6 * at, x, y, z)
+            store_triple(undo, 6 * at + 3 * WIDTH, vx, vy, vz)
+        x, y, z = x - dx, y - dy, z - dz
+        vx, vy, vz = vx - dx * inverse_dt, vy - dy * inverse_dt, vz - dz * inverse_dt
+        if full[at // WIDTH]:
+            scatter_points(points, atoms, at, x, y, z)
+            if move:
+                scatter_points(velocities, atoms, at, vx, vy, vz)
+        else:
+            # Slots beyond a chain's end repeat its last atom; only its own slot writes it.
+            store_triple(work, slot + _R, x, y, z)
+            store_triple(work, slot + _F, vx, vy, vz)
+            for lane in range(WIDTH):
+                if owned[at + lane]:
+                    target = atoms[at + lane] // 3
+                    for axis in range(3):
+                        points[target, axis] = work[slot + _R + axis * WIDTH + lane]
+                        if move:
+                            velocities[target, axis] = work[slot + _F + axis * WIDTH + lane]
+
+
+@njit(fastmath=FASTMATH)
+def _restore(points, atoms, undo, end, first):
+    """Write back what `_shift` kept of the slots before `end`."""
+    # Backwards: a slot that repeats an atom kept it as it was after its own slot.
+    for at in range(end - WIDTH, -WIDTH, -WIDTH):
+        x, y, z = load_triple(undo, 6 * at + first)
+        scatter_points(points, atoms, at, x, y, z)
+
+
+@njit(fastmath=FASTMATH)
+def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
+    """Multipliers of unit gradients."""
+    for k in range(n_slots * WIDTH):
+        if present[first + k] > 0.0:
+            at = (k // WIDTH) * SLOT + k % WIDTH
+            square = work[at + _S] ** 2 + work[at + _S + WIDTH] ** 2 + work[at + _S + 2 * WIDTH] ** 2
+            value = work[at + _FIRST] if solves > 0 else 0.0
+            if solves > 1:
+                value += work[at + _LATER]
+            multipliers[rows[first + k]] = sign * value * np.sqrt(square)
+
+
+@njit(cache=True, fastmath=FASTMATH, error_model="numpy")
+def project(
+    points,
+    references,
+    velocities,
+    inverse_dt,
+    tangent,
+    starts,
+    atoms,
+    owned,
+    full,
+    rows,
+    present,
+    weights,
+    wholes,
+    given,
+    lattice,
+    kind,
+    multipliers,
+    work,
+    undo,
+):
+    """Project one strip after another; `tangent` says what `points` are."""
+    small = np.empty(8 * WIDTH)
+    cell = lattice_numbers(lattice)
+    worst, worst_row, most = 0.0, -1, 0
+    last = starts.shape[0] - 2
+    limit = TANGENT_TOLERANCE if tangent else POSITION_TOLERANCE
+    for strip in range(last + 1):
+        first, n_slots = starts[strip], (starts[strip + 1] - starts[strip]) // WIDTH
+        ok, residual, place, solves = _solve(
+            references, points, atoms, rows, present, weights, given, cell, kind,
+            first, n_slots, wholes[strip], tangent, limit, work, small,
+        )  # fmt: skip
+        most = max(most, solves)
+        if not (ok and residual <= worst):
+            worst, worst_row = residual, rows[first + place]
+        if not ok:
+            _restore(points, atoms, undo, first, 0)
+            if velocities.shape[0] > 0:
+                _restore(velocities, atoms, undo, first, 3 * WIDTH)
+            return False, worst, most, worst_row
+        if solves > 0:
+            _shift(
+                points, velocities, inverse_dt, atoms, owned, full, weights, work,
+                first, n_slots, solves, undo, strip < last,
+            )  # fmt: skip
+        elif strip < last:
+            for at in range(first, starts[strip + 1], WIDTH):
+                x, y, z = gather_points(points, atoms, at)
+                store_triple(undo, 6 * at, x, y, z)
+                if velocities.shape[0] > 0:
+                    x, y, z = gather_points(velocities, atoms, at)
+                store_triple(undo, 6 * at + 3 * WIDTH, x, y, z)
+        if multipliers.shape[0] > 0:
+            _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent else 1.0)
+    return True, worst, most, worst_row
