@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -74,11 +75,17 @@ def make_report(
     )
 
 
+class HasRows(Protocol):
+    """Anything with global row numbers."""
+
+    rows: IntArray
+
+
 def _named(numbers: IntArray | None, atoms: IntArray) -> list[int]:
     return [int(a) for a in (atoms if numbers is None else numbers[atoms])]
 
 
-def _not_finite(
+def _bad_array(
     constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray]
 ) -> KconsError | None:
     touched = constraint_set.touched
@@ -98,25 +105,54 @@ def _row_label(constraint_set: ConstraintSet, numbers: IntArray | None, row: int
     return f"#{row} {item.family}({shown})", atoms
 
 
-def positions_failed(
+def _global_row(outcome: Outcome, solver: HasRows) -> int:
+    return int(solver.rows[outcome.worst_row]) if outcome.worst_row >= 0 else -1
+
+
+def unusable(
     constraint_set: ConstraintSet,
     numbers: IntArray | None,
-    x: FloatArray,
-    ref: FloatArray,
+    arrays: dict[str, FloatArray],
     outcome: Outcome,
-    row: int,
-    plan: Plan,
+    solver: HasRows,
+) -> KconsError | None:
+    """The error for input that no solver can work on: NaN or infinity, coincident atoms; None if it is sound."""
+    error = _bad_array(constraint_set, numbers, arrays)
+    row = _global_row(outcome, solver)
+    if error is not None or row < 0:
+        return error
+    item, k = constraint_set.locate(row)
+    if item.family != "Distance":
+        return None
+    reference = list(arrays.values())[-1]
+    r = constraint_set.gather(item.select([k]), reference)[0]
+    if np.linalg.norm(r[1] - r[0]) > 0:
+        return None
+    i, j = _named(numbers, item.atoms[k])
+    return SingularGeometryError(
+        f"atoms {i} and {j} coincide: distance gradient undefined; move them apart", rows=[row], atoms=[i, j]
+    )
+
+
+def not_finite_rows(
+    constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray], row: int
+) -> KconsError:
+    """The error for a right-hand side b that is not finite."""
+    error = _bad_array(constraint_set, numbers, arrays)
+    name, atoms = _row_label(constraint_set, numbers, row)
+    return error or SingularGeometryError(
+        f"the curvature of row {name} is undefined at these positions", rows=[row], atoms=atoms
+    )
+
+
+def positions_failed(
+    constraint_set: ConstraintSet, numbers: IntArray | None, outcome: Outcome, solver: HasRows, plan: Plan
 ) -> KconsError:
     """The error for a position projection without solution."""
-    error = _not_finite(constraint_set, numbers, {"position": x, "reference position": ref})
-    if error is not None:
-        return error
+    row = _global_row(outcome, solver)
     if row < 0:
         return ConvergenceError("the position projection did not converge", residual=outcome.residual)
     name, atoms = _row_label(constraint_set, numbers, row)
-    singular = _coincident(constraint_set, numbers, ref, row)
-    if singular is not None:
-        return singular
     return ConvergenceError(
         f"no positions near the given ones fulfil row {name}: relative residual {outcome.residual:.3g} after "
         f"{outcome.iterations} iterations. The displacement is too large for this geometry; use a smaller "
@@ -130,41 +166,24 @@ def positions_failed(
     )
 
 
-def _coincident(
-    constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, row: int
-) -> KconsError | None:
-    item, k = constraint_set.locate(row)
-    if item.family != "Distance":
-        return None
-    r = constraint_set.gather(item.select([k]), x)[0]
-    if np.linalg.norm(r[1] - r[0]) > 0:
-        return None
-    i, j = _named(numbers, item.atoms[k])
-    return SingularGeometryError(
-        f"atoms {i} and {j} coincide: distance gradient undefined; move them apart", rows=[row], atoms=[i, j]
-    )
-
-
 def tangents_failed(
     constraint_set: ConstraintSet,
     numbers: IntArray | None,
     x: FloatArray,
     y: FloatArray,
     outcome: Outcome,
-    row: int,
+    solver: HasRows,
     what: str,
     plan: Plan,
 ) -> KconsError:
     """The error for a velocity or force projection without solution."""
-    error = _not_finite(constraint_set, numbers, {"position": x, what: y})
+    error = unusable(constraint_set, numbers, {what: y, "position": x}, outcome, solver)
     if error is not None:
         return error
+    row = _global_row(outcome, solver)
     if row < 0:
         return ConvergenceError(f"the {what} projection did not converge", residual=outcome.residual)
     name, atoms = _row_label(constraint_set, numbers, row)
-    singular = _coincident(constraint_set, numbers, x, row)
-    if singular is not None:
-        return singular
     return ConvergenceError(
         f"the {what} projection leaves a residual of {outcome.residual:.3g} in row {name}: the rows contradict "
         "each other at these positions (A A+ b differs from b), or a gradient is undefined there",
@@ -177,12 +196,15 @@ def tangents_failed(
 
 
 def restore_failed(
-    constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, outcome: Outcome, row: int, time: float
+    constraint_set: ConstraintSet,
+    numbers: IntArray | None,
+    x: FloatArray,
+    outcome: Outcome,
+    solver: HasRows,
+    time: float,
 ) -> KconsError:
     """The error for start positions that cannot be brought onto the constraints."""
-    error = _not_finite(constraint_set, numbers, {"position": x})
-    if error is not None:
-        return error
+    row = _global_row(outcome, solver)
     name, atoms = _row_label(constraint_set, numbers, row)
     sum_of_squares = float(np.sum(constraint_set.value(x, time) ** 2))
     return InfeasibleError(

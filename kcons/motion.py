@@ -18,7 +18,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
-from kcons.errors import InputError
+from kcons.errors import ConvergenceError, InputError
 from kcons.plan import ClusterSolver, Plan, make_plan
 from kcons.solvers.general import GeneralClusters
 from kcons.solvers.outcome import Outcome
@@ -27,6 +27,10 @@ from kcons.solvers.outcome import Outcome
 MAX_RESCUES = 20
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
+#: Largest cluster, in rows, that dense damped Newton rescues.
+RESCUE_ROWS = 400
+#: Rounds of the search for the nearest point on the constraints.
+NEAREST_ROUNDS = 200
 
 
 class Motion:
@@ -195,15 +199,16 @@ class Motion:
             if not outcome.converged:
                 if saved is None:
                     saved = (x.copy(), None if velocities is None else velocities.copy())
-                outcome = self._rescue(
-                    solver, outcome, x, ref, targets, velocities, inv_dt, lam, time, reference_time
-                )
-            if not outcome.converged:
-                np.copyto(x, saved[0])
-                if velocities is not None and saved[1] is not None:
-                    np.copyto(velocities, saved[1])
-                row = int(solver.rows[outcome.worst_row]) if outcome.worst_row >= 0 else -1
-                raise diagnosis.positions_failed(self._local, self._numbers, x, ref, outcome, row, plan)
+                error = diagnosis.unusable(self._local, self._numbers, {"x_new": x, "x_ref": ref}, outcome, solver)
+                if error is None:
+                    outcome = self._rescue(
+                        solver, outcome, x, ref, targets, velocities, inv_dt, lam, time, reference_time
+                    )
+                if not outcome.converged:
+                    np.copyto(x, saved[0])
+                    if velocities is not None and saved[1] is not None:
+                        np.copyto(velocities, saved[1])
+                    raise error or diagnosis.positions_failed(self._local, self._numbers, outcome, solver, plan)
             if multipliers is not None and lam is not None:
                 multipliers[solver.rows] = lam
 
@@ -227,6 +232,8 @@ class Motion:
                 return outcome
             row = int(solver.rows[outcome.worst_row])
             general = self._rescuer(row)
+            if general is None:
+                return outcome
             piece = np.zeros(len(general.rows))
             rescued = general.positions(
                 x, ref, targets, self._local.lattice, velocities, inv_dt, piece, time, reference_time
@@ -245,10 +252,13 @@ class Motion:
                 return outcome
         return outcome
 
-    def _rescuer(self, row: int) -> GeneralClusters:
+    def _rescuer(self, row: int) -> GeneralClusters | None:
+        """The damped solver for the cluster of `row`; None if it is too large for dense algebra."""
         label = int(self.plan.labels[row])
         if label not in self._rescuers:
             rows = np.flatnonzero(self.plan.labels == label)
+            if len(rows) > RESCUE_ROWS:
+                return None
             self._rescuers[label] = GeneralClusters(
                 self._local, rows, np.zeros(len(rows), dtype=np.int64), self.plan.inverse_masses
             )
@@ -269,14 +279,11 @@ class Motion:
         start = _positions(x, self.n_atoms, "positions")
         result = start.copy()
         local = result if self._atoms is None else result[self._atoms]
-        targets = self._local.target(time)
+        targets = self._local.target(time) if self._local.moving else None
         if len(self.plan.pinned):
             local[self.plan.pinned] = self.plan.pinned_targets(targets, self._local)
-        for general in self.plan.general_for_all():
-            outcome = general.restore(local, time=time)
-            if not outcome.converged:
-                row = int(general.rows[outcome.worst_row])
-                raise diagnosis.restore_failed(self._local, self._numbers, local, outcome, row, time)
+        if not self._nearest(local, time):
+            self._restore_generally(local, time)
         if self._atoms is not None:
             result[self._atoms] = local
         if out is None:
@@ -284,6 +291,45 @@ class Motion:
         _check_out(out, self.n_atoms)
         np.copyto(out, result)
         return out
+
+    def _nearest(self, x: FloatArray, time: float) -> bool:
+        """x <- x0 + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers; False if it fails.
+
+        Its fixed point is the foot of the mass-weighted perpendicular from x0.
+        """
+        try:
+            here = x.copy()
+            self._positions_direct(here, x, time, time, None, 0.0, None)
+            last = np.inf
+            for _ in range(NEAREST_ROUNDS):
+                ahead = x.copy()
+                self._positions_direct(ahead, here, time, time, None, 0.0, None)
+                move = float(np.max(np.abs(ahead - here), initial=0.0))
+                here = ahead
+                if move == 0.0 or (move > 0.5 * last and move < 1e-12):
+                    break
+                last = move
+            else:
+                return False
+        except ConvergenceError:
+            return False
+        np.copyto(x, here)
+        return True
+
+    def _restore_generally(self, x: FloatArray, time: float) -> None:
+        """Damped Gauss-Newton for every cluster, then once more towards the nearest point from there."""
+        start = x.copy()
+        general = self.plan.general_for_all(RESCUE_ROWS)
+        outcome = general.restore(x, time=time)
+        if not outcome.converged:
+            error = diagnosis.unusable(self._local, self._numbers, {"positions": start}, outcome, general)
+            raise error or diagnosis.restore_failed(self._local, self._numbers, x, outcome, general, time)
+        foot = start.copy()
+        try:
+            self._positions_direct(foot, x, time, time, None, 0.0, None)
+        except ConvergenceError:
+            return
+        np.copyto(x, foot)
 
     # -- velocities, accelerations, forces ------------------------------------------------------
 
@@ -354,8 +400,7 @@ class Motion:
             if not outcome.converged:
                 if saved is not None:
                     np.copyto(y, saved)
-                row = int(solver.rows[outcome.worst_row]) if outcome.worst_row >= 0 else -1
-                raise diagnosis.tangents_failed(self._local, self._numbers, x, y, outcome, row, what, plan)
+                raise diagnosis.tangents_failed(self._local, self._numbers, x, y, outcome, solver, what, plan)
             if multipliers is not None and lam is not None:
                 multipliers[solver.rows] = lam
 
@@ -389,6 +434,9 @@ class Motion:
         local_x, local_v = (here, speed) if self._atoms is None else (here[self._atoms], speed[self._atoms])
         local_a = a if self._atoms is None else a[self._atoms]
         b = self._local.acceleration_target(local_x, local_v, time)
+        if not np.all(np.isfinite(b)):
+            arrays = {"positions": local_x, "velocities": local_v}
+            raise diagnosis.not_finite_rows(self._local, self._numbers, arrays, int(np.argmin(np.isfinite(b))))
         mu = np.zeros(self._local.n_rows)
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:

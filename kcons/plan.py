@@ -11,7 +11,8 @@ from kcons.clusters import Shape, classify, cluster_labels
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import ContradictionError
+from kcons.errors import ContradictionError, UnsupportedError
+from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances
 from kcons.solvers.general import RANK_TOLERANCE, GeneralClusters
 from kcons.solvers.lanes import SmallClusters
@@ -105,12 +106,23 @@ class Plan:
             targets = local.target(0.0)
         return targets[self.pinned_rows].reshape(-1, 3)
 
-    def general_for_all(self) -> list[GeneralClusters]:
-        """The damped solver for every cluster, for positions that are far off."""
+    def general_for_all(self, limit: int) -> GeneralClusters:
+        """The damped solver for every cluster, for positions that are far off.
+
+        Raises
+        ------
+        UnsupportedError
+            A cluster has more than `limit` rows, too many for dense algebra.
+        """
         rows = np.flatnonzero(self.labels >= 0)
-        if len(rows) == 0:
-            return []
-        return [GeneralClusters(self.constraint_set, rows, self.labels[rows], self.inverse_masses)]
+        sizes = np.bincount(self.labels[rows])
+        if len(sizes) and sizes.max() > limit:
+            name = self.constraint_set.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
+            raise UnsupportedError(
+                f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
+                "to the constraints (minimise with harmonic bonds first), or hold fewer rows"
+            )
+        return GeneralClusters(self.constraint_set, rows, self.labels[rows], self.inverse_masses)
 
 
 def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Plan:
@@ -134,6 +146,12 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
             rank = _rank(constraint_set, shape, inverse_masses, positions, solver, time)
         if rank < shape.rows.size:
             plan.dependent += _by_cluster(shape.rows.ravel(), labels)
+            if shape.kind in ("water", "lanes"):
+                # The lanes have no cut for dependent rows; sparse elimination has.
+                flat = shape.rows.ravel()
+                ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
+                shape = Shape("sparse", flat, shape.clusters, False, pairs=ends)
+                solver = _solver(shape, constraint_set, inverse_masses, labels, time)
         plan.solvers.append(solver)
         plan.rank += rank
         example = constraint_set.row_name(int(shape.rows.ravel()[0]))
@@ -260,6 +278,8 @@ def _solver(
         solver = RigidTriangles(rows, shape.atoms, targets[rows], inverse_masses[shape.atoms[0]])
     elif shape.kind == "lanes":
         solver = SmallClusters(rows, shape.atoms, shape.pairs, targets[rows], inverse_masses[shape.atoms[0]])
+    elif shape.kind == "chain":
+        solver = Chains(rows, shape.starts, shape.atoms, targets[rows], inverse_masses[shape.atoms])
     else:
         solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses)
     return DistanceClusters(solver, targets)
@@ -282,7 +302,7 @@ def _rank(
             return sparse.rank(positions, constraint_set.lattice)
         return _rank_of_small(constraint_set, shape, inverse_masses, positions)
     assert isinstance(solver, GeneralClusters)
-    return sum(int(np.sum(s > RANK_TOLERANCE * s[0])) for _, s in solver.singular_values(positions, time))
+    return solver.rank(positions, time)
 
 
 def _rank_of_small(

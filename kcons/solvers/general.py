@@ -1,7 +1,8 @@
-"""Any rows whatever: damped Newton with rank-revealing dense algebra, one cluster at a time.
+"""Any rows whatever: damped Newton with rank-revealing dense algebra, batches of equal clusters at once.
 
-The slow, sure solver. It serves small clusters with interpreted rows (collective variables, user
-functions) and rescues clusters on which a fast solver did not converge. Rows may depend on each other.
+The sure solver. It serves clusters with interpreted rows (collective variables, user functions, surfaces
+that have no kernel) and rescues small clusters on which a fast solver did not converge. Rows may depend
+on each other: singular directions are cut, multipliers come out with least norm.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
@@ -18,13 +20,20 @@ from kcons.solvers.outcome import Outcome
 #: Singular values of the row-normalised, mass-weighted matrix below this part of the largest are redundant.
 RANK_TOLERANCE = 1e-8
 MAX_ITERATIONS = 50
+#: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
+SPEED_TOLERANCE = 1e-11
 _HALVINGS = 30
+_EPS = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
-class _Cluster:
-    rows: IntArray  # within the subset
-    columns: IntArray  # Cartesian columns of the subset's Jacobian
+class _Batch:
+    """Clusters with the same numbers of rows and columns."""
+
+    rows: IntArray  # (n, K) within the subset
+    columns: IntArray  # (n, C) Cartesian columns of the subset
+    entries: IntArray  # where the subset's Jacobian data stand ...
+    places: IntArray  # ... and where they go in the flat (n, K, C) array
 
 
 class GeneralClusters:
@@ -51,17 +60,61 @@ class GeneralClusters:
         self.subset, self.atoms = constraint_set.subset(rows)
         self._root_w = np.repeat(np.sqrt(inverse_masses[self.atoms]), 3)
         self._scale = self.subset.scale
-        self._holonomic = self.subset.holonomic
-        incidence = self.subset.incidence
-        self._clusters: list[_Cluster] = []
+        self._held = self.subset.holonomic
+        self._batches = self._make_batches(labels)
+
+    def _make_batches(self, labels: IntArray) -> list[_Batch]:
+        indptr, indices = self.subset.incidence.indptr, self.subset.incidence.indices
         order = np.argsort(labels, kind="stable")
-        cuts = np.flatnonzero(np.diff(labels[order])) + 1
-        for members in np.split(order, cuts):
-            if len(members) == 0:
-                continue
-            touched = np.unique(incidence[members].indices)
-            columns = (3 * touched[:, None] + np.arange(3)).ravel()
-            self._clusters.append(_Cluster(np.sort(members), columns))
+        starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
+        members = [np.sort(m) for m in np.split(order, starts[1:])] if len(order) else []
+        groups: dict[tuple[int, int], list[tuple[IntArray, IntArray]]] = {}
+        for rows in members:
+            atoms = np.unique(np.concatenate([indices[indptr[r] : indptr[r + 1]] for r in rows]))
+            groups.setdefault((len(rows), len(atoms)), []).append((rows, atoms.astype(np.int64)))
+        return [self._batch(group) for group in groups.values()]
+
+    def _batch(self, group: list[tuple[IntArray, IntArray]]) -> _Batch:
+        indptr, indices = self.subset.incidence.indptr, self.subset.incidence.indices
+        rows = np.array([r for r, _ in group])
+        atoms = np.array([a for _, a in group])
+        n, k = rows.shape
+        c = 3 * atoms.shape[1]
+        place = np.zeros(self.subset.n_atoms, dtype=np.int64)
+        entries, places = [], []
+        for i in range(n):
+            place[atoms[i]] = np.arange(atoms.shape[1])
+            for j, row in enumerate(rows[i]):
+                slots = np.arange(indptr[row], indptr[row + 1])
+                entries.append((3 * slots[:, None] + np.arange(3)).ravel())
+                local = 3 * place[indices[slots]][:, None] + np.arange(3)
+                places.append(((i * k + j) * c + local).ravel())
+        columns = (3 * atoms[:, :, None] + np.arange(3)).reshape(n, c)
+        return _Batch(rows, columns, np.concatenate(entries), np.concatenate(places))
+
+    # -- pieces ---------------------------------------------------------------------------------
+
+    def _weighted(self, batch: _Batch, data: FloatArray) -> FloatArray:
+        """A M^-1/2 of each cluster, shape (n, K, C), from the data of the subset's Jacobian."""
+        n, k = batch.rows.shape
+        b = np.zeros((n, k, batch.columns.shape[1]))
+        b.reshape(-1)[batch.places] = data[batch.entries]
+        return b * self._root_w[batch.columns][:, None, :]
+
+    def _floor(self, batch: _Batch, data: FloatArray, state: FloatArray) -> FloatArray:
+        """Relative residual that rounding allows: max(1e-14, 2 eps sum |dq/dx_i| |x_i| / scale), (n, K)."""
+        gradient = np.zeros((*batch.rows.shape, batch.columns.shape[1]))
+        gradient.reshape(-1)[batch.places] = data[batch.entries]
+        sizes = np.linalg.norm(state.reshape(-1)[batch.columns].reshape(len(batch.rows), -1, 3), axis=2)
+        norms = np.linalg.norm(gradient.reshape(*batch.rows.shape, -1, 3), axis=3)
+        reach = np.einsum("nka,na->nk", norms, sizes)
+        return np.maximum(1e-14, 2 * _EPS * reach / self._scale[batch.rows])
+
+    def _sigma(self, batch: _Batch, state: FloatArray, time: float) -> FloatArray:
+        return self.subset.value(state, time)[batch.rows]
+
+    def _data(self, state: FloatArray, time: float) -> FloatArray:
+        return self.subset.jacobian(state, time).data
 
     # -- positions ------------------------------------------------------------------------------
 
@@ -78,202 +131,147 @@ class GeneralClusters:
         reference_time: float,
     ) -> Outcome:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
-        start = x_new[self.atoms]
-        directions = self._weighted(x_ref[self.atoms], reference_time)
-        state = start.copy()
-        total = np.zeros(len(self.rows))
-        worst, worst_row, most = 0.0, -1, 0
-        for cluster in self._clusters:
-            done, residual, row, iterations = self._newton(cluster, start, state, directions, time, total)
-            most = max(most, iterations)
-            if not done:
-                return Outcome(False, residual, iterations, row)
-            if residual > worst:
-                worst, worst_row = residual, row
-        change = state - start
+        state = x_new[self.atoms]
+        with np.errstate(all="ignore"):
+            reference = self._data(x_ref[self.atoms], reference_time)
+            total = np.zeros(len(self.rows))
+            moves = np.zeros_like(state)
+            worst = Outcome(True, 0.0, 0, -1)
+            for batch in self._batches:
+                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), time, total)
+                if not outcome.converged:
+                    return outcome
+                worst = max(worst, outcome, key=lambda o: o.residual)
         x_new[self.atoms] = state
         if velocities is not None:
-            velocities[self.atoms] += inv_dt * change
+            velocities[self.atoms] += inv_dt * moves
         if multipliers is not None:
             multipliers[:] = total
-        return Outcome(True, worst, most, worst_row)
+        return worst
 
     def _newton(
         self,
-        cluster: _Cluster,
-        start: FloatArray,
+        batch: _Batch,
         state: FloatArray,
-        directions: FloatArray,
+        moves: FloatArray,
+        b0: FloatArray,
         time: float,
         total: FloatArray,
-    ) -> tuple[bool, float, int, int]:
-        """Damped Newton for one cluster along fixed directions; changes `state` and `total` in place."""
-        rows, columns = cluster.rows, cluster.columns
-        held = self._holonomic[rows]
-        rows = rows[held]
-        if len(rows) == 0:
-            return True, 0.0, -1, 0
-        b0 = directions[rows][:, columns]
-        size0 = _row_norms(b0)
-        if not np.all(size0 > 0):
-            return False, np.inf, int(rows[np.argmin(size0)]), 0
-        b0 = b0 / size0[:, None]
-        root_w = self._root_w[columns]
-        scale = self._scale[rows]
-        flat, flat_start = state.reshape(-1), start.reshape(-1)
-        lam = np.zeros(len(rows))  # multiplies the normalised rows of b0
-
-        def sigma_at(trial: FloatArray) -> FloatArray:
-            flat[columns] = flat_start[columns] + root_w * (b0.T @ trial)
-            return self.subset.value(state, time)[rows]
-
-        sigma = sigma_at(lam)
-        error = _norm(sigma / scale)
-        previous = np.inf
+    ) -> Outcome:
+        """Damped Newton along fixed directions, all clusters of a batch side by side, in place."""
+        held = self._held[batch.rows]
+        size0 = np.linalg.norm(b0, axis=2)
+        bad = held & ~(size0 > 0)
+        if bad.any():
+            return _failed(batch, bad, 0)
+        unit0 = np.where(held[..., None], b0 / size0[..., None], 0.0)
+        scale = self._scale[batch.rows]
+        root_w = self._root_w[batch.columns]
+        flat, flat_moves = state.reshape(-1), moves.reshape(-1)
+        lam = np.zeros(batch.rows.shape)
+        sigma = self._sigma(batch, state, time) * held
+        error = _rms(sigma / scale)
+        done = np.zeros(len(batch.rows), dtype=bool)
+        polished = np.zeros(len(batch.rows), dtype=bool)
         for iteration in range(1, MAX_ITERATIONS + 1):
-            b = self._weighted(state, time)[rows][:, columns]
-            floor = self._floor(b, columns, rows, state, scale)
+            data = self._data(state, time)
+            b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            converged = bool(np.all(relative <= floor))
-            if converged and (error == 0.0 or error > 0.25 * previous):
-                flipped = np.einsum("ij,ij->i", b, b0) <= 0
-                if flipped.any():
-                    return False, np.inf, int(rows[np.argmax(flipped)]), iteration
-                total[rows] = lam / size0
-                k = int(np.argmax(relative))
-                return True, float(relative[k]), int(rows[k]), iteration
-            if not np.all(np.isfinite(b)):
-                return False, np.inf, int(rows[np.argmin(np.isfinite(b).all(axis=1))]), iteration
-            size = _row_norms(b)
-            if not np.all(size > 0):
-                return False, np.inf, int(rows[np.argmin(size)]), iteration
-            step = -_pseudo_solve((b @ b0.T) / size[:, None], sigma / size)
-            previous = error
-            factor = 1.0
+            settled = np.all(relative <= self._floor(batch, data, state), axis=1)
+            done |= settled & (polished | (error == 0.0))
+            if done.all():
+                turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
+                if turned.any():
+                    return _failed(batch, turned, iteration)
+                total[batch.rows] = np.where(held, lam / np.where(held, size0, 1.0), 0.0)
+                where = np.unravel_index(int(np.argmax(relative)), relative.shape)
+                return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
+            size = np.linalg.norm(b, axis=2)
+            bad = held & ~(np.isfinite(size) & (size > 0) & np.isfinite(sigma))
+            if bad.any():
+                return _failed(batch, bad, iteration)
+            safe = np.where(held, size, 1.0)
+            step = -_least_norm(np.einsum("nkc,njc->nkj", b, unit0) / safe[..., None], sigma / safe)
+            shift = root_w * np.einsum("nkc,nk->nc", unit0, step)
+            here = flat[batch.columns]
+            factor = np.where(done, 0.0, 1.0)
             for _ in range(_HALVINGS):
-                trial_sigma = sigma_at(lam + factor * step)
-                trial_error = _norm(trial_sigma / scale)
-                if trial_error < error or (converged and factor == 1.0):
+                flat[batch.columns] = here + factor[:, None] * shift
+                trial = self._sigma(batch, state, time) * held
+                trial_error = _rms(trial / scale)
+                # Clusters at their floor take one more step only if it gains.
+                worse = ~(trial_error < error) & (factor > 0)
+                if not worse.any():
                     break
-                factor *= 0.5
+                polished |= worse & settled
+                factor = np.where(worse, np.where(settled, 0.0, 0.5 * factor), factor)
             else:
-                if converged:
-                    previous = 0.0
-                    sigma = sigma_at(lam)
-                    continue
-                sigma_at(lam)
-                k = int(np.argmax(relative))
-                return False, float(relative[k]), int(rows[k]), iteration
-            if converged and not trial_error < error:
-                sigma, previous = sigma_at(lam), 0.0  # at the floor: keep the better point
-                continue
-            lam, sigma, error = lam + factor * step, trial_sigma, trial_error
-        relative = np.abs(sigma) / scale
-        k = int(np.nanargmax(relative)) if np.isfinite(relative).any() else 0
-        return False, float(relative[k]), int(rows[k]), MAX_ITERATIONS
-
-    def _floor(
-        self, b: FloatArray, columns: IntArray, rows: IntArray, state: FloatArray, scale: FloatArray
-    ) -> FloatArray:
-        """Relative residual that double precision allows: max(1e-14, 2 eps sum |dq/dx_i| |x_i| / scale)."""
-        w = self._root_w[columns]
-        gradient = np.divide(b, w, out=np.zeros_like(b), where=w > 0)
-        n = len(columns) // 3
-        sizes = np.linalg.norm(state.reshape(-1)[columns].reshape(n, 3), axis=1)
-        reach = np.linalg.norm(gradient.reshape(len(rows), n, 3), axis=2) @ sizes
-        return np.maximum(1e-14, 2 * np.finfo(float).eps * reach / scale)
+                flat[batch.columns] = here
+                return _failed(batch, held & worse[:, None], iteration, relative)
+            polished |= settled
+            lam += factor[:, None] * step
+            flat_moves[batch.columns] += factor[:, None] * shift
+            sigma, error = trial, trial_error
+        return _failed(batch, held & ~done[:, None], MAX_ITERATIONS, np.abs(sigma) / scale)
 
     def restore(self, x: FloatArray, *, time: float) -> Outcome:
-        """Bring far-off positions onto the surface in place: the nearest point in the mass metric.
-
-        First damped Gauss-Newton with the gradients at the current point, then the fixed-point iteration
-        x <- x0 + M^-1 A(x)^T lambda, which settles on the foot of the mass-weighted perpendicular.
-        """
-        start = x[self.atoms]
-        state = start.copy()
-        worst, worst_row, most = 0.0, -1, 0
-        for cluster in self._clusters:
-            rows = cluster.rows[self._holonomic[cluster.rows]]
-            if len(rows) == 0:
-                continue
-            outcome = self._gauss_newton(rows, cluster.columns, state, time)
-            if not outcome.converged:
-                return outcome
-            self._nearest(rows, cluster.columns, start, state, time)
-            outcome = self._gauss_newton(rows, cluster.columns, state, time)
-            if not outcome.converged:
-                return outcome
-            most = max(most, outcome.iterations)
-            if outcome.residual > worst:
-                worst, worst_row = outcome.residual, outcome.worst_row
+        """Bring far-off positions onto the surface in place: damped Gauss-Newton in the mass metric."""
+        state = x[self.atoms]
+        worst = Outcome(True, 0.0, 0, -1)
+        with np.errstate(all="ignore"):
+            for batch in self._batches:
+                outcome = self._gauss_newton(batch, state, time)
+                if not outcome.converged:
+                    x[self.atoms] = state  # for the report on how far it came
+                    return outcome
+                worst = max(worst, outcome, key=lambda o: o.residual)
         x[self.atoms] = state
-        return Outcome(True, worst, most, worst_row)
+        return worst
 
-    def _gauss_newton(self, rows: IntArray, columns: IntArray, state: FloatArray, time: float) -> Outcome:
-        root_w = self._root_w[columns]
-        scale = self._scale[rows]
+    def _gauss_newton(self, batch: _Batch, state: FloatArray, time: float) -> Outcome:
+        """Minimise |sigma| with the gradients at the current point; Levenberg-Marquardt where that stalls."""
+        held = self._held[batch.rows]
+        scale = self._scale[batch.rows]
+        root_w = self._root_w[batch.columns]
         flat = state.reshape(-1)
-        sigma = self.subset.value(state, time)[rows]
-        error = _norm(sigma / scale)
-        for iteration in range(1, 201):
-            b = self._weighted(state, time)[rows][:, columns]
+        sigma = self._sigma(batch, state, time) * held
+        error = _rms(sigma / scale)
+        damping = np.zeros(len(batch.rows))
+        for iteration in range(1, 4 * MAX_ITERATIONS + 1):
+            data = self._data(state, time)
+            b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            k = int(np.argmax(relative))
-            converged = bool(np.all(relative <= self._floor(b, columns, rows, state, scale)))
-            if converged and relative[k] == 0.0:
-                return Outcome(True, 0.0, iteration, int(rows[k]))
-            if not np.all(np.isfinite(b)):
-                return Outcome(False, np.inf, iteration, int(rows[np.argmin(np.isfinite(b).all(axis=1))]))
-            size = _row_norms(b)
-            if not np.all(size > 0):
-                return Outcome(False, np.inf, iteration, int(rows[np.argmin(size)]))
-            b = b / size[:, None]
-            step = -root_w * _pseudo_solve(b, sigma / size)
-            here = flat[columns].copy()
-            factor = 1.0
+            settled = np.all(relative <= self._floor(batch, data, state), axis=1)
+            if settled.all():
+                where = np.unravel_index(int(np.argmax(relative)), relative.shape)
+                return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
+            size = np.linalg.norm(b, axis=2)
+            bad = held & ~(np.isfinite(size) & (size > 0) & np.isfinite(sigma))
+            if bad.any():
+                return _failed(batch, bad, iteration)
+            safe = np.where(held, size, 1.0)
+            unit = np.where(held[..., None], b / safe[..., None], 0.0)
+            here = flat[batch.columns]
+            active = ~settled
             for _ in range(_HALVINGS):
-                flat[columns] = here + factor * step
-                trial = self.subset.value(state, time)[rows]
-                trial_error = _norm(trial / scale)
-                # A mere rounding-sized gain is a stall, not progress.
-                if trial_error < error * (1 - 1e-3 * factor):
+                step = -root_w * _damped(unit, sigma / safe, damping)
+                flat[batch.columns] = here + np.where(active[:, None], step, 0.0)
+                trial = self._sigma(batch, state, time) * held
+                trial_error = _rms(trial / scale)
+                worse = active & ~(trial_error < error)
+                if not worse.any():
                     break
-                factor *= 0.5
+                damping = np.where(worse, np.maximum(4 * damping, 1e-3), damping)
             else:
-                flat[columns] = here
-                return Outcome(converged, float(relative[k]), iteration, int(rows[k]))
+                flat[batch.columns] = here
+                return _failed(batch, held & worse[:, None], iteration, relative)
+            damping = np.where(active, 0.1 * damping, damping)
+            damping[damping < 1e-8] = 0.0
+            stalled = active & (trial_error > (1 - 1e-12) * error) & (trial_error > 1e-6)
             sigma, error = trial, trial_error
-        relative = np.abs(sigma) / scale
-        k = int(np.argmax(relative))
-        return Outcome(False, float(relative[k]), 200, int(rows[k]))
-
-    def _nearest(
-        self, rows: IntArray, columns: IntArray, start: FloatArray, state: FloatArray, time: float
-    ) -> None:
-        """Fixed-point iteration towards the nearest point; leaves `state` as it was if that fails."""
-        root_w = self._root_w[columns]
-        flat, origin = state.reshape(-1), start.reshape(-1)[columns]
-        kept = flat[columns].copy()
-        move = np.inf
-        for _ in range(100):
-            b = self._weighted(state, time)[rows][:, columns]
-            size = _row_norms(b)
-            if not (np.all(np.isfinite(b)) and np.all(size > 0)):
-                break
-            b = b / size[:, None]
-            here = flat[columns]
-            away = np.divide(here - origin, root_w, out=np.zeros_like(here), where=root_w > 0)
-            target = b @ away - self.subset.value(state, time)[rows] / size
-            flat[columns] = origin + root_w * _pseudo_solve(b, target)
-            last, move = move, _norm(flat[columns] - here)
-            if not move < 4 * max(last, 1e-300) or not np.isfinite(move):
-                break
-            if move <= 1e-15 * max(1.0, _norm(here)):
-                return
-            if move >= last and move < 1e-12 * max(1.0, _norm(here)):
-                return
-        if not np.isfinite(move) or move > 1e-9:
-            flat[columns] = kept
+            if stalled.any():
+                return _failed(batch, held & stalled[:, None], iteration, np.abs(sigma) / scale)
+        return _failed(batch, held & ~settled[:, None], 4 * MAX_ITERATIONS, np.abs(sigma) / scale)
 
     # -- tangents -------------------------------------------------------------------------------
 
@@ -287,96 +285,87 @@ class GeneralClusters:
         time: float,
     ) -> Outcome:
         """y <- y - M^-1 A^T mu with A y = rates, in place; see `Motion.project_velocities`."""
-        b = self._weighted(x[self.atoms], time)
-        local = y[self.atoms]
-        flat = local.reshape(-1)
-        mu = np.zeros(len(self.rows))
-        worst, worst_row = 0.0, -1
-        for cluster in self._clusters:
-            rows, columns = cluster.rows, cluster.columns
-            part = b[rows][:, columns]
-            size = _row_norms(part)
-            if not (np.all(np.isfinite(part)) and np.all(size > 0)):
-                bad = ~(np.isfinite(part).all(axis=1) & (size > 0))
-                return Outcome(False, np.inf, 0, int(rows[np.argmax(bad)]))
-            unit = part / size[:, None]
-            root_w = self._root_w[columns]
-            wanted = np.zeros(len(rows)) if rates is None else rates[self.rows[rows]] / size
-            scaled = np.divide(flat[columns], root_w, out=np.zeros(len(columns)), where=root_w > 0)
-            pinned = root_w == 0
-            gram = _Gram(unit)
-            # Pinned atoms move as prescribed; their part of A v is known.
-            if pinned.any():
-                jacobian = self.subset.jacobian(x[self.atoms], time)[rows][:, columns].toarray()
-                wanted = wanted - (jacobian[:, pinned] @ flat[columns][pinned]) / size
-            sum_mu = np.zeros(len(rows))
-            before = _norm(scaled)
-            for _ in range(3):
-                miss = unit @ scaled - wanted
-                step = gram.solve(miss)
-                scaled = scaled - unit.T @ step
-                sum_mu += step
-            miss = np.abs(unit @ scaled - wanted)
-            speed = max(before, _norm(scaled), _norm(wanted), np.finfo(float).tiny)
-            k = int(np.argmax(miss))
-            if not miss[k] <= 1e-11 * speed:
-                return Outcome(False, float(miss[k] / speed), 3, int(rows[k]))
-            flat[columns] = np.where(pinned, flat[columns], root_w * scaled)
-            mu[rows] = gram.least_norm(sum_mu / size, size)
-            if miss[k] * size[k] > worst:
-                worst, worst_row = float(miss[k] * size[k]), int(rows[k])
+        with np.errstate(all="ignore"):
+            data = self._data(x[self.atoms], time)
+            local = y[self.atoms]
+            flat = local.reshape(-1)
+            mu = np.zeros(len(self.rows))
+            worst = Outcome(True, 0.0, 1, -1)
+            for batch in self._batches:
+                b = self._weighted(batch, data)
+                size = np.linalg.norm(b, axis=2)
+                speeds = flat[batch.columns]
+                bad = ~(np.isfinite(size) & (size > 0)) | ~np.isfinite(speeds).all(axis=1)[:, None]
+                if bad.any():
+                    return _failed(batch, bad, 0)
+                unit = b / size[..., None]
+                root_w = self._root_w[batch.columns]
+                free = root_w > 0
+                wanted = np.zeros(size.shape) if rates is None else rates[self.rows[batch.rows]] / size
+                if not free.all():
+                    # Atoms of infinite mass move as prescribed; their part of A v is known.
+                    gradient = np.zeros(b.shape)
+                    gradient.reshape(-1)[batch.places] = data[batch.entries]
+                    wanted = wanted - np.einsum("nkc,nc->nk", gradient, np.where(free, 0.0, speeds)) / size
+                scaled = np.where(free, speeds / np.where(free, root_w, 1.0), 0.0)
+                reach = np.maximum(np.linalg.norm(scaled, axis=1), np.linalg.norm(wanted, axis=1))
+                u, s, _ = np.linalg.svd(unit, full_matrices=False)
+                inverse = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / s**2, 0.0)
+                total = np.zeros(size.shape)
+                for _ in range(3):
+                    miss = np.einsum("nkc,nc->nk", unit, scaled) - wanted
+                    step = np.einsum("nkr,nr->nk", u, inverse * np.einsum("nkr,nk->nr", u, miss))
+                    scaled = scaled - np.einsum("nkc,nk->nc", unit, step)
+                    total += step
+                miss = np.abs(np.einsum("nkc,nc->nk", unit, scaled) - wanted)
+                bad = ~(miss <= SPEED_TOLERANCE * reach[:, None])
+                if bad.any():
+                    return _failed(batch, bad, 3, miss)
+                flat[batch.columns] = np.where(free, root_w * scaled, speeds)
+                mu[batch.rows] = total / size
+                natural = miss * size
+                where = np.unravel_index(int(np.argmax(natural)), natural.shape)
+                if natural[where] >= worst.residual:
+                    worst = Outcome(True, float(natural[where]), 1, int(batch.rows[where]))
         y[self.atoms] = local
         if multipliers is not None:
             multipliers[:] = mu
-        return Outcome(True, worst, 1, worst_row)
+        return worst
 
-    # -- pieces ---------------------------------------------------------------------------------
-
-    def _weighted(self, local: FloatArray, time: float) -> FloatArray:
-        """A M^-1/2 of the subset, dense by cluster use only, shape (rows, 3 atoms)."""
-        return self.subset.jacobian(local, time).multiply(self._root_w[None, :]).toarray()
-
-    def singular_values(self, x: FloatArray, time: float = 0.0) -> list[tuple[IntArray, FloatArray]]:
-        """Per cluster: its rows and the singular values of the row-normalised mass-weighted matrix."""
-        b = self._weighted(x[self.atoms], time)
-        result = []
-        for cluster in self._clusters:
-            part = b[cluster.rows][:, cluster.columns]
-            size = _row_norms(part)
-            unit = np.divide(part, size[:, None], out=np.zeros_like(part), where=size[:, None] > 0)
-            result.append((self.rows[cluster.rows], np.linalg.svd(unit, compute_uv=False)))
-        return result
+    def rank(self, x: FloatArray, time: float) -> int:
+        """Independent rows at `x`, by singular values."""
+        data = self._data(x[self.atoms], time)
+        rank = 0
+        for batch in self._batches:
+            b = self._weighted(batch, data)
+            size = np.linalg.norm(b, axis=2, keepdims=True)
+            s = np.linalg.svd(np.divide(b, size, out=np.zeros_like(b), where=size > 0), compute_uv=False)
+            rank += int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
+        return rank
 
 
-def _norm(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+def _failed(batch: _Batch, bad: NDArray[np.bool_], iterations: int, residual: FloatArray | None = None) -> Outcome:
+    """Outcome that names the worst of the bad rows."""
+    size = np.where(bad, np.inf if residual is None else np.nan_to_num(residual, nan=np.inf), -1.0)
+    where = np.unravel_index(int(np.argmax(size)), size.shape)
+    return Outcome(False, float(size[where]), iterations, int(batch.rows[where]))
 
 
-def _row_norms(matrix: FloatArray) -> FloatArray:
-    return np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
+def _rms(values: FloatArray) -> FloatArray:
+    return np.sqrt(np.mean(values**2, axis=1))
 
 
-def _pseudo_solve(b: FloatArray, right: FloatArray) -> FloatArray:
-    """Least-norm, least-squares solution by SVD with the rank cut."""
-    u, s, vt = np.linalg.svd(b, full_matrices=False)
-    keep = s > RANK_TOLERANCE * s[0]
-    return vt[keep].T @ ((u[:, keep].T @ right) / s[keep])
+def _least_norm(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Least-norm, least-squares solutions of a stack of systems, singular directions cut."""
+    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
+    inverse = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / np.where(s > 0, s, 1.0), 0.0)
+    return np.einsum("nrk,nr->nk", vt, inverse * np.einsum("nkr,nk->nr", u, right))
 
 
-class _Gram:
-    """(B B^T)^+ through the SVD of B, factored once."""
-
-    def __init__(self, b: FloatArray) -> None:
-        u, s, _ = np.linalg.svd(b, full_matrices=True)
-        rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
-        self._u, self._s2, self._null = u[:, :rank], s[:rank] ** 2, u[:, rank:]
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        return self._u @ ((self._u.T @ right) / self._s2)
-
-    def least_norm(self, mu: FloatArray, size: FloatArray) -> FloatArray:
-        """Remove from natural multipliers what does not act: the null space of A^T in natural rows."""
-        if self._null.shape[1] == 0:
-            return mu
-        q, _ = np.linalg.qr(self._null / size[:, None])
-        return mu - q @ (q.T @ mu)
+def _damped(unit: FloatArray, right: FloatArray, damping: FloatArray) -> FloatArray:
+    """B^+ right, or (B^T B + damping)^-1 B^T right where `damping` is positive."""
+    u, s, vt = np.linalg.svd(unit, full_matrices=False)
+    plain = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / np.where(s > 0, s, 1.0), 0.0)
+    filtered = s / (s**2 + damping[:, None] * s[:, :1] ** 2)
+    weight = np.where(damping[:, None] > 0, filtered, plain)
+    return np.einsum("nrc,nr->nc", vt, weight * np.einsum("nkr,nk->nr", u, right))

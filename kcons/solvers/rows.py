@@ -18,6 +18,8 @@ from kcons.solvers.lattice import NO_LATTICE
 from kcons.solvers.outcome import Outcome
 
 MAX_ITERATIONS = 50
+#: Halvings of one Newton step by the step control.
+MAX_HALVINGS = 30
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
 SPEED_TOLERANCE = 1e-15
 _EPS = float(np.finfo(float).eps)
@@ -68,6 +70,8 @@ class SparseRows:
         self._base = np.zeros(4 * len(self._atoms))
         self._moves = np.zeros(4 * len(self._atoms))
         self._solution = np.zeros(n)
+        self._kept_moves = np.zeros(len(self._moves))
+        self._kept_solution = np.zeros(n)
         self._speeds = np.zeros(4 * len(self._atoms))
 
     def positions(
@@ -84,12 +88,16 @@ class SparseRows:
     ) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
         wanted = self._targets if targets is None else targets[self.rows]
-        failed, residual, iterations, worst = _positions(
-            x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
-            self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
-            self._parameters, self._scale, *self._pattern, *self._triples, self._gradients, self._work,
-            self._entries, self._base, self._moves, self._solution,
-        )  # fmt: skip
+        for careful in (False, True):
+            failed, residual, iterations, worst = _positions(
+                careful, x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
+                self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
+                self._parameters, self._scale, *self._pattern, *self._triples, self._gradients, self._work,
+                self._entries, self._base, self._moves, self._solution,
+                self._kept_moves, self._kept_solution,
+            )  # fmt: skip
+            if not failed:
+                break
         if failed:
             return Outcome(False, residual, iterations, worst)
         _apply(x_new, 1.0, self._atoms, self._moves)
@@ -266,9 +274,9 @@ def _backward(first, last, start, columns, slots, slot_atoms, w, ref, work, entr
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds, parameters,
+    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds, parameters,
     scale, start, columns, target_start, targets, triple, left, right, gradients, work, entries, base, moves,
-    solution,
+    solution, kept_moves, kept_solution,
 ):  # fmt: skip
     now, ref = gradients[0], gradients[1]
     side, values, floor = work[2], work[3], work[4]
@@ -296,8 +304,10 @@ def _positions(  # type: ignore[no-untyped-def]
                 reach += np.sqrt(g2 * x2)
             floor[k] = max(1e-14 * scale[k], 2 * _EPS * reach)
         error = np.inf
+        best = np.inf
         factored = False
         iteration = 0
+        halvings = 0
         while True:
             previous = error
             error, total = 0.0, 0.0
@@ -313,6 +323,17 @@ def _positions(  # type: ignore[no-untyped-def]
                     error = e
                     bad = k
                 excess = max(excess, abs(off) / floor[k])
+            if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
+                # Step control: go back half the way.
+                if halvings == MAX_HALVINGS:
+                    return True, error, iteration, bad
+                halvings += 1
+                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
+                    moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
+                for k in range(first, last):
+                    solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
+                error = previous
+                continue
             if not (total < np.inf):
                 for k in range(first, last):
                     if not (abs(side[k]) < np.inf):
@@ -322,6 +343,13 @@ def _positions(  # type: ignore[no-untyped-def]
             # Go on to the floor of the relative coordinates as long as Newton still gains.
             if excess <= 1.0 and (error <= 4e-15 or error > 0.1 * previous):
                 break
+            if careful:
+                best = total
+                halvings = 0
+                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
+                    kept_moves[a] = moves[a]
+                for k in range(first, last):
+                    kept_solution[k] = solution[k]
             ratio = error / previous
             if factored and (error * ratio <= 4e-15 or ratio < 1e-4):
                 _forward(first, last, start, columns, work, entries)
