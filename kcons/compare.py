@@ -10,6 +10,7 @@ import os
 import platform
 import signal
 import subprocess
+import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -252,13 +253,10 @@ def _all_settings(
         last = given_up or (found[-1] if found else None)
         if last is not None and last.step_seconds is not None:
             # A tighter tolerance takes at least as many steps as a looser one.
-            count = planned or last.steps
             left = budget - (perf_counter() - begun)
-            if given_up is not None or last.step_seconds * count > left:
+            if given_up is not None or last.step_seconds * (planned or last.steps) > left:
                 given_up = last
-                what = f"{count} steps of" if planned else "steps of"
-                note = f"{what} {duration(last.step_seconds)} would exceed the budget of {budget:g} s"
-                found.append(Measurement(status="not run", note=note, **common))
+                found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
                 continue
         watcher.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
         found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher, common))
@@ -306,7 +304,7 @@ def _measure(
         with _interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
             run = method.start(scene, setting)
             setup = perf_counter() - begun
-            note = _run_to_horizon(scene, run, log, deadline, watcher)
+            note = _run_to_horizon(scene, run, log, budget, deadline, watcher)
             status = "partial" if note else "ok"
     except _OverBudgetError:
         status = "partial"
@@ -314,7 +312,7 @@ def _measure(
     except Exception as error:  # whatever a peer raises is a result, and is shown
         status = "failed"
         first = (str(error).strip().splitlines() or [""])[0]
-        note = f"step {len(log.seconds) + 1}: {type(error).__name__}: {first}"[:200]
+        note = textwrap.shorten(f"step {len(log.seconds) + 1}: {type(error).__name__}: {first}", 300)
     common = dict(common, steps=len(log.seconds), setup_seconds=setup, **_costs(scene, method, run, log))
     if run is None or not log.seconds:
         return Measurement(status=status, note=note, **common)
@@ -337,7 +335,9 @@ def _measure(
     )
 
 
-def _run_to_horizon(scene: Scene, run: Run, log: _Log, deadline: float, watcher: Watcher) -> str:
+def _run_to_horizon(
+    scene: Scene, run: Run, log: _Log, budget: float, deadline: float, watcher: Watcher
+) -> str:
     """Advance to the horizon; the reason if it was given up for the budget."""
     potential, masses = scene.potential, scene.masses[:, None]
 
@@ -363,9 +363,12 @@ def _run_to_horizon(scene: Scene, run: Run, log: _Log, deadline: float, watcher:
         to_go = (scene.horizon - run.time) / (run.time - log.times[-2])
         doubtful = first and log.seconds[0] < FIRST_STEP_DOUBT
         if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
-            count = len(log.seconds)
-            return f"{count} step{'s' if count > 1 else ''} only: {duration(log.seconds[-1])} a step"
+            return _too_slow(log.seconds[-1], budget)
     return ""
+
+
+def _too_slow(step_seconds: float, budget: float) -> str:
+    return f"at {duration(step_seconds)} a step, the steps to the horizon exceed the budget of {budget:.3g} s"
 
 
 def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str, float | None]:
@@ -377,7 +380,7 @@ def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str
     elapsed = run.time / scene.units.long_time_unit
     return {
         "step_seconds": step,
-        "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds else 0.0,
+        "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds else None,
         "evaluations_per_time": log.evaluations / elapsed,
         "seconds_per_time": step * len(log.seconds) / elapsed,
     }

@@ -17,6 +17,7 @@ from ase import Atoms
 from ase.constraints import FixBondLengths, FixInternals
 from ase.md.verlet import VelocityVerlet
 from scipy.integrate import DOP853
+from scipy.linalg import qr
 
 from kcons.ase import Constraints
 from kcons.constraint_set import ConstraintSet
@@ -255,7 +256,8 @@ def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
 class _OdeRun(Run):
     def __init__(self, scene: Scene, rtol: float) -> None:
         super().__init__()
-        motion = Motion(scene.constraint_set, scene.positions)
+        # Off the surface, where this equation drifts, rows that depend on each other contradict each other.
+        motion = Motion(_independent_rows(scene), scene.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
         shape, half = scene.positions.shape, scene.positions.size
 
@@ -287,6 +289,21 @@ class _OdeRun(Run):
     @property
     def velocities(self) -> FloatArray:
         return np.asarray(self._solver.y[self._half :]).reshape(self._shape)
+
+
+def _independent_rows(scene: Scene) -> ConstraintSet:
+    """The set without the rows that others imply at the start (those last in a pivoted QR)."""
+    held = scene.constraint_set
+    if scene.motion.rank == held.n_rows:
+        return held
+    weighted = held.jacobian(scene.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
+    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][: scene.motion.rank])
+    pieces = []
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        mine = kept[(kept >= start) & (kept < start + item.n_rows)] - start
+        if len(mine):
+            pieces.append(item.select(mine))
+    return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
 
 
 class ProjectedOde(Method):

@@ -100,7 +100,7 @@ def _verdict(m: Measurement, note: int | None) -> str | Text:
         return "" if m.error is None else f"{m.error:.2e}"
     if m.status == "floor":
         return "-"
-    word = f"{m.steps} step only" if m.status == "partial" and m.steps == 1 else m.status
+    word = f"{m.steps} step{'s' if m.steps > 1 else ''} only" if m.status == "partial" and m.steps else m.status
     return Text(f"{word} [{note}]" if note else word, style="red" if m.status == "failed" else "yellow")
 
 

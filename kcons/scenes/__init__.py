@@ -26,7 +26,7 @@ class Entry:
 
 
 SCENES: Mapping[str, Entry] = {
-    "water": Entry("water", "box of rigid TIP3P water, PME forces", 216, 27, "molecules"),
+    "water": Entry("water", "box of rigid TIP3P water, PME forces", 64, 8, "molecules"),
     "chain": Entry("chain", "zigzag chain, all bonds held", 100, 20, "bonds"),
     "chain-straight": Entry("chain", "straight chain", 100, 20, "bonds", {"shape": "straight"}),
     "chain-175": Entry("chain", "nearly straight chain, 175°", 100, 20, "bonds", {"shape": "175"}),

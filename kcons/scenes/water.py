@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib import resources
 from importlib.util import find_spec
 
@@ -28,14 +29,14 @@ CUTOFF = 9.0
 SMALLEST = 8
 
 
-def build(size: int = 216, seed: int = 1, *, forces: str = "") -> Scene:
+def build(size: int = 64, seed: int = 1, *, forces: str = "") -> Scene:
     """`size` molecules.
 
     Parameters
     ----------
     size : int
-        Molecules; multiples of 216 by a cube are replicas of an equilibrated box, others are cut out of
-        one and relaxed.
+        Molecules. 64 and 216 times a cube are replicas of an equilibrated box; others are cut out of one
+        and relaxed.
     seed : int
         Of the velocities.
     forces : {'', 'openmm', 'ase'}
@@ -82,18 +83,23 @@ def build(size: int = 216, seed: int = 1, *, forces: str = "") -> Scene:
 
 def _molecules(size: int) -> tuple[FloatArray, float, bool]:
     """Positions, box, and whether they need no relaxation."""
-    with resources.files("kcons.scenes").joinpath("data/water216.npz").open("rb") as file:
-        data = np.load(file)
-        unit, length = data["positions"].astype(float).reshape(-1, 3, 3), float(data["box"])
-    copies = int(np.ceil((size / len(unit)) ** (1 / 3) - 1e-9))
-    shifts = length * np.stack(np.meshgrid(*[np.arange(copies)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    all_of_them = (unit[None] + shifts[:, None, None, :]).reshape(-1, 3, 3)
-    if len(all_of_them) == size:
-        return all_of_them.reshape(-1, 3), copies * length, True
+    for unit, length in (_equilibrated(64), _equilibrated(216)):
+        copies = math.ceil((size / len(unit)) ** (1 / 3) - 1e-9)
+        shifts = length * np.stack(np.meshgrid(*[np.arange(copies)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        replicas = (unit[None] + shifts[:, None, None, :]).reshape(-1, 3, 3)
+        if len(replicas) == size:
+            return replicas.reshape(-1, 3), copies * length, True
     # The corner cube that holds `size` molecules; those at its faces do not fit their new images.
-    order = np.argsort(all_of_them[:, 0].max(axis=1), kind="stable")[:size]
+    order = np.argsort(replicas[:, 0].max(axis=1), kind="stable")[:size]
     box = length * (size / len(unit)) ** (1 / 3)
-    return all_of_them[np.sort(order)].reshape(-1, 3), box, False
+    return replicas[np.sort(order)].reshape(-1, 3), box, False
+
+
+def _equilibrated(size: int) -> tuple[FloatArray, float]:
+    """A box that ran 100 ps at 300 K: positions, shape (size, 3, 3), and its length."""
+    with resources.files("kcons.scenes").joinpath(f"data/water{size}.npz").open("rb") as file:
+        data = np.load(file)
+        return data["positions"].astype(float).reshape(size, 3, 3), float(data["box"])
 
 
 def _relaxed(motion: Motion, potential: Potential, x: FloatArray, seed: int) -> FloatArray:

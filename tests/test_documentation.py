@@ -1,0 +1,76 @@
+"""Every snippet in README.md and docs/, and every example, runs as it stands."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kcons import cli
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def snippets(language):
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for match in FENCE.finditer(text):
+            if match.group(1) == language:
+                line = text.count("\n", 0, match.start()) + 1
+                found.append(pytest.param(page, match.group(2), id=f"{page.name}:{line}"))
+    return found
+
+
+def python_pages():
+    """The Python snippets of one page continue each other."""
+    pages = {}
+    for parameter in snippets("python"):
+        page, code = parameter.values
+        pages.setdefault(page, []).append(code)
+    return [pytest.param("\n".join(codes), id=page.name) for page, codes in pages.items()]
+
+
+@pytest.mark.parametrize("code", python_pages())
+def test_python_snippets_run(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
+
+
+@pytest.mark.parametrize(("page", "text"), snippets("console"))
+def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    commands = [line[2:] for line in text.splitlines() if line.startswith("$ ")]
+    assert commands, f"a console block in {page.name} has no line that starts with '$ '"
+    for command in commands:
+        program, *arguments = shlex.split(command, comments=True)
+        assert program == "kcons", f"only kcons commands can be tested, not {command!r}"
+        assert cli.main(arguments) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
+def test_example_runs(script, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    result = subprocess.run(
+        [sys.executable, "-W", "error", str(script)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip()
+
+
+def test_pages_and_examples_were_found():
+    assert ROOT / "docs" / "compare.md" in PAGES
+    assert EXAMPLES
