@@ -25,6 +25,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit status: 0, 2 for an error that the user can mend, 130 when interrupted."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
+    if chosen.version:
+        from importlib.metadata import version
+
+        print(f"kcons {version('kcons')}")
+        return 0
     if chosen.command is None:
         parser.print_help()
         return 0
@@ -41,7 +46,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
-    parser.set_defaults(command=None)
     commands = parser.add_subparsers(title="commands", dest="command")
 
     scene_help = "one of the built-in scenes; --list shows them"

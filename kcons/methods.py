@@ -342,4 +342,6 @@ def chosen(names: Iterable[str] | None = None) -> list[Method]:
         if name not in METHODS:
             raise InputError(f"there is no method {name!r}; there are {', '.join(METHODS)}", item="methods")
         picked.append(METHODS[name])
+    if not picked:
+        raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
     return picked

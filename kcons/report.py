@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -147,7 +148,7 @@ def plot(comparison: Comparison, path: Path) -> None:
     for axes, cost in ((left, "evaluations_per_time"), (right, "seconds_per_time")):
         for name in dict.fromkeys(m.method for m in comparison.measurements):
             colour, marker = STYLES.get(name, ("black", "x"))
-            done = [m for m in comparison.of(name) if m.error and getattr(m, cost)]
+            done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and getattr(m, cost)]
             if done:
                 axes.loglog(
                     [getattr(m, cost) for m in done],
@@ -218,6 +219,6 @@ def _plain(value: Any) -> Any:
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
-    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -43,7 +43,9 @@ def test_every_scene_is_covered_here():
 def test_start_is_on_the_constraints(name):
     scene = small(name)
     sigma, tangency = scene.residuals(scene.positions, scene.velocities)
-    assert np.all(np.abs(scene.constraint_set.value(scene.positions)) <= scene.constraint_set.tolerance(scene.positions))
+    assert np.all(
+        np.abs(scene.constraint_set.value(scene.positions)) <= scene.constraint_set.tolerance(scene.positions)
+    )
     assert sigma < 1e-13
     assert tangency < 1e-14
 
@@ -85,9 +87,7 @@ def test_converged_reference_against_an_independent_integrator(name):
     def rate(_, y):
         x, v = y.reshape(2, *shape)
         f = scene.potential.forces(x)
-        a = projection.acceleration(
-            held.jacobian(x).toarray(), masses, f.ravel(), held.acceleration_target(x, v)
-        )
+        a = projection.acceleration(held.jacobian(x).toarray(), masses, f.ravel(), held.acceleration_target(x, v))
         return np.concatenate([v.ravel(), a])
 
     start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])

@@ -1,0 +1,143 @@
+"""The command `kcons`: what it writes, and how it says that something is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from kcons import cli
+
+
+def run(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+def test_compare_writes_table_plot_and_json(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("compare", "chain", "--size", 4, "--methods", "rattle,verlet", "--dt", "10,5", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert "chain of 4 rigid bonds" in printed.out
+    assert "kcons RATTLE" in printed.out
+    assert "error: root-mean-square distance" in printed.out
+    assert f"wrote {out / 'compare.json'}" in printed.out
+    assert "reference solution" in printed.err  # progress goes to the other stream
+    data = json.loads((out / "compare.json").read_text())
+    assert data["scene"]["atoms"] == 5
+    assert data["scene"]["rank"] == 4
+    assert data["settings"] == {
+        "methods": ["rattle", "verlet"],
+        "budget_seconds": 20.0,
+        "size": 4,
+        "seed": 1,
+        "quick": False,
+        "dt": [10.0, 5.0],
+    }
+    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [
+        ("rattle", 10.0),
+        ("rattle", 5.0),
+        ("verlet", 10.0),
+        ("verlet", 5.0),
+    ]
+    assert data["observed_order"]["rattle"] == pytest.approx(2.0, abs=0.1)
+    assert data["environment"]["cpu"]
+    assert "max |Av|" in (out / "compare.txt").read_text(encoding="utf-8")
+    assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_default_folder_is_named_after_the_scene(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
+    assert (tmp_path / "compare-sphere" / "compare.json").exists()
+    data = json.loads((tmp_path / "compare-sphere" / "compare.json").read_text())
+    assert data["settings"]["quick"] is True
+    assert data["settings"]["budget_seconds"] == 5.0
+    assert data["scene"]["atoms"] == 2
+
+
+def test_seed_changes_the_trajectory(tmp_path, capsys):
+    errors = []
+    for seed in (1, 1, 2):
+        out = tmp_path / "out"
+        assert run("compare", "chain", "--size", 3, "--methods", "rattle", "--seed", seed, "--out", out) == 0
+        errors.append(json.loads((out / "compare.json").read_text())["measurements"][0]["error"])
+    assert errors[0] == errors[1] != errors[2]
+
+
+def test_plan_prints_clusters_rank_and_solver(capsys):
+    assert run("plan", "chain", "--size", 6) == 0
+    text = capsys.readouterr().out
+    assert "chain of 6 rigid bonds" in text
+    assert "rank 6" in text
+    assert "solver" in text
+
+
+@pytest.mark.parametrize("command", ["compare", "plan"])
+def test_list(command, capsys):
+    assert run(command, "--list") == 0
+    text = capsys.readouterr().out
+    for word in ("water", "chain-straight", "ethanol", "rattle", "dop853"):
+        assert word in text
+
+
+def test_without_command_prints_help(capsys):
+    assert run() == 0
+    assert "compare" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out.startswith("kcons ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["compare"], "name a scene: water"),
+        (["compare", "wat"], "there is no scene 'wat'"),
+        (["plan", "wat"], "there is no scene 'wat'"),
+        (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
+        (["compare", "chain", "--methods", ","], "no method"),
+        (["compare", "chain", "--size", "0"], "at least one bond"),
+        (["compare", "chain", "--size", "3", "--dt", "3"], "does not divide the horizon"),
+        (["compare", "chain", "--size", "3", "--dt", ","], "--dt is empty"),
+        (["compare", "chain", "--seed", "-1"], "non-negative"),
+        (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
+        (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
+    ],
+)
+def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("kcons: ")]
+    assert len(lines) == 1
+    assert text in lines[0]
+    assert not list(tmp_path.glob("**/compare.json"))
+
+
+@pytest.mark.parametrize("arguments", [["frobnicate"], ["compare", "chain", "--dt", "a,b"], ["compare", "--size", "x"]])
+def test_unreadable_arguments_leave_with_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        run(*arguments)
+    assert left.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_interrupt(monkeypatch, capsys):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_scene", stop)
+    assert run("plan", "chain") == 130
+    assert capsys.readouterr().err == "kcons: interrupted\n"
+
+
+def test_importing_the_command_imports_no_host():
+    code = (
+        "import sys, kcons.cli; "
+        "print([m for m in ('ase', 'openmm', 'matplotlib', 'scipy', 'numba', 'rich') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,265 @@
+"""What `compare` measures is right, and what goes wrong in a method is shown."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kcons import compare, methods, scenes
+from kcons.errors import ConvergenceError, InputError
+from kcons.steppers import State, System, run
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return scenes.build("chain", 4)
+
+
+@pytest.fixture(scope="module")
+def result(chain):
+    return compare.compare(chain, budget=30)
+
+
+@pytest.fixture(scope="module")
+def spheres():
+    return compare.compare(scenes.build("sphere-pendulum", 2), budget=30)
+
+
+def test_all_methods_are_there(result):
+    assert list(dict.fromkeys(m.method for m in result.measurements)) == list(methods.METHODS)
+    assert {m.status for m in result.measurements} == {"ok", "floor"}
+
+
+@pytest.mark.parametrize("method", ["rattle", "ase-kcons", "ase-bonds"])
+def test_error_falls_with_the_square_of_the_step(result, method):
+    errors = [m.error for m in result.of(method)]
+    assert len(errors) == 4
+    assert errors == sorted(errors, reverse=True)
+    assert result.observed_order(method) == pytest.approx(2.0, abs=0.05)
+
+
+def test_rattle_is_the_same_in_the_core_and_in_ase(result):
+    for core, hosted in zip(result.of("rattle"), result.of("ase-kcons"), strict=True):
+        assert hosted.error == pytest.approx(core.error, rel=1e-6)
+        assert hosted.evaluations_per_time == pytest.approx(core.evaluations_per_time)
+
+
+def test_error_is_the_distance_from_the_reference(chain, result):
+    # By hand, for one step size.
+    dt = chain.time_steps[1]
+    system = System(chain.motion, chain.potential.forces)
+    state = run(system, State(chain.positions, chain.velocities), dt, round(chain.horizon / dt))
+    wanted = np.sqrt(np.mean(np.sum((state.positions - chain.reference().positions) ** 2, axis=1)))
+    assert result.of("rattle")[1].error == pytest.approx(wanted, rel=1e-9)
+
+
+def test_costs_of_fixed_steps(chain, result):
+    for m in result.of("rattle"):
+        assert m.steps == m.steps_planned == round(result.scene["horizon"] / m.setting)
+        # One force evaluation a step; a picosecond has 1000/dt steps.
+        assert m.evaluations_per_time == pytest.approx(1000 / m.setting)
+        assert m.seconds_per_time == pytest.approx(m.step_seconds * 1000 / m.setting)
+        assert 0 < m.constraint_seconds < m.step_seconds
+
+
+def test_residuals_tell_the_methods_apart(spheres):
+    for m in spheres.of("rattle"):
+        assert m.constraint_residual < 1e-13
+        assert m.velocity_residual < 1e-14
+    # The projected equation of motion drifts off the surface.
+    drift = [m.constraint_residual for m in spheres.of("dop853")]
+    assert drift[0] > 1e-5
+    assert drift[-1] > 1e-12
+    assert drift == sorted(drift, reverse=True)
+
+
+def test_adaptive_method_gets_better_with_its_tolerance(spheres):
+    found = spheres.of("dop853")
+    assert [m.error for m in found] == sorted((m.error for m in found), reverse=True)
+    assert [m.evaluations_per_time for m in found] == sorted(m.evaluations_per_time for m in found)
+    assert found[-1].error < 1e-7
+    assert spheres.observed_order("dop853") is None
+
+
+def test_floor_states_no_error(result):
+    for name in ("verlet", "ase-verlet"):
+        (floor, *_) = result.of(name, "floor")
+        assert floor.error is None
+        assert floor.step_seconds > 0
+
+
+def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
+    (refused,) = spheres.of("ase-bonds", "not run")
+    assert "sphere" in refused.note
+    assert spheres.of("rattle")
+
+
+def test_energy_slope_is_the_fit():
+    scene = scenes.build("sphere", 2)
+    log = compare._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
+    slope, error = compare._energy_slope(scene, log)
+    assert slope == pytest.approx(2.0 / scene.motion.degrees_of_freedom)
+    assert error == pytest.approx(0.0, abs=1e-12)
+    log.energies = [0.0, 1.0, 0.0, 1.0, 0.0]
+    slope, error = compare._energy_slope(scene, log)
+    assert abs(slope) < 2 * error
+
+
+# -- budget and failures ----------------------------------------------------------------------------
+
+
+class Slow(methods.CoreRattle):
+    """A peer whose every step takes a while."""
+
+    pause = 0.6
+
+    def start(self, scene, setting):
+        started = super().start(scene, setting)
+        advance, pause = started.advance, self.pause
+
+        def slowly():
+            time.sleep(pause)
+            advance()
+
+        started.advance = slowly
+        return started
+
+
+class Broken(methods.CoreRattle):
+    def start(self, scene, setting):
+        raise ConvergenceError("did not converge, as an example\nwith more lines")
+
+
+def compare_with(monkeypatch, method, chain, **options):
+    monkeypatch.setattr(methods, "METHODS", {method.name: method})
+    return compare.compare(chain, **options)
+
+
+def test_method_over_budget_is_stopped_after_one_step(monkeypatch, chain):
+    result = compare_with(monkeypatch, Slow("slow", "slow one"), chain, budget=1.5)
+    first, *others = result.measurements
+    assert first.status == "partial"
+    assert first.steps == 1
+    assert first.error is None
+    assert first.step_seconds >= 0.6
+    assert "exceed the budget of 1.5 s" in first.note
+    assert first.constraint_residual < 1e-13  # the state after that step is known
+    assert [m.status for m in others] == ["not run"] * 3
+
+
+def test_method_that_does_not_come_back_is_interrupted(monkeypatch, chain):
+    method = Slow("slow", "slow one")
+    monkeypatch.setattr(Slow, "pause", 30.0)
+    begun = time.perf_counter()
+    (only,) = compare_with(monkeypatch, method, chain, budget=0.2).measurements
+    assert time.perf_counter() - begun < 20
+    assert only.status == "partial"
+    assert only.steps == 0
+    assert "step 1 was not done" in only.note
+
+
+def test_failure_of_a_method_is_a_result(monkeypatch, chain):
+    result = compare_with(monkeypatch, Broken("broken", "broken one"), chain)
+    assert {m.status for m in result.measurements} == {"failed"}
+    assert result.measurements[0].note == "step 1: ConvergenceError: did not converge, as an example"
+
+
+def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
+    class Runaway(methods.CoreRattle):
+        def start(self, scene, setting):
+            started = super().start(scene, setting)
+            advance = started.advance
+
+            def away():
+                advance()
+                started._state = replace(started._state, positions=np.full_like(scene.positions, np.nan))
+
+            started.advance = away
+            return started
+
+    result = compare_with(monkeypatch, Runaway("away", "runaway"), chain)
+    assert {m.status for m in result.measurements} == {"failed"}
+    assert not any(m.error for m in result.measurements)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"methods": ["shake"]}, "there is no method 'shake'; there are rattle"),
+        ({"budget": 0}, "positive number of seconds"),
+        ({"budget": float("nan")}, "positive number of seconds"),
+    ],
+)
+def test_bad_arguments(chain, options, text):
+    with pytest.raises(InputError, match=text):
+        compare.compare(chain, **options)
+
+
+# -- environment ------------------------------------------------------------------------------------
+
+
+def test_environment_names_machine_and_versions():
+    found = compare.environment()
+    assert found["cpu"]
+    assert found["cores"] >= 1
+    assert found["versions"]["numpy"] == np.__version__
+    assert found["commit"] is None or len(found["commit"].rstrip("+")) == 40
+
+
+def test_stopwatch_counts_nested_calls_once():
+    class Object:
+        def outer(self):
+            self.inner()
+
+        def inner(self):
+            time.sleep(0.01)
+
+    watch, thing = methods.Stopwatch(), Object()
+    watch.watch(thing, ("outer", "inner", "absent"))
+    start = time.perf_counter()
+    thing.outer()
+    elapsed = time.perf_counter() - start
+    assert 0.01 <= watch.seconds <= elapsed
+
+
+def test_watcher_hears_of_everything(chain):
+    class Listener(compare.Watcher):
+        def __init__(self):
+            self.heard, self.open = [], 0
+
+        def begin(self, what, total):
+            self.heard.append(what)
+            self.open += 1
+
+        def advance(self, done):
+            assert self.open == 1
+
+        def end(self):
+            self.open -= 1
+
+    listener = Listener()
+    compare.compare(chain, methods=["rattle"], watcher=listener)
+    assert listener.open == 0
+    assert listener.heard[0].startswith("compiling kernels")
+    assert listener.heard[1] == "reference solution"
+    assert len(listener.heard) == 2 + len(chain.time_steps)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0.00 ns"),
+        (1.5e-8, "15.0 ns"),
+        (9.999e-4, "1.00 ms"),
+        (1.234e-3, "1.23 ms"),
+        (0.5, "500 ms"),
+        (12.5, "12.5 s"),
+        (1200.0, "20 min"),
+        (36000.0, "10.0 h"),
+    ],
+)
+def test_duration(seconds, text):
+    assert compare.duration(seconds) == text
