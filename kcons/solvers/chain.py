@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.groups import NO_NUMBERS, NO_POINTS, lattice_kind
+from kcons.solvers.groups import NO_NUMBERS, NO_POINTS, aligned, lattice_kind
 from kcons.solvers.outcome import Outcome
 from kcons.solvers.simd import WIDTH
 from kcons.solvers.strips import SHORT, long_strip, short_strip, whole_slots
@@ -57,8 +57,9 @@ class Chains:
         self._owned = owned
         self._full = owned.reshape(-1, WIDTH).all(axis=1)
         self._rows = row.astype(np.uint32)
-        self._present = present.astype(np.float64)
-        self._weights = np.where(owned, inverse[place], 0.0)
+        self._present, self._weights = aligned(len(place)), aligned(len(place))
+        self._present[:] = present
+        self._weights[:] = np.where(owned, inverse[place], 0.0)
         self._wholes = np.array([whole_slots(strip[2]) for strip in strips]) + self._starts[:-1]
         self._longest = max(lanes) // WIDTH
         self._work = NO_NUMBERS
@@ -70,15 +71,15 @@ class Chains:
         references: NDArray[np.float64],
         velocities: NDArray[np.float64] | None,
         inv_dt: float,
-        tangent: bool,
+        tangent: bool | None,
         given: NDArray[np.float64],
         lattice: NDArray[np.float64] | None,
         multipliers: NDArray[np.float64] | None,
     ) -> Outcome:
         if not len(self._work):
-            self._work = np.empty(self._longest * SLOT)
+            self._work = aligned(self._longest * SLOT)
             # The last strip is written once everything is known: it needs no undoing.
-            self._undo = np.empty(6 * self._starts[-2])
+            self._undo = aligned(6 * int(self._starts[-2]))
         cell, kind = lattice_kind(lattice)
         return Outcome(
             *project(
@@ -135,7 +136,7 @@ class Chains:
             Nothing has changed where it is not converged.
         """
         given = self.lengths if lengths is None else lengths
-        return self._run(x_new, x_ref, velocities, inv_dt, False, given, lattice, multipliers)
+        return self._run(x_new, x_ref, velocities, inv_dt, None, given, lattice, multipliers)
 
     def tangents(
         self,

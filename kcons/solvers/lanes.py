@@ -21,6 +21,7 @@ from kcons.solvers.groups import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
+    aligned,
     dot,
     lane_tables,
     lattice_kind,
@@ -402,7 +403,7 @@ class SmallClusters:
 
     def _undo_room(self) -> NDArray[np.float64]:
         if not len(self._undo):
-            self._undo = np.empty(6 * len(self._atoms))
+            self._undo = aligned(6 * len(self._atoms))
         return self._undo
 
     def _outcome(self, ok: bool, residual: float, iterations: int, row: int) -> Outcome:

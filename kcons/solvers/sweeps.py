@@ -138,14 +138,14 @@ def _solve(
     if kind != OPEN:
         zx, zy, zz = minimum_image(zx, zy, zz, cell, kind)
         ux, uy, uz = minimum_image(ux, uy, uz, cell, kind)
-        if not tangent:
+        if tangent is None:
             cx, cy, cz = minimum_image(cx, cy, cz, cell, kind)
             vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
     store_triple(work, seam + _S, zx, zy, zz)
     store_triple(work, seam + _R, cx, cy, cz)
     count, scale = real, dot(cx, cy, cz, cx, cy, cz)
     seam_target = gather(given, rows, end, 0) * real if driven else zero
-    if tangent:
+    if tangent is not None:
         scale = scale + seam_target * seam_target
         seam_target = seam_target * square_root(dot(zx, zy, zz, zx, zy, zz))
     else:
@@ -186,7 +186,7 @@ def _solve(
                 target = gather(given, rows, atom, 0) * real if driven else zero
                 count = count + real
                 scale = scale + (dot(rx, ry, rz, rx, ry, rz) + target * target)
-                target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent else target)
+                target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
                 store_triple(work, slot + _S, sx, sy, sz)
                 store(work, slot + _TARGET, target)
                 if row + 1 < m:
@@ -198,7 +198,7 @@ def _solve(
                     vx, vy, vz = cx - dx, cy - dy, cz - dz
                     if kind != OPEN:
                         nx, ny, nz = minimum_image(nx, ny, nz, cell, kind)
-                        if not tangent:
+                        if tangent is None:
                             vx, vy, vz = minimum_image(vx, vy, vz, cell, kind)
             else:
                 rx, ry, rz = load_triple(work, slot + _R)
@@ -220,7 +220,7 @@ def _solve(
             oz = w_exit * product_difference(nz, then, sz, now)
             rx, ry, rz = rx + (ex - ox), ry + (ey - oy), rz + (ez - oz)
             store_triple(work, slot + _R, rx, ry, rz)
-            if tangent:
+            if tangent is not None:
                 error, inner, positive, ratio = _rate_error(rx, ry, rz, sx, sy, sz, target, real)
                 rx, ry, rz = sx, sy, sz
             else:
@@ -259,7 +259,7 @@ def _solve(
         elif iteration > 2:
             store(work, seam + _LATER, load(work, seam + _LATER) + shared)
         real = load(present, end)
-        if tangent:
+        if tangent is not None:
             error, inner, positive, ratio = _rate_error(rx, ry, rz, zx, zy, zz, seam_target, real)
             rx, ry, rz = zx, zy, zz
         else:
@@ -268,7 +268,7 @@ def _solve(
         total = total + ratio
         peak_slot = where_greater(ratio, peak, splat(float(seam)), peak_slot)
         peak = where_greater(ratio, peak, ratio, peak)
-        if opening and tangent:
+        if tangent is not None and opening:
             limit = limit * np.sqrt(lane_sum(scale, small) / lane_sum(count, small))
         # Comparisons drop NaN, sums keep it.
         finite = all_within(total, 1e300)
@@ -302,7 +302,7 @@ def _solve(
             inner_product = 0.0
             for axis in range(0, 3 * WIDTH, WIDTH):
                 s, r = work[at + _S + axis], work[at + _R + axis]
-                inner_product += s * s + 0.0 * r if tangent else s * r
+                inner_product += s * s + 0.0 * r if tangent is not None else s * r
             if present[first + k] > 0.0 and not inner_product > 0.0:
                 worst, place, lane = np.inf, k // WIDTH, k % WIDTH
                 break
@@ -408,12 +408,16 @@ def project(
     work,
     undo,
 ):
-    """Project one strip after another; `tangent` says what `points` are."""
+    """Project one strip after another.
+
+    `tangent` is None where `points` are positions, and anything else where
+    they are velocities: a kernel is compiled for each.
+    """
     small = np.empty(8 * WIDTH)
     cell = lattice_numbers(lattice)
     worst, worst_row, most = 0.0, -1, 0
     last = starts.shape[0] - 2
-    limit = TANGENT_TOLERANCE if tangent else POSITION_TOLERANCE
+    limit = TANGENT_TOLERANCE if tangent is not None else POSITION_TOLERANCE
     for strip in range(last + 1):
         first, n_slots = starts[strip], (starts[strip + 1] - starts[strip]) // WIDTH
         ok, residual, place, solves = _solve(
@@ -441,5 +445,5 @@ def project(
                     x, y, z = gather_points(velocities, atoms, at)
                 store_triple(undo, 6 * at + 3 * WIDTH, x, y, z)
         if multipliers.shape[0] > 0:
-            _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent else 1.0)
+            _report(multipliers, rows, present, work, first, n_slots, solves, -1.0 if tangent is not None else 1.0)
     return True, worst, most, worst_row

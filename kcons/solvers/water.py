@@ -19,6 +19,7 @@ from kcons.solvers.groups import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
+    aligned,
     dot,
     lane_tables,
     lattice_kind,
@@ -313,7 +314,7 @@ class RigidTriangles:
 
     def _undo_room(self) -> NDArray[np.float64]:
         if not len(self._undo):
-            self._undo = np.empty(18 * len(self._slots) + 1)
+            self._undo = aligned(18 * len(self._slots))
         return self._undo
 
     def positions(
