@@ -9,7 +9,6 @@ from typing import Literal
 import numba as nb
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from kcons.constraint_set import ConstraintSet

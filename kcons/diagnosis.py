@@ -52,9 +52,7 @@ class Report:
         return "\n".join(lines)
 
 
-def make_report(
-    constraint_set: ConstraintSet, plan: Plan, x: FloatArray, v: FloatArray | None, time: float
-) -> Report:
+def make_report(constraint_set: ConstraintSet, plan: Plan, x: FloatArray, v: FloatArray | None, time: float) -> Report:
     """Evaluate the set at `x` (and `v`)."""
     sigma = np.abs(constraint_set.value(x, time))
     worst = int(np.argmax(sigma / constraint_set.scale)) if len(sigma) else -1
@@ -121,11 +119,14 @@ def unusable(
     row = _global_row(outcome, solver)
     if error is not None or row < 0:
         return error
+    return _coincident(constraint_set, numbers, list(arrays.values())[-1], row)
+
+
+def _coincident(constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, row: int) -> KconsError | None:
     item, k = constraint_set.locate(row)
     if item.family != "Distance":
         return None
-    reference = list(arrays.values())[-1]
-    r = constraint_set.gather(item.select([k]), reference)[0]
+    r = constraint_set.gather(item.select([k]), x)[0]
     if np.linalg.norm(r[1] - r[0]) > 0:
         return None
     i, j = _named(numbers, item.atoms[k])
@@ -134,11 +135,13 @@ def unusable(
     )
 
 
-def not_finite_rows(
+def undefined_row(
     constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray], row: int
 ) -> KconsError:
-    """The error for a right-hand side b that is not finite."""
+    """The error for a right-hand side b that is not finite; the last of `arrays` holds positions."""
     error = _bad_array(constraint_set, numbers, arrays)
+    if error is None:
+        error = _coincident(constraint_set, numbers, list(arrays.values())[-1], row)
     name, atoms = _row_label(constraint_set, numbers, row)
     return error or SingularGeometryError(
         f"the curvature of row {name} is undefined at these positions", rows=[row], atoms=atoms

@@ -29,6 +29,8 @@ MAX_RESCUES = 20
 DENSE_ROWS = 1500
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400
+#: More Newton iterations than a time step of any use takes: the start was far off.
+MANY_ITERATIONS = 6
 #: Rounds of the search for the nearest point on the constraints.
 NEAREST_ROUNDS = 200
 
@@ -209,8 +211,28 @@ class Motion:
                     if velocities is not None and saved[1] is not None:
                         np.copyto(velocities, saved[1])
                     raise error or diagnosis.positions_failed(self._local, self._numbers, outcome, solver, plan)
+            if outcome.iterations > MANY_ITERATIONS:
+                # A far start leaves the rounding of its size; once more from the near end removes it.
+                self._polish(solver, x, ref, targets, velocities, inv_dt, lam, time, reference_time)
             if multipliers is not None and lam is not None:
                 multipliers[solver.rows] = lam
+
+    def _polish(
+        self,
+        solver: ClusterSolver,
+        x: FloatArray,
+        ref: FloatArray,
+        targets: FloatArray | None,
+        velocities: FloatArray | None,
+        inv_dt: float,
+        lam: FloatArray | None,
+        time: float,
+        reference_time: float,
+    ) -> None:
+        more = None if lam is None else np.empty(len(lam))
+        again = solver.positions(x, ref, targets, self._local.lattice, velocities, inv_dt, more, time, reference_time)
+        if again.converged and lam is not None and more is not None:
+            lam += more
 
     def _rescue(
         self,
@@ -264,9 +286,7 @@ class Motion:
             )
         return self._rescuers[label]
 
-    def restore_positions(
-        self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
-    ) -> FloatArray:
+    def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
         """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
 
         Damped Newton with the gradients at the current point; for initial positions, not for time steps.
@@ -423,9 +443,7 @@ class Motion:
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
-    def _accelerate(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def _accelerate(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> tuple[FloatArray, FloatArray]:
         here = _positions(x, self.n_atoms, "positions")
         speed = _positions(v, self.n_atoms, "velocities")
         force = _positions(f, self.n_atoms, "forces")
@@ -433,10 +451,11 @@ class Motion:
             a = force / self.masses[:, None]
         local_x, local_v = (here, speed) if self._atoms is None else (here[self._atoms], speed[self._atoms])
         local_a = a if self._atoms is None else a[self._atoms]
-        b = self._local.acceleration_target(local_x, local_v, time)
+        with np.errstate(all="ignore"):
+            b = self._local.acceleration_target(local_x, local_v, time)
         if not np.all(np.isfinite(b)):
-            arrays = {"positions": local_x, "velocities": local_v}
-            raise diagnosis.not_finite_rows(self._local, self._numbers, arrays, int(np.argmin(np.isfinite(b))))
+            arrays = {"velocity": local_v, "position": local_x}
+            raise diagnosis.undefined_row(self._local, self._numbers, arrays, int(np.argmin(np.isfinite(b))))
         mu = np.zeros(self._local.n_rows)
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:

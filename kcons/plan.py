@@ -317,8 +317,8 @@ def _rank_of_small(
     root_w = np.sqrt(inverse_masses[shape.atoms[0]])
     b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
     b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
-    b = b.reshape(n, k, -1)
-    size = np.linalg.norm(b, axis=2, keepdims=True)
-    b = np.divide(b, size, out=np.zeros_like(b), where=size > 0)
-    s = np.linalg.svd(b, compute_uv=False)
+    flat = b.reshape(n, k, -1)
+    size = np.linalg.norm(flat, axis=2, keepdims=True)
+    unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
+    s = np.linalg.svd(unit, compute_uv=False)
     return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))

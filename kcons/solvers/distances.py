@@ -178,7 +178,9 @@ def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _factor(first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots):  # type: ignore[no-untyped-def]
+def _factor(  # type: ignore[no-untyped-def]
+    first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
+):
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
 
     `state` holds r, s, the accumulated change of the pivot, and the right-hand side; `entries` the upper
@@ -197,7 +199,8 @@ def _factor(first, last, start, columns, target_start, targets, couplings, ends,
             l = columns[p]
             c = couplings[p]
             up = c * (rx * state[8 * l + 3] + ry * state[8 * l + 4] + rz * state[8 * l + 5]) + entries[4 * p + 2]
-            low = (c * (sx * state[8 * l] + sy * state[8 * l + 1] + sz * state[8 * l + 2]) + entries[4 * p + 3]) * inverse
+            low = c * (sx * state[8 * l] + sy * state[8 * l + 1] + sz * state[8 * l + 2]) + entries[4 * p + 3]
+            low *= inverse
             entries[4 * p] = up
             entries[4 * p + 1] = low
             entries[4 * p + 2] = 0.0
@@ -215,7 +218,9 @@ def _factor(first, last, start, columns, target_start, targets, couplings, ends,
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _factor_symmetric(first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots):  # type: ignore[no-untyped-def]
+def _factor_symmetric(  # type: ignore[no-untyped-def]
+    first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
+):
     """`_factor` for r = s: half the work."""
     for k in range(first, last):
         sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
@@ -360,9 +365,7 @@ def _positions(  # type: ignore[no-untyped-def]
             if factored and (error * ratio <= LENGTH_TOLERANCE or ratio < 1e-4):
                 _forward(first, last, start, columns, state, entries)
             else:
-                _factor(
-                    first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
-                )
+                _factor(first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots)
                 factored = True
             _backward(first, last, start, columns, ends, w, state, entries, pivots, moves, solution)
             iteration += 1
@@ -505,8 +508,8 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
 def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def]
     """Multipliers of |r| - d instead of s . r."""
     for k in range(len(solution)):
-        s2 = state[8 * k + 3] * state[8 * k + 3] + state[8 * k + 4] * state[8 * k + 4] + state[8 * k + 5] * state[8 * k + 5]
-        multipliers[k] = sign * solution[k] * np.sqrt(s2)
+        sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
+        multipliers[k] = sign * solution[k] * np.sqrt(sx * sx + sy * sy + sz * sz)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")

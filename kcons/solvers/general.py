@@ -177,7 +177,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = np.all(relative <= self._floor(batch, data, state), axis=1)
+            settled = (relative <= self._floor(batch, data, state)).all(axis=1)
             done |= settled & (polished | (error == 0.0))
             if done.all():
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
@@ -235,13 +235,13 @@ class GeneralClusters:
         root_w = self._root_w[batch.columns]
         flat = state.reshape(-1)
         sigma = self._sigma(batch, state, time) * held
-        error = _rms(sigma / scale)
+        error = _rms(sigma)
         damping = np.zeros(len(batch.rows))
         for iteration in range(1, 4 * MAX_ITERATIONS + 1):
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = np.all(relative <= self._floor(batch, data, state), axis=1)
+            settled = (relative <= self._floor(batch, data, state)).all(axis=1)
             if settled.all():
                 where = np.unravel_index(int(np.argmax(relative)), relative.shape)
                 return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
@@ -249,15 +249,14 @@ class GeneralClusters:
             bad = held & ~(np.isfinite(size) & (size > 0) & np.isfinite(sigma))
             if bad.any():
                 return _failed(batch, bad, iteration)
-            safe = np.where(held, size, 1.0)
-            unit = np.where(held[..., None], b / safe[..., None], 0.0)
+            b = np.where(held[..., None], b, 0.0)
             here = flat[batch.columns]
             active = ~settled
             for _ in range(_HALVINGS):
-                step = -root_w * _damped(unit, sigma / safe, damping)
+                step = -root_w * _damped(b, sigma, damping)
                 flat[batch.columns] = here + np.where(active[:, None], step, 0.0)
                 trial = self._sigma(batch, state, time) * held
-                trial_error = _rms(trial / scale)
+                trial_error = _rms(trial)
                 worse = active & ~(trial_error < error)
                 if not worse.any():
                     break
@@ -267,10 +266,7 @@ class GeneralClusters:
                 return _failed(batch, held & worse[:, None], iteration, relative)
             damping = np.where(active, 0.1 * damping, damping)
             damping[damping < 1e-8] = 0.0
-            stalled = active & (trial_error > (1 - 1e-12) * error) & (trial_error > 1e-6)
             sigma, error = trial, trial_error
-            if stalled.any():
-                return _failed(batch, held & stalled[:, None], iteration, np.abs(sigma) / scale)
         return _failed(batch, held & ~settled[:, None], 4 * MAX_ITERATIONS, np.abs(sigma) / scale)
 
     # -- tangents -------------------------------------------------------------------------------

@@ -56,8 +56,10 @@ class SparseRows:
             flat, self._slots, pattern.clusters, len(inverse_masses)
         )
         self._w = inverse_masses[self._atoms]
-        self._pattern = (pattern.start, pattern.columns, pattern.target_start, pattern.targets)
-        self._triples = _triples(pattern.start, pattern.columns, self._slots, self._slot_atoms, self._w)
+        self._pattern: tuple[IntArray, ...] = (pattern.start, pattern.columns, pattern.target_start, pattern.targets)
+        self._triples: tuple[IntArray, ...] = _triples(
+            pattern.start, pattern.columns, self._slots, self._slot_atoms, self._w
+        )
         kinds, parameters = _kinds_and_parameters(constraint_set)
         self._kinds = kinds[self.rows]
         self._parameters = np.ascontiguousarray(parameters[self.rows]).ravel()
@@ -92,7 +94,7 @@ class SparseRows:
             failed, residual, iterations, worst = _positions(
                 careful, x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
                 self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
-                self._parameters, self._scale, *self._pattern, *self._triples, self._gradients, self._work,
+                self._parameters, self._scale, *self._tables, self._gradients, self._work,
                 self._entries, self._base, self._moves, self._solution,
                 self._kept_moves, self._kept_solution,
             )  # fmt: skip
@@ -121,7 +123,7 @@ class SparseRows:
         failed, residual, iterations, worst = _tangents(
             x, y, wanted, rates is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
             self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
-            self._parameters, *self._pattern, *self._triples, self._gradients, self._work,
+            self._parameters, *self._tables, self._gradients, self._work,
             self._entries, self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
         if failed:
@@ -274,9 +276,9 @@ def _backward(first, last, start, columns, slots, slot_atoms, w, ref, work, entr
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds, parameters,
-    scale, start, columns, target_start, targets, triple, left, right, gradients, work, entries, base, moves,
-    solution, kept_moves, kept_solution,
+    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds,
+    parameters, scale, start, columns, target_start, targets, triple, left, right, gradients, work, entries, base,
+    moves, solution, kept_moves, kept_solution,
 ):  # fmt: skip
     now, ref = gradients[0], gradients[1]
     side, values, floor = work[2], work[3], work[4]
