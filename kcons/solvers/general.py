@@ -177,7 +177,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = (relative <= self._floor(batch, data, state)).all(axis=1)
+            settled = _each(relative <= self._floor(batch, data, state))
             done |= settled & (polished | (error == 0.0))
             if done.all():
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
@@ -241,7 +241,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = (relative <= self._floor(batch, data, state)).all(axis=1)
+            settled = _each(relative <= self._floor(batch, data, state))
             if settled.all():
                 where = np.unravel_index(int(np.argmax(relative)), relative.shape)
                 return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
@@ -345,6 +345,11 @@ def _failed(batch: _Batch, bad: NDArray[np.bool_], iterations: int, residual: Fl
     size = np.where(bad, np.inf if residual is None else np.nan_to_num(residual, nan=np.inf), -1.0)
     where = np.unravel_index(int(np.argmax(size)), size.shape)
     return Outcome(False, float(size[where]), iterations, int(batch.rows[where]))
+
+
+def _each(test: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """For each cluster, whether all of its rows pass."""
+    return np.asarray(np.all(test, axis=1), dtype=np.bool_)
 
 
 def _rms(values: FloatArray) -> FloatArray:
