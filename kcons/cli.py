@@ -101,15 +101,16 @@ def _compare(chosen: argparse.Namespace) -> int:
     methods.chosen(chosen.methods)  # complain before any work
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
     folder: Path = chosen.out or Path(f"compare-{chosen.scene}")
-    scene = _scene(chosen, quick=chosen.quick)
-    if chosen.dt is not None:
-        if not chosen.dt:
-            raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
-        scene = scene.with_time_steps(chosen.dt)
-    folder.mkdir(parents=True, exist_ok=True)  # complain before any work
-
+    if chosen.dt is not None and not chosen.dt:
+        raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
     asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt}
     with Bars() as watcher:
+        watcher.begin("building the scene" + ("" if compare.kernels_cached() else "; compiling kernels (once)"), 1)
+        scene = _scene(chosen, quick=chosen.quick)
+        watcher.end()
+        if chosen.dt is not None:
+            scene = scene.with_time_steps(chosen.dt)
+        folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
         result = compare.compare(scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked)
     text = _rendered(result)
     console = _console()
@@ -127,8 +128,6 @@ def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
         raise InputError(f"name a scene: {', '.join(scenes.SCENES)}", item="scene")
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
-    if sys.stderr.isatty():
-        print(f"building {chosen.scene} ...", file=sys.stderr)
     return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick)
 
 

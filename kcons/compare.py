@@ -179,7 +179,7 @@ def compare(
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     picked = chosen(methods)
     watching = watcher or Watcher()
-    watching.begin("compiling kernels" + ("" if kernels_cached() else " (once)"), 1)
+    watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
     warm_up(scene)
     watching.advance(1)
     watching.end()
@@ -335,9 +335,7 @@ def _measure(
     )
 
 
-def _run_to_horizon(
-    scene: Scene, run: Run, log: _Log, budget: float, deadline: float, watcher: Watcher
-) -> str:
+def _run_to_horizon(scene: Scene, run: Run, log: _Log, budget: float, deadline: float, watcher: Watcher) -> str:
     """Advance to the horizon; the reason if it was given up for the budget."""
     potential, masses = scene.potential, scene.masses[:, None]
 

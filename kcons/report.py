@@ -17,15 +17,15 @@ from kcons.compare import Comparison, Measurement, duration
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Colour-blind safe (Okabe and Ito), and a marker each.
-STYLES = {
+#: Colour-blind safe (Okabe and Ito), and a marker each; 6 is matplotlib's upward caret.
+STYLES: dict[str, tuple[str, str | int]] = {
     "rattle": ("#0072B2", "o"),
     "ase-kcons": ("#56B4E9", "s"),
     "ase-bonds": ("#D55E00", "^"),
     "ase-internals": ("#CC79A7", "v"),
     "dop853": ("#009E73", "D"),
-    "verlet": ("#7f7f7f", "|"),
-    "ase-verlet": ("#b0b0b0", "|"),
+    "verlet": ("#333333", 6),
+    "ase-verlet": ("#999999", 6),
 }
 
 EXPLANATION = (
@@ -140,6 +140,7 @@ def plot(comparison: Comparison, path: Path) -> None:
     """Error against force evaluations and against wall time, both axes logarithmic, as a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     units = comparison.scene["units"]
     figure = Figure(figsize=(11, 5.2), layout="constrained")
@@ -163,6 +164,9 @@ def plot(comparison: Comparison, path: Path) -> None:
                 )
         if comparison.reference["error"] > 0:
             axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
     _mark_costs_without_error(right, comparison)
     left.set_xlabel(f"force evaluations per simulated {units['long_time']}")
     right.set_xlabel(f"wall time per simulated {units['long_time']} / s")
@@ -188,16 +192,25 @@ def plot(comparison: Comparison, path: Path) -> None:
 
 
 def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
-    """Floors, and methods stopped for the budget: vertical lines at what they cost."""
+    """Floors: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line."""
     for name in dict.fromkeys(m.method for m in comparison.measurements):
-        colour, _ = STYLES.get(name, ("black", "x"))
-        for status, dashes, remark in (("floor", "-", ""), ("partial", "--", " (stopped for the budget)")):
-            for k, m in enumerate(comparison.of(name, status)):  # type: ignore[arg-type]
-                if m.seconds_per_time:
-                    # A floor at each time step would be many lines; the coarsest step is the least cost.
-                    label = f"{m.title}{remark}, step {m.setting:g} {comparison.scene['units']['time']}"
-                    if k == 0:
-                        axes.axvline(m.seconds_per_time, color=colour, linestyle=dashes, linewidth=1.2, label=label)
+        colour, marker = STYLES.get(name, ("black", "x"))
+        floors = [m for m in comparison.of(name, "floor") if m.seconds_per_time]
+        if floors:
+            axes.plot(
+                [float(m.seconds_per_time or 0.0) for m in floors],
+                [0.03] * len(floors),
+                transform=axes.get_xaxis_transform(),
+                linestyle="none",
+                marker=marker,
+                color=colour,
+                markersize=7,
+                label=f"{floors[0].title} (cost only)",
+            )
+        for m in comparison.of(name, "partial")[:1]:
+            if m.seconds_per_time:
+                label = f"{m.title} (stopped for the budget, cost only)"
+                axes.axvline(m.seconds_per_time, color=colour, linestyle="--", linewidth=1.2, label=label)
 
 
 def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:

@@ -209,6 +209,14 @@ def test_environment_names_machine_and_versions():
     assert found["commit"] is None or len(found["commit"].rstrip("+")) == 40
 
 
+def test_kernels_are_looked_for_where_they_are_cached(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert not compare.kernels_cached()
+    (tmp_path / "deeper").mkdir()
+    (tmp_path / "deeper" / "kernel.nbi").touch()
+    assert compare.kernels_cached()
+
+
 def test_stopwatch_counts_nested_calls_once():
     class Object:
         def outer(self):
@@ -243,7 +251,7 @@ def test_watcher_hears_of_everything(chain):
     listener = Listener()
     compare.compare(chain, methods=["rattle"], watcher=listener)
     assert listener.open == 0
-    assert listener.heard[0].startswith("compiling kernels")
+    assert "kernels" in listener.heard[0]
     assert listener.heard[1] == "reference solution"
     assert len(listener.heard) == 2 + len(chain.time_steps)
 
