@@ -191,10 +191,12 @@ class Scene:
 def converged(scene: Scene, dt: float, *, levels: int = 3, progress: Progress | None = None) -> Reference:
     """RATTLE at dt, dt/2, ... with Romberg extrapolation: its error has even powers of dt only.
 
-    The error estimate is the difference between the last two extrapolations of the finest row.
+    The error estimate is the difference from the extrapolation that leaves out the finest run. It sees the
+    noise of forces in single precision as well.
     """
     steps = max(1, round(scene.horizon / dt))
     table: list[FloatArray] = []
+    without_finest = scene.positions
     total = sum(steps << k for k in range(levels))
     done = 0
     system = System(scene.motion, scene.potential.forces)
@@ -206,6 +208,7 @@ def converged(scene: Scene, dt: float, *, levels: int = 3, progress: Progress | 
             done += 1
             if progress is not None:
                 progress(done, total)
+        without_finest = table[-1] if table else scene.positions
         row = [state.positions]
         for k, coarse in enumerate(table, start=1):
             row.append(row[-1] + (row[-1] - coarse) / (4.0**k - 1.0))
@@ -213,7 +216,7 @@ def converged(scene: Scene, dt: float, *, levels: int = 3, progress: Progress | 
     finest = scene.horizon / (steps << (levels - 1)) / scene.units.time_unit
     return Reference(
         table[-1],
-        scene.deviation(table[-1], table[-2]),
+        scene.deviation(table[-1], without_finest),
         f"RATTLE down to {finest:.3g} {scene.units.time}, extrapolated (order {2 * levels})",
     )
 
