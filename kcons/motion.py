@@ -19,7 +19,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError
-from kcons.plan import ClusterSolver, Plan, make_plan
+from kcons.plan import ClusterSolver, Plan, make_plan, sparse_distances
 from kcons.solvers.general import GeneralClusters
 from kcons.solvers.outcome import Outcome
 
@@ -94,7 +94,7 @@ class Motion:
             self._local, _ = self.constraint_set.subset(np.arange(self.constraint_set.n_rows))
         self.plan: Plan = make_plan(self._local, x if self._atoms is None else x[self._atoms], time)
         self._touched = touched
-        self._rescuers: dict[int, GeneralClusters] = {}
+        self._rescuers: dict[int, ClusterSolver] = {}
 
     @property
     def rank(self) -> int:
@@ -274,16 +274,18 @@ class Motion:
                 return outcome
         return outcome
 
-    def _rescuer(self, row: int) -> GeneralClusters | None:
-        """The damped solver for the cluster of `row`; None if it is too large for dense algebra."""
+    def _rescuer(self, row: int) -> ClusterSolver | None:
+        """A solver with step control for the cluster of `row`; None if its own solver has that already."""
         label = int(self.plan.labels[row])
         if label not in self._rescuers:
             rows = np.flatnonzero(self.plan.labels == label)
-            if len(rows) > RESCUE_ROWS:
+            if len(rows) <= RESCUE_ROWS:
+                labels = np.zeros(len(rows), dtype=np.int64)
+                self._rescuers[label] = GeneralClusters(self._local, rows, labels, self.plan.inverse_masses)
+            elif any(isinstance(solver, LongChains) and row in solver.rows for solver in self.plan.solvers):
+                self._rescuers[label] = sparse_distances(self._local, rows, self.plan.inverse_masses)
+            else:
                 return None
-            self._rescuers[label] = GeneralClusters(
-                self._local, rows, np.zeros(len(rows), dtype=np.int64), self.plan.inverse_masses
-            )
         return self._rescuers[label]
 
     def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:

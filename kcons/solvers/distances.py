@@ -14,6 +14,7 @@ from kcons.constraints.target import FloatArray
 from kcons.solvers.elimination import (
     FAST,
     PIVOT_TOLERANCE,
+    UIntArray,
     make_pattern,
 )
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
@@ -129,6 +130,28 @@ class SparseDistances:
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots[::4]))
+
+
+def lengths_resolved(x: FloatArray, pairs: UIntArray, lengths: FloatArray, lattice: FloatArray | None) -> bool:
+    """Whether each |sigma| at `x` is within max(1e-14 d, 2 eps (|x_i| + |x_j|))."""
+    return bool(_lengths_resolved(x, pairs, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _lengths_resolved(x, pairs, lengths, lattice, periodic):  # type: ignore[no-untyped-def]
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        ax, ay, az = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        if periodic:
+            ax, ay, az = nearest_image(ax, ay, az, lattice)
+        d = lengths[k]
+        miss = abs(ax * ax + ay * ay + az * az - d * d) / (2.0 * d)
+        if not (miss <= 1e-14 * d):
+            reach = np.sqrt(x[i, 0] ** 2 + x[i, 1] ** 2 + x[i, 2] ** 2)
+            reach += np.sqrt(x[j, 0] ** 2 + x[j, 1] ** 2 + x[j, 2] ** 2)
+            if not (miss <= 2 * _EPS * reach):
+                return False
+    return True
 
 
 @nb.njit(cache=True)

@@ -291,7 +291,7 @@ class GeneralClusters:
                 b = self._weighted(batch, data)
                 size = np.linalg.norm(b, axis=2)
                 speeds = flat[batch.columns]
-                bad = ~(np.isfinite(size) & (size > 0)) | ~np.isfinite(speeds).all(axis=1)[:, None]
+                bad = ~(np.isfinite(size) & (size > 0)) | ~_each(np.isfinite(speeds))[:, None]
                 if bad.any():
                     return _failed(batch, bad, 0)
                 unit = b / size[..., None]

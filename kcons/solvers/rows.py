@@ -56,8 +56,8 @@ class SparseRows:
             flat, self._slots, pattern.clusters, len(inverse_masses)
         )
         self._w = inverse_masses[self._atoms]
-        triples = _triples(pattern.start, pattern.columns, self._slots, self._slot_atoms, self._w)
-        self._tables = (pattern.start, pattern.columns, pattern.target_start, pattern.targets, *triples)
+        triple, left, right = _triples(pattern.start, pattern.columns, self._slots, self._slot_atoms, self._w)
+        self._tables = (pattern.start, pattern.columns, pattern.target_start, pattern.targets, triple, left, right)
         kinds, parameters = _kinds_and_parameters(constraint_set)
         self._kinds = kinds[self.rows]
         self._parameters = np.ascontiguousarray(parameters[self.rows]).ravel()
