@@ -19,7 +19,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError
-from kcons.plan import ClusterSolver, Plan, make_plan, sparse_distances
+from kcons.plan import ClusterSolver, LongChains, Plan, make_plan, sparse_distances
 from kcons.solvers.general import GeneralClusters
 from kcons.solvers.outcome import Outcome
 
@@ -291,7 +291,8 @@ class Motion:
     def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
         """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
 
-        Damped Newton with the gradients at the current point; for initial positions, not for time steps.
+        For initial positions, not for time steps. Damped Newton where the start is far off; where the search
+        for the nearest point does not settle, a point on the constraints along the gradients at the start.
 
         Raises
         ------
@@ -315,26 +316,33 @@ class Motion:
         return out
 
     def _nearest(self, x: FloatArray, time: float) -> bool:
-        """x <- x0 + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers; False if it fails.
+        """x <- x0 + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers.
 
-        Its fixed point is the foot of the mass-weighted perpendicular from x0.
+        Its fixed point is the foot of the mass-weighted perpendicular from x0. Where the iteration does not
+        settle, its first point is kept, which lies on the surface along the gradients at x0. False if there
+        is not even that.
         """
+        first = x.copy()
         try:
-            here = x.copy()
-            self._positions_direct(here, x, time, time, None, 0.0, None)
-            last = np.inf
-            for _ in range(NEAREST_ROUNDS):
-                ahead = x.copy()
-                self._positions_direct(ahead, here, time, time, None, 0.0, None)
-                move = float(np.max(np.abs(ahead - here), initial=0.0))
-                here = ahead
-                if move == 0.0 or (move > 0.5 * last and move < 1e-12):
-                    break
-                last = move
-            else:
-                return False
+            self._positions_direct(first, x, time, time, None, 0.0, None)
         except ConvergenceError:
             return False
+        here, last = first, np.inf
+        for _ in range(NEAREST_ROUNDS):
+            ahead = x.copy()
+            try:
+                self._positions_direct(ahead, here, time, time, None, 0.0, None)
+            except ConvergenceError:
+                here = first
+                break
+            move = float(np.max(np.abs(ahead - here), initial=0.0))
+            here = ahead
+            if move == 0.0 or (move > 0.5 * last and move < 1e-12):
+                break
+            if move > 2 * last:
+                here = first
+                break
+            last = move
         np.copyto(x, here)
         return True
 
