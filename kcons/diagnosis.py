@@ -83,9 +83,10 @@ def _named(numbers: IntArray | None, atoms: IntArray) -> list[int]:
     return [int(a) for a in (atoms if numbers is None else numbers[atoms])]
 
 
-def _bad_array(
+def not_finite(
     constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray]
 ) -> KconsError | None:
+    """The error for a NaN or infinity at an atom that a row touches; None if there is none."""
     touched = constraint_set.touched
     for item, array in arrays.items():
         bad = ~np.isfinite(array[touched]).all(axis=1)
@@ -115,7 +116,7 @@ def unusable(
     solver: HasRows,
 ) -> KconsError | None:
     """The error for input that no solver can work on: NaN or infinity, coincident atoms; None if it is sound."""
-    error = _bad_array(constraint_set, numbers, arrays)
+    error = not_finite(constraint_set, numbers, arrays)
     row = _global_row(outcome, solver)
     if error is not None or row < 0:
         return error
@@ -139,7 +140,7 @@ def undefined_row(
     constraint_set: ConstraintSet, numbers: IntArray | None, arrays: dict[str, FloatArray], row: int
 ) -> KconsError:
     """The error for a right-hand side b that is not finite; the last of `arrays` holds positions."""
-    error = _bad_array(constraint_set, numbers, arrays)
+    error = not_finite(constraint_set, numbers, arrays)
     if error is None:
         error = _coincident(constraint_set, numbers, list(arrays.values())[-1], row)
     name, atoms = _row_label(constraint_set, numbers, row)
@@ -202,11 +203,15 @@ def restore_failed(
     constraint_set: ConstraintSet,
     numbers: IntArray | None,
     x: FloatArray,
+    start: FloatArray,
     outcome: Outcome,
     solver: HasRows,
     time: float,
 ) -> KconsError:
     """The error for start positions that cannot be brought onto the constraints."""
+    error = unusable(constraint_set, numbers, {"positions": start}, outcome, solver)
+    if error is not None:
+        return error
     row = _global_row(outcome, solver)
     name, atoms = _row_label(constraint_set, numbers, row)
     sum_of_squares = float(np.sum(constraint_set.value(x, time) ** 2))
