@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse.linalg import lsqr
 
 from kcons import diagnosis
 from kcons.constraint_set import ConstraintSet
@@ -445,6 +444,8 @@ class Motion:
             if len(rows) <= DENSE_ROWS:
                 lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
             else:
+                from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
+
                 lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
         return lam
 
