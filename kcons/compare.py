@@ -49,7 +49,7 @@ class Measurement:
     setting : float
         Time step in the scene's shown unit, or relative tolerance of an adaptive method.
     status : {'ok', 'floor', 'partial', 'failed', 'not run'}
-        'floor': nothing is held, so no error is stated. 'partial': stopped for the budget; cost only.
+        'floor': nothing is held, only the cost is stated. 'partial': stopped for the budget; cost only.
     error : float
         Root-mean-square distance an atom from the reference at the horizon.
     constraint_residual, velocity_residual : float
@@ -304,7 +304,7 @@ def _measure(
         with _interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
             run = method.start(scene, setting)
             setup = perf_counter() - begun
-            note = _run_to_horizon(scene, run, log, budget, deadline, watcher)
+            note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, watcher)
             status = "partial" if note else "ok"
     except _OverBudgetError:
         status = "partial"
@@ -335,7 +335,9 @@ def _measure(
     )
 
 
-def _run_to_horizon(scene: Scene, run: Run, log: _Log, budget: float, deadline: float, watcher: Watcher) -> str:
+def _run_to_horizon(
+    scene: Scene, run: Run, holds: bool, log: _Log, budget: float, deadline: float, watcher: Watcher
+) -> str:
     """Advance to the horizon; the reason if it was given up for the budget."""
     potential, masses = scene.potential, scene.masses[:, None]
 
@@ -346,6 +348,8 @@ def _run_to_horizon(scene: Scene, run: Run, log: _Log, budget: float, deadline: 
 
     write_down()
     while not run.finished:
+        if not holds:
+            run.rewind()
         evaluations, held = potential.evaluations, run.constraints.seconds
         start = perf_counter()
         run.advance()

@@ -75,6 +75,10 @@ class Run(ABC):
     def advance(self) -> None:
         """One step."""
 
+    def rewind(self) -> None:
+        """Go back to the start, forces known, while time and steps go on counting."""
+        raise NotImplementedError
+
     @property
     @abstractmethod
     def finished(self) -> bool:
@@ -97,8 +101,8 @@ class Method(ABC):
     ----------
     name, title : str
     holds : bool
-        False for the floor, which holds nothing: its cost is the least there is, its trajectory is that
-        of another system.
+        False for the floor, which holds nothing: its cost is the least there is. It makes the first step
+        again and again, since with nothing held the system would soon fly apart.
     adaptive : bool
         Whether its setting is a tolerance instead of a time step.
     """
@@ -130,17 +134,26 @@ class _CoreRun(Run):
         self.constraints.watch(motion, ENGINE_CALLS)
         self._system = System(motion, scene.potential.forces)
         self._stepper = Rattle()
-        self._state = self._system.with_forces(State(scene.positions, scene.velocities))
+        self._start = self._system.with_forces(State(scene.positions, scene.velocities))
+        self._state = self._start
+        self._potential = scene.potential
         self._dt = dt
+        self._done = 0
         self._steps = round(scene.horizon / dt)
 
     def advance(self) -> None:
         self._state = self._stepper.step(self._system, self._state, self._dt)
-        self.time = self._state.time
+        self._done += 1
+        self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._state = self._start
+        # The end of the last step is no longer the last point known.
+        self._potential.forces(self._start.positions)
 
     @property
     def finished(self) -> bool:
-        return self._state.step >= self._steps
+        return self._done >= self._steps
 
     @property
     def positions(self) -> FloatArray:
@@ -173,6 +186,7 @@ class CoreVerlet(Method):
 class _AseRun(Run):
     def __init__(self, scene: Scene, dt: float, constraint: Any | None) -> None:
         super().__init__()
+        self._scene = scene
         self._atoms = scene.atoms()
         if constraint is not None:
             self._atoms.set_constraint(constraint)
@@ -188,6 +202,11 @@ class _AseRun(Run):
         self._dynamics.step()
         self._done += 1
         self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._atoms.positions[:] = self._scene.positions
+        self._atoms.set_velocities(self._scene.velocities)
+        self._scene.potential.forces(self._scene.positions)
 
     @property
     def finished(self) -> bool:

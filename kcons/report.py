@@ -36,7 +36,7 @@ EXPLANATION = (
     "in brackets where below twice its standard error.",
     "time, constraints: median wall time of a step and of its constraints. "
     "forces, wall: force evaluations and wall time for one simulated {long_time}.",
-    "floor: the same step with nothing held, the least a step can cost; it is another system, so no error is stated.",
+    "floor: the first step with nothing held, again and again: what a step costs before any constraint.",
 )
 
 #: Characters that all columns take.
@@ -151,7 +151,7 @@ def plot(comparison: Comparison, path: Path) -> None:
             colour, marker = STYLES.get(name, ("black", "x"))
             done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and getattr(m, cost)]
             if done:
-                axes.loglog(
+                axes.plot(
                     [getattr(m, cost) for m in done],
                     [m.error for m in done],
                     color=colour,
@@ -164,10 +164,16 @@ def plot(comparison: Comparison, path: Path) -> None:
                 )
         if comparison.reference["error"] > 0:
             axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
+    _mark_costs_without_error(right, comparison)
+    for axes in (left, right):
+        if not any(line.get_marker() != "None" for line in axes.lines):
+            axes.text(0.5, 0.5, "no method reached the horizon", transform=axes.transAxes, ha="center")
+            if not axes.get_legend_handles_labels()[0]:
+                axes.set_xlim(1.0, 1000.0)
+        axes.set(xscale="log", yscale="log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
-    _mark_costs_without_error(right, comparison)
     left.set_xlabel(f"force evaluations per simulated {units['long_time']}")
     right.set_xlabel(f"wall time per simulated {units['long_time']} / s")
     left.set_ylabel(f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}")

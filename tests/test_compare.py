@@ -91,6 +91,26 @@ def test_floor_states_no_error(result):
         assert floor.step_seconds > 0
 
 
+@pytest.mark.parametrize("name", ["verlet", "ase-verlet"])
+def test_floor_repeats_its_first_step_for_one_evaluation_each(chain, name):
+    floor = methods.METHODS[name].start(chain, chain.time_steps[0])
+    ends = []
+    for _ in range(3):
+        floor.rewind()
+        before = chain.potential.evaluations
+        floor.advance()
+        assert chain.potential.evaluations == before + 1
+        ends.append(floor.positions)
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[0], ends[2])
+    assert floor.time == pytest.approx(3 * chain.time_steps[0])
+    # x + v dt + f dt^2/2m: nothing is held.
+    dt = chain.time_steps[0]
+    kick = chain.potential.forces(chain.positions) / chain.masses[:, None]
+    expected = chain.positions + dt * chain.velocities + 0.5 * dt**2 * kick
+    np.testing.assert_allclose(ends[0], expected, rtol=0, atol=1e-13)
+
+
 def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
     (refused,) = spheres.of("ase-bonds", "not run")
     assert "sphere" in refused.note

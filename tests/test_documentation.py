@@ -11,7 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from kcons import cli
+from kcons import cli, projection
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint
+from kcons.motion import Motion
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -74,3 +77,18 @@ def test_example_runs(script, tmp_path):
 def test_pages_and_examples_were_found():
     assert ROOT / "docs" / "compare.md" in PAGES
     assert EXAMPLES
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+def test_links_within_the_project_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_names_in_the_notation_exist():
+    owners = {"projection": projection, "Motion": Motion, "ConstraintSet": ConstraintSet, "Constraint": Constraint}
+    text = (ROOT / "docs/notation.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(projection|Motion|ConstraintSet|Constraint)\.(\w+)", text)
+    assert len(named) > 20
+    for owner, name in named:
+        assert hasattr(owners[owner], name), f"{owner}.{name}"
