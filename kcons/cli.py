@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kcons import __version__
 from kcons.errors import InputError, KconsError
 
 if TYPE_CHECKING:
@@ -26,9 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.version:
-        from importlib.metadata import version
-
-        print(f"kcons {version('kcons')}")
+        print(f"kcons {__version__}")
         return 0
     if chosen.command is None:
         parser.print_help()
