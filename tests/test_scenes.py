@@ -292,3 +292,13 @@ def test_bad_time_step(dt, text):
 def test_time_steps_are_sorted_coarse_first():
     scene = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
     np.testing.assert_allclose(np.array(scene.time_steps) / units.fs, [10.0, 5.0, 2.5])
+
+
+@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum"])
+def test_shortened_scene_has_its_solution_at_its_own_horizon(name):
+    scene = scenes.build(name, size=2)
+    half = scene.shortened(2)
+    assert half.horizon == scene.horizon / 2
+    system = System(half.motion, half.potential.forces)
+    end = run(system, State(half.positions, half.velocities), half.horizon / 400, 400)
+    assert half.deviation(end.positions, half.reference().positions) < 1e-4

@@ -90,7 +90,7 @@ class Scene:
     refusals : mapping
         Method name -> why it cannot run this scene.
     solution : callable, optional
-        The reference in closed form or by an independent integrator; without it the scene is converged by
+        The reference at a given time, in closed form or by an independent integrator; without it the scene is converged by
         RATTLE at `reference_step` with extrapolation.
     reference_step : float
     """
@@ -110,7 +110,7 @@ class Scene:
     angles: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
     angle_bonds: IntArray | None = None
     refusals: Mapping[str, str] = field(default_factory=dict)
-    solution: Callable[[], Reference] | None = None
+    solution: Callable[[float], Reference] | None = None
     reference_step: float = 0.0
     cell: FloatArray | None = None
 
@@ -174,7 +174,7 @@ class Scene:
     def reference(self, progress: Progress | None = None) -> Reference:
         """The solution at the horizon."""
         if self.solution is not None:
-            return self.solution()
+            return self.solution(self.horizon)
         return converged(self, self.reference_step or min(self.time_steps) / 2, progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:

@@ -46,17 +46,16 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
     centers = 4.0 * np.stack([np.arange(size), np.zeros(size), np.zeros(size)], axis=1)
     x = np.asarray(centers + RADIUS * n, dtype=float)
     masses = np.ones(size)
-    horizon = 4.0
 
-    def great_circles() -> Reference:
+    def great_circles(time: float) -> Reference:
         speed = np.linalg.norm(v, axis=1)[:, None]
-        angle = speed * horizon / RADIUS
+        angle = speed * time / RADIUS
         ends: FloatArray = np.add(centers, RADIUS * (np.cos(angle) * n + np.sin(angle) * v / speed), dtype=np.float64)
         return Reference(ends, 0.0, "great circles")
 
-    def pendulums() -> Reference:
-        ends = [swing(RADIUS * n[k], v[k], gravity, horizon) for k in range(size)]
-        coarse = [swing(RADIUS * n[k], v[k], gravity, horizon, rtol=1e-11) for k in range(size)]
+    def pendulums(time: float) -> Reference:
+        ends = [swing(RADIUS * n[k], v[k], gravity, time) for k in range(size)]
+        coarse = [swing(RADIUS * n[k], v[k], gravity, time, rtol=1e-11) for k in range(size)]
         error = float(np.sqrt(np.mean(np.sum((np.array(ends) - coarse) ** 2, axis=1))))
         there: FloatArray = np.add(centers, ends, dtype=np.float64)
         return Reference(there, error, "the pendulum's own equation, DOP853 at rtol 2.3e-14")
@@ -70,7 +69,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
         velocities=v,
         potential=Potential(_weight(gravity), "uniform field" if gravity else "no forces"),
         symbols=["X"] * size,
-        horizon=horizon,
+        horizon=4.0,
         time_steps=(0.2, 0.1, 0.05, 0.025),
         tolerances=(1e-3, 1e-6, 1e-9),
         units=REDUCED,
