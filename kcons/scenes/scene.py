@@ -90,8 +90,8 @@ class Scene:
     refusals : mapping
         Method name -> why it cannot run this scene.
     solution : callable, optional
-        The reference at a given time, in closed form or by an independent integrator; without it the scene is converged by
-        RATTLE at `reference_step` with extrapolation.
+        The reference at a given time, in closed form or by an independent integrator; without it the scene is
+        converged by RATTLE at `reference_step` with extrapolation.
     reference_step : float
     """
 
