@@ -11,13 +11,26 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.elimination import (
-    FAST,
-    PIVOT_TOLERANCE,
-    UIntArray,
-    make_pattern,
-)
+from kcons.solvers.elimination import FAST, UIntArray, make_pattern
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
+from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
+from kcons.solvers.narrow import (
+    dot,
+    entry,
+    first_vector,
+    lane,
+    load_point,
+    load_quad,
+    number,
+    pair,
+    put,
+    quad,
+    second_vector,
+    store_first,
+    store_line,
+    store_point,
+    store_quad,
+)
 from kcons.solvers.outcome import Outcome
 
 #: Newton stops at this relative error of a length in relative coordinates (a few roundings).
@@ -55,19 +68,22 @@ class SparseDistances:
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
         self.lengths = lengths[pattern.order].copy()
-        self._clusters = pattern.clusters.astype(np.uint32)
-        numbers, atom_start, ends = _number_atoms(pairs, pattern.clusters, len(inverse_masses))
-        self._atoms, self._atom_start, self._ends = numbers, atom_start.astype(np.uint32), ends
-        self._w = inverse_masses[numbers]
-        start = pattern.start.astype(np.uint32)
-        self._pattern = (start, pattern.columns, pattern.target_start.astype(np.uint32), pattern.targets)
-        self._couplings = _couplings(pattern.start, pattern.columns, ends, self._w)
-        # One cache line a row: r, s, accumulated pivot, right-hand side.
+        self._clusters = pattern.clusters
+        self._atoms, self._atom_start, ends = _number_atoms(pairs, pattern.clusters, len(inverse_masses))
+        self._w = inverse_masses[self._atoms]
+        links = np.zeros((len(rows) + 1, 4), np.uint32)
+        links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
+        weights = self._w[ends].sum(axis=1)
+        couplings = _couplings(pattern.start, pattern.columns, ends, self._w)
+        self._tables = (self._clusters, self._atoms, self._atom_start, self._w, links.ravel(),
+            pattern.columns, pattern.targets, couplings, weights,
+        )  # fmt: skip
         self._state = _aligned(8 * len(rows))
         self._entries = _aligned(4 * len(pattern.columns))
-        self._pivots = _aligned(4 * len(rows))
-        self._places = _aligned(4 * len(numbers))
-        self._moves = _aligned(4 * len(numbers))
+        self._pivots = np.zeros(len(rows))
+        self._starts = _aligned(4 * len(rows))
+        self._places = _aligned(4 * len(self._atoms))
+        self._moves = _aligned(4 * len(self._atoms))
         self._solution = np.zeros(len(rows))
         self._kept_moves = np.zeros(len(self._moves))
         self._kept_solution = np.zeros(len(rows))
@@ -86,9 +102,8 @@ class SparseDistances:
         for careful in (False, True):
             failed, residual, iterations, worst = _positions(
                 careful, x_new, x_ref, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None,
-                self._clusters, self._atoms, self._atom_start, self._ends, self._w, *self._pattern,
-                self._couplings, self._state, self._entries, self._pivots, self._places, self._moves, self._solution,
-                self._kept_moves, self._kept_solution,
+                *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
+                self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             if not failed:
                 break
@@ -114,8 +129,8 @@ class SparseDistances:
         failed, residual, iterations, worst = _tangents(
             x, y, self.lengths if rates is None else rates, rates is not None,
             NO_LATTICE if lattice is None else lattice, lattice is not None,
-            self._clusters, self._atoms, self._atom_start, self._ends, self._w, *self._pattern,
-            self._couplings, self._state, self._entries, self._pivots, self._places, self._moves, self._solution,
+            *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
+            self._solution,
         )  # fmt: skip
         if failed:
             return Outcome(False, residual, iterations, worst)
@@ -129,7 +144,7 @@ class SparseDistances:
         outcome = self.tangents(x, np.zeros_like(x), None, lattice, None)
         if not outcome.converged:
             return len(self.rows)
-        return int(np.count_nonzero(self._pivots[::4]))
+        return int(np.count_nonzero(self._pivots))
 
 
 def lengths_resolved(x: FloatArray, pairs: UIntArray, lengths: FloatArray, lattice: FloatArray | None) -> bool:
@@ -175,7 +190,7 @@ def _number_atoms(pairs, clusters, n_atoms):  # type: ignore[no-untyped-def]
                     used += 1
                 ends[k, side] = place[a]
         atom_start[c + 1] = used
-    return atoms[:used].copy(), atom_start, ends.ravel()
+    return atoms[:used].copy(), atom_start, ends
 
 
 @nb.njit(cache=True)
@@ -183,10 +198,10 @@ def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
     """c_kl with (A M^-1 A^T)_kl = c_kl s_k . s_l for each stored entry; 0 where there is only fill."""
     coupling = np.zeros(len(columns))
     for k in range(len(start) - 1):
-        i, j = ends[2 * k], ends[2 * k + 1]
+        i, j = ends[k, 0], ends[k, 1]
         for e in range(start[k], start[k + 1]):
             l = columns[e]
-            i2, j2 = ends[2 * l], ends[2 * l + 1]
+            i2, j2 = ends[l, 0], ends[l, 1]
             total = 0.0
             if i == i2:
                 total += w[i]
@@ -201,172 +216,87 @@ def _couplings(start, columns, ends, w):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _factor(  # type: ignore[no-untyped-def]
-    first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
-):
-    """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
-
-    `state` holds r, s, the accumulated change of the pivot, and the right-hand side; `entries` the upper
-    and lower factor and their accumulated changes, which are left at zero for the next time.
-    """
+def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, periodic, atoms, w, links,
+    state, starts, places, moves, solution,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Reference vectors s and current vectors q of a cluster; largest and total relative error of the lengths."""
+    for a in range(first_atom, last_atom):
+        g = 3 * entry(atoms, a)
+        store_quad(places, 4 * a, load_point(x_ref, g))
+        store_quad(moves, 4 * a, load_point(x_new, g))
+    error, total = 0.0, 0.0
     for k in range(first, last):
-        rx, ry, rz = state[8 * k], state[8 * k + 1], state[8 * k + 2]
-        sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
-        whole = (w[ends[2 * k]] + w[ends[2 * k + 1]]) * (rx * sx + ry * sy + rz * sz)
-        d = whole + state[8 * k + 6]
-        bk = state[8 * k + 7]
-        inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
-        pivots[4 * k] = inverse
-        begin, end = start[k], start[k + 1]
-        for p in range(begin, end):
-            l = columns[p]
-            c = couplings[p]
-            up = c * (rx * state[8 * l + 3] + ry * state[8 * l + 4] + rz * state[8 * l + 5]) + entries[4 * p + 2]
-            low = c * (sx * state[8 * l] + sy * state[8 * l + 1] + sz * state[8 * l + 2]) + entries[4 * p + 3]
-            low *= inverse
-            entries[4 * p] = up
-            entries[4 * p + 1] = low
-            entries[4 * p + 2] = 0.0
-            entries[4 * p + 3] = 0.0
-            state[8 * l + 6] -= low * up
-            state[8 * l + 7] -= low * bk
-        t = target_start[k]
-        for p in range(begin, end):
-            up, low = entries[4 * p], entries[4 * p + 1]
-            for q in range(p + 1, end):
-                e = targets[t]
-                entries[4 * e + 2] -= low * entries[4 * q]
-                entries[4 * e + 3] -= entries[4 * q + 1] * up
-                t += 1
+        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+        s = load_quad(places, i) - load_quad(places, j)
+        q = load_quad(moves, i) - load_quad(moves, j)
+        if periodic:
+            s, q = _image(s, lattice), _image(q, lattice)
+        d2 = number(lengths, k) * number(lengths, k)
+        miss = 0.5 * (d2 - dot(q, q))
+        store_line(state, 8 * k, q, s, pair(0.0, miss))
+        store_quad(starts, 4 * k, q)
+        put(starts, 4 * k + 3, 1.0 / d2)
+        put(solution, k, 0.0)
+        e = abs(miss) / d2
+        total += e
+        error = max(error, e)
+    for a in range(first_atom, last_atom):
+        store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, number(w, a)))
+    return error, total
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _factor_symmetric(  # type: ignore[no-untyped-def]
-    first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
-):
-    """`_factor` for r = s: half the work."""
-    for k in range(first, last):
-        sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
-        whole = (w[ends[2 * k]] + w[ends[2 * k + 1]]) * (sx * sx + sy * sy + sz * sz)
-        d = whole + state[8 * k + 6]
-        bk = state[8 * k + 7]
-        inverse = 1.0 / d if d > PIVOT_TOLERANCE * whole else 0.0
-        pivots[4 * k] = inverse
-        begin, end = start[k], start[k + 1]
-        for p in range(begin, end):
-            l = columns[p]
-            dot = sx * state[8 * l + 3] + sy * state[8 * l + 4] + sz * state[8 * l + 5]
-            up = couplings[p] * dot + entries[4 * p + 2]
-            low = up * inverse
-            entries[4 * p] = up
-            entries[4 * p + 1] = low
-            entries[4 * p + 2] = 0.0
-            state[8 * l + 6] -= low * up
-            state[8 * l + 7] -= low * bk
-        t = target_start[k]
-        for p in range(begin, end):
-            low = entries[4 * p + 1]
-            for q in range(p + 1, end):
-                entries[4 * targets[t] + 2] -= low * entries[4 * q]
-                t += 1
+def _image(vector, lattice):  # type: ignore[no-untyped-def]
+    x, y, z = nearest_image(lane(vector, 0), lane(vector, 1), lane(vector, 2), lattice)
+    return quad(x, y, z, 0.0)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _forward(first, last, start, columns, state, entries):  # type: ignore[no-untyped-def]
-    """Forward substitution with the factor kept from before."""
+def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore[no-untyped-def]
+    """Current vectors and right-hand sides; largest and total relative error of the lengths."""
+    error, total = 0.0, 0.0
     for k in range(first, last):
-        bk = state[8 * k + 7]
-        for p in range(start[k], start[k + 1]):
-            state[8 * columns[p] + 7] -= entries[4 * p + 1] * bk
-
-
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _backward(first, last, start, columns, ends, w, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
-    """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
-    for back in range(last - first):
-        k = last - 1 - back
-        step = state[8 * k + 7]
-        for p in range(start[k], start[k + 1]):
-            step -= entries[4 * p] * state[8 * columns[p] + 7]
-        step *= pivots[4 * k]
-        state[8 * k + 7] = step
-        solution[k] += step
-        i, j = ends[2 * k], ends[2 * k + 1]
-        wi, wj = step * w[i], step * w[j]
-        moves[4 * i] += wi * state[8 * k + 3]
-        moves[4 * i + 1] += wi * state[8 * k + 4]
-        moves[4 * i + 2] += wi * state[8 * k + 5]
-        moves[4 * j] -= wj * state[8 * k + 3]
-        moves[4 * j + 1] -= wj * state[8 * k + 4]
-        moves[4 * j + 2] -= wj * state[8 * k + 5]
+        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+        r = load_quad(starts, 4 * k) + (load_quad(moves, i) - load_quad(moves, j))
+        d2 = number(lengths, k) * number(lengths, k)
+        miss = 0.5 * (d2 - dot(r, r))
+        store_first(state, 8 * k, r, pair(0.0, miss))
+        e = abs(miss) * number(starts, 4 * k + 3)
+        total += e
+        error = max(error, e)
+    return error, total
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, x_new, x_ref, lengths, lattice, periodic, clusters, atoms, atom_start, ends, w, start, columns,
-    target_start, targets, couplings, state, entries, pivots, places, moves, solution, kept_moves, kept_solution,
+    careful, x_new, x_ref, lengths, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
+    targets, couplings, weights, state, entries, pivots, starts, places, moves, solution, kept_moves, kept_solution,
 ):  # fmt: skip
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
-        # The start: reference vectors s, current vectors q, through the cluster's own atom list.
-        for a in range(atom_start[c], atom_start[c + 1]):
-            g = atoms[a]
-            for axis in range(3):
-                places[4 * a + axis] = x_ref[g, axis]
-                moves[4 * a + axis] = x_new[g, axis]
-        for k in range(first, last):
-            i, j = ends[2 * k], ends[2 * k + 1]
-            ax = places[4 * i] - places[4 * j]
-            ay = places[4 * i + 1] - places[4 * j + 1]
-            az = places[4 * i + 2] - places[4 * j + 2]
-            bx = moves[4 * i] - moves[4 * j]
-            by = moves[4 * i + 1] - moves[4 * j + 1]
-            bz = moves[4 * i + 2] - moves[4 * j + 2]
-            if periodic:
-                ax, ay, az = nearest_image(ax, ay, az, lattice)
-                bx, by, bz = nearest_image(bx, by, bz, lattice)
-            state[8 * k], state[8 * k + 1], state[8 * k + 2] = bx, by, bz
-            state[8 * k + 3], state[8 * k + 4], state[8 * k + 5] = ax, ay, az
-            pivots[4 * k + 1], pivots[4 * k + 2], pivots[4 * k + 3] = bx, by, bz
-            solution[k] = 0.0
-        for a in range(atom_start[c], atom_start[c + 1]):
-            for axis in range(3):
-                moves[4 * a + axis] = 0.0
-        error = np.inf
+        first_atom, last_atom = atom_start[c], atom_start[c + 1]
+        error, total = _begin(
+            first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, periodic, atoms, w, links,
+            state, starts, places, moves, solution,
+        )  # fmt: skip
+        previous = np.inf
         best = np.inf
         factored = False
         iteration = 0
         halvings = 0
         while True:
-            previous = error
-            error = 0.0
-            total = 0.0
-            for k in range(first, last):
-                rx, ry, rz = state[8 * k], state[8 * k + 1], state[8 * k + 2]
-                if iteration > 0:
-                    i, j = ends[2 * k], ends[2 * k + 1]
-                    rx = pivots[4 * k + 1] + (moves[4 * i] - moves[4 * j])
-                    ry = pivots[4 * k + 2] + (moves[4 * i + 1] - moves[4 * j + 1])
-                    rz = pivots[4 * k + 3] + (moves[4 * i + 2] - moves[4 * j + 2])
-                    state[8 * k], state[8 * k + 1], state[8 * k + 2] = rx, ry, rz
-                d2 = lengths[k] * lengths[k]
-                miss = 0.5 * (d2 - (rx * rx + ry * ry + rz * rz))
-                state[8 * k + 6] = 0.0
-                state[8 * k + 7] = miss
-                e = abs(miss) / d2
-                total += e
-                error = max(error, e)
+            if iteration > 0:
+                error, total = _measure(first, last, lengths, links, state, starts, moves)
             if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
                 # Step control: go back half the way.
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, _worst(first, last, state, lengths)
                 halvings += 1
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
+                for a in range(4 * first_atom, 4 * last_atom):
                     moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
                 for k in range(first, last):
                     solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
-                error = previous
                 continue
             # max() may drop a NaN; the sum cannot.
             if not (total < np.inf) or iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
@@ -374,42 +304,42 @@ def _positions(  # type: ignore[no-untyped-def]
             if error <= LENGTH_TOLERANCE:
                 break
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
-            if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, ends):
+            if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, links):
                 break
             if careful:
                 best = total
                 halvings = 0
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
+                for a in range(4 * first_atom, 4 * last_atom):
                     kept_moves[a] = moves[a]
                 for k in range(first, last):
                     kept_solution[k] = solution[k]
             # Reuse the factor while a step with it still gains enough for its lower price.
             ratio = error / previous
             if factored and (error * ratio <= LENGTH_TOLERANCE or ratio < 1e-4):
-                _forward(first, last, start, columns, state, entries)
+                forward(first, last, links, columns, state, entries)
             else:
-                _factor(first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots)
+                factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
                 factored = True
-            _backward(first, last, start, columns, ends, w, state, entries, pivots, moves, solution)
+            backward(first, last, links, columns, state, entries, pivots, moves, solution)
+            previous = error
             iteration += 1
         for k in range(first, last):
-            sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
             # A bond must not have turned by 90 degrees or more within the step.
-            if not (state[8 * k] * sx + state[8 * k + 1] * sy + state[8 * k + 2] * sz > 0.0):
-                return True, np.inf, iteration, np.int64(k)
+            if not (dot(first_vector(state, 8 * k), second_vector(state, 8 * k)) > 0.0):
+                return True, np.inf, iteration, k
         if error >= worst:
-            worst, worst_row = error, np.int64(first)
+            worst, worst_row = error, first
         most = max(most, iteration)
     return False, worst, most, worst_row
 
 
 @nb.njit(cache=True)
-def _resolved(first, last, state, lengths, places, ends):  # type: ignore[no-untyped-def]
+def _resolved(first, last, state, lengths, places, links):  # type: ignore[no-untyped-def]
     """Whether each |sigma| is within max(1e-14 d, 2 eps (|x_i| + |x_j|))."""
     for k in range(first, last):
         reach = 0.0
         for side in range(2):
-            a = 4 * ends[2 * k + side]
+            a = 4 * np.int64(links[4 * k + 2 + side])
             reach += np.sqrt(places[a] ** 2 + places[a + 1] ** 2 + places[a + 2] ** 2)
         if not (abs(state[8 * k + 7]) / lengths[k] <= max(1e-14 * lengths[k], 2 * _EPS * reach)):
             return False
@@ -431,65 +361,50 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(  # type: ignore[no-untyped-def]
-    x, y, rates, driven, lattice, periodic, clusters, atoms, atom_start, ends, w, start, columns,
-    target_start, targets, couplings, state, entries, pivots, places, moves, solution,
+    x, y, rates, driven, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
+    targets, couplings, weights, state, entries, pivots, starts, places, moves, solution,
 ):  # fmt: skip
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
-            g = atoms[a]
-            for axis in range(3):
-                places[4 * a + axis] = x[g, axis]
-                moves[4 * a + axis] = y[g, axis]
+            g = 3 * entry(atoms, a)
+            store_quad(places, 4 * a, load_point(x, g))
+            store_quad(moves, 4 * a, load_point(y, g))
         largest = 0.0
         total = 0.0
         for k in range(first, last):
-            i, j = ends[2 * k], ends[2 * k + 1]
-            ax = places[4 * i] - places[4 * j]
-            ay = places[4 * i + 1] - places[4 * j + 1]
-            az = places[4 * i + 2] - places[4 * j + 2]
+            i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+            s = load_quad(places, i) - load_quad(places, j)
+            u = load_quad(moves, i) - load_quad(moves, j)
             if periodic:
-                ax, ay, az = nearest_image(ax, ay, az, lattice)
-            bx = moves[4 * i] - moves[4 * j]
-            by = moves[4 * i + 1] - moves[4 * j + 1]
-            bz = moves[4 * i + 2] - moves[4 * j + 2]
-            s2 = ax * ax + ay * ay + az * az
-            goal = rates[k] * np.sqrt(s2) if driven else 0.0
-            pivots[4 * k + 1], pivots[4 * k + 2], pivots[4 * k + 3] = bx, by, bz
-            miss = goal - (ax * bx + ay * by + az * bz)
-            state[8 * k + 3], state[8 * k + 4], state[8 * k + 5] = ax, ay, az
-            state[8 * k + 6] = 0.0
-            state[8 * k + 7] = miss
-            size = (bx * bx + by * by + bz * bz) * s2 + goal * goal
+                s = _image(s, lattice)
+            s2 = dot(s, s)
+            goal = number(rates, k) * np.sqrt(s2) if driven else 0.0
+            store_line(state, 8 * k, u, s, pair(0.0, goal - dot(s, u)))
+            store_quad(starts, 4 * k, u)
+            put(starts, 4 * k + 3, goal)
+            size = dot(u, u) * s2 + goal * goal
             largest = max(largest, size)
             total += size if s2 > 0.0 else np.inf
-            solution[k] = 0.0
+            put(solution, k, 0.0)
         for a in range(atom_start[c], atom_start[c + 1]):
-            for axis in range(3):
-                moves[4 * a + axis] = 0.0
+            store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, number(w, a)))
         if not (total < np.inf):
             return True, np.inf, 0, _first_bad(first, last, state)
-        _factor_symmetric(
-            first, last, start, columns, target_start, targets, couplings, ends, w, state, entries, pivots
-        )
+        factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
         allowed = SPEED_TOLERANCE * np.sqrt(largest)
         error, iteration = 0.0, 0
         previous = np.inf
         while True:
-            _backward(first, last, start, columns, ends, w, state, entries, pivots, moves, solution)
+            backward(first, last, links, columns, state, entries, pivots, moves, solution)
             iteration += 1
             error, total = 0.0, 0.0
             for k in range(first, last):
-                i, j = ends[2 * k], ends[2 * k + 1]
-                sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
-                bx = pivots[4 * k + 1] + (moves[4 * i] - moves[4 * j])
-                by = pivots[4 * k + 2] + (moves[4 * i + 1] - moves[4 * j + 1])
-                bz = pivots[4 * k + 3] + (moves[4 * i + 2] - moves[4 * j + 2])
-                miss = -(sx * bx + sy * by + sz * bz)
-                if driven:
-                    miss += rates[k] * np.sqrt(sx * sx + sy * sy + sz * sz)
-                state[8 * k + 7] = miss
+                i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+                u = load_quad(starts, 4 * k) + (load_quad(moves, i) - load_quad(moves, j))
+                miss = number(starts, 4 * k + 3) - dot(second_vector(state, 8 * k), u)
+                put(state, 8 * k + RIGHT, miss)
                 total += abs(miss)
                 error = max(error, abs(miss))
             if not (total < np.inf):
@@ -498,11 +413,11 @@ def _tangents(  # type: ignore[no-untyped-def]
             if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
                 break
             previous = error
-            _forward(first, last, start, columns, state, entries)
+            forward(first, last, links, columns, state, entries)
         if error > 1e3 * allowed:
             return True, error, iteration, _largest(first, last, state)
         if error >= worst:
-            worst, worst_row = error, np.int64(first)
+            worst, worst_row = error, first
         most = max(most, iteration)
     return False, worst, most, worst_row
 
@@ -511,7 +426,7 @@ def _tangents(  # type: ignore[no-untyped-def]
 def _first_bad(first, last, state):  # type: ignore[no-untyped-def]
     """First row whose vectors or right-hand side are zero or not finite."""
     for k in range(first, last):
-        s2 = state[8 * k + 3] ** 2 + state[8 * k + 4] ** 2 + state[8 * k + 5] ** 2
+        s2 = state[8 * k + 1] ** 2 + state[8 * k + 3] ** 2 + state[8 * k + 5] ** 2
         if not (s2 > 0.0 and s2 < np.inf and abs(state[8 * k + 7]) < np.inf):
             return np.int64(k)
     return np.int64(first)
@@ -531,26 +446,24 @@ def _largest(first, last, state):  # type: ignore[no-untyped-def]
 def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def]
     """Multipliers of |r| - d instead of s . r."""
     for k in range(len(solution)):
-        sx, sy, sz = state[8 * k + 3], state[8 * k + 4], state[8 * k + 5]
+        sx, sy, sz = state[8 * k + 1], state[8 * k + 3], state[8 * k + 5]
         multipliers[k] = sign * solution[k] * np.sqrt(sx * sx + sy * sy + sz * sz)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply(x, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
-        g = atoms[a]
-        x[g, 0] += moves[4 * a]
-        x[g, 1] += moves[4 * a + 1]
-        x[g, 2] += moves[4 * a + 2]
+        g = 3 * entry(atoms, a)
+        store_point(x, g, load_point(x, g) + load_quad(moves, 4 * a))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
-        g = atoms[a]
-        for axis in range(3):
-            x[g, axis] += moves[4 * a + axis]
-            v[g, axis] += inv_dt * moves[4 * a + axis]
+        g = 3 * entry(atoms, a)
+        move = load_quad(moves, 4 * a)
+        store_point(x, g, load_point(x, g) + move)
+        store_point(v, g, load_point(v, g) + inv_dt * move)
 
 
 def _aligned(size: int) -> FloatArray:

@@ -1,0 +1,123 @@
+"""Elimination and substitution for distance rows: the sweeps over one cluster.
+
+A row's line of eight doubles holds its vectors r and s, the accumulated change of its pivot, and its
+right-hand side: r0 s0 r1 s1 r2 s2 change right. An entry's line of four doubles holds A_lk / pivot and A_kl
+(k < l) and their accumulated changes, which are left at zero for the next time. `links` holds, row by row,
+where its entries and its targets begin and its two ends; atoms are quads (move, inverse mass).
+"""
+
+from __future__ import annotations
+
+import numba as nb
+
+from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE
+from kcons.solvers.narrow import (
+    entry,
+    lane,
+    load_pair,
+    load_quad,
+    number,
+    pair,
+    put,
+    second_vector,
+    settled,
+    store_pair,
+    store_quad,
+    swapped,
+)
+
+#: Places of the two last numbers in a row's line.
+CHANGE, RIGHT = 6, 7
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
+    """Assemble and eliminate rows first to last, with forward substitution, in one sweep."""
+    begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
+    for k in range(first, last):
+        x, y, z = swapped(load_pair(state, 8 * k)), swapped(load_pair(state, 8 * k + 2)), load_pair(state, 8 * k + 4)
+        z = swapped(z)
+        inner = lane(x, 0) * lane(x, 1) + lane(y, 0) * lane(y, 1) + lane(z, 0) * lane(z, 1)
+        whole = number(weights, k) * inner
+        d = whole + number(state, 8 * k + CHANGE)
+        right = number(state, 8 * k + RIGHT)
+        inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
+        put(pivots, k, inverse)
+        end = entry(links, 4 * k + 4)
+        for p in range(begin, end):
+            l = 8 * entry(columns, p)
+            both = x * load_pair(state, l) + y * load_pair(state, l + 2) + z * load_pair(state, l + 4)
+            both = number(couplings, p) * both + load_pair(entries, 4 * p + 2)
+            low, up = inverse * lane(both, 0), lane(both, 1)
+            store_quad(entries, 4 * p, settled(pair(low, up)))
+            store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+        for p in range(begin, end - 1):
+            mine = swapped(load_pair(entries, 4 * p))
+            for q in range(p + 1, end):
+                e = 4 * entry(targets, t) + 2
+                # For an entry (l, m), l < m: A_ml -= low_m up_l, A_lm -= low_l up_m.
+                store_pair(entries, e, load_pair(entries, e) - mine * load_pair(entries, 4 * q))
+                t += 1
+        begin = end
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
+    """`factor` for r = s: half the work."""
+    begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
+    for k in range(first, last):
+        sx, sy, sz = number(state, 8 * k + 1), number(state, 8 * k + 3), number(state, 8 * k + 5)
+        whole = number(weights, k) * (sx * sx + sy * sy + sz * sz)
+        d = whole + number(state, 8 * k + CHANGE)
+        right = number(state, 8 * k + RIGHT)
+        inverse = 1.0 / d if d > PIVOT_TOLERANCE * whole else 0.0
+        put(pivots, k, inverse)
+        end = entry(links, 4 * k + 4)
+        for p in range(begin, end):
+            l = 8 * entry(columns, p)
+            inner = sx * number(state, l + 1) + sy * number(state, l + 3) + sz * number(state, l + 5)
+            up = number(couplings, p) * inner + number(entries, 4 * p + 2)
+            low = up * inverse
+            store_quad(entries, 4 * p, settled(pair(low, up)))
+            store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+        for p in range(begin, end - 1):
+            low = number(entries, 4 * p)
+            for q in range(p + 1, end):
+                e = 4 * entry(targets, t) + 2
+                put(entries, e, number(entries, e) - low * number(entries, 4 * q + 1))
+                t += 1
+        begin = end
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
+    """Forward substitution with the factor kept from before."""
+    begin = entry(links, 4 * first)
+    for k in range(first, last):
+        right = number(state, 8 * k + RIGHT)
+        end = entry(links, 4 * k + 4)
+        for p in range(begin, end):
+            l = 8 * entry(columns, p) + RIGHT
+            put(state, l, number(state, l) - number(entries, 4 * p) * right)
+        begin = end
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def backward(first, last, links, columns, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
+    """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
+    end = entry(links, 4 * last)
+    for back in range(last - first):
+        k = last - 1 - back
+        # The whole line is read before a part of it is written: the other way round the processor waits.
+        s = second_vector(state, 8 * k)
+        step = number(state, 8 * k + RIGHT)
+        begin = entry(links, 4 * k)
+        for p in range(begin, end):
+            step -= number(entries, 4 * p + 1) * number(state, 8 * entry(columns, p) + RIGHT)
+        end = begin
+        step *= number(pivots, k)
+        put(state, 8 * k + RIGHT, step)
+        put(solution, k, number(solution, k) + step)
+        i, j = 4 * entry(links, 4 * k + 2), 4 * entry(links, 4 * k + 3)
+        store_quad(moves, i, load_quad(moves, i) + (step * number(moves, i + 3)) * s)
+        store_quad(moves, j, load_quad(moves, j) - (step * number(moves, j + 3)) * s)
