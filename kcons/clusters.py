@@ -58,6 +58,8 @@ class Shape:
 
 def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows: IntArray) -> IntArray:
     """Cluster number of each row: rows that share a movable atom belong together; -1 for rows without one."""
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
     incidence = constraint_set.incidence
     n_rows, n_atoms = incidence.shape
     free = np.ones(n_atoms)
@@ -69,7 +71,7 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     labels = np.full(n_rows, -1, dtype=np.int64)
     if n_rows == 0:
         return labels
-    found = sp.csgraph.connected_components(graph, directed=False)[1][:n_rows]
+    found = connected_components(graph, directed=False)[1][:n_rows]
     movable = np.diff(links.indptr) > 0
     movable[pinned_rows] = False
     if movable.any():

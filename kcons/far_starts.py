@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,14 +12,97 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.plan import Plan
+from kcons.plan import ClusterSolver, LongChains, Plan, sparse_distances
+from kcons.solvers.general import GeneralClusters
+from kcons.solvers.outcome import Outcome
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400
+#: Rescues of single clusters by the damped solver within one call, before the call fails.
+MAX_RESCUES = 20
 #: Rounds of the search for the nearest point on the constraints.
 NEAREST_ROUNDS = 200
 #: Halvings of one step of it.
 MAX_HALVINGS = 30
+
+
+class Task(NamedTuple):
+    """One position projection, in place on local arrays; see `ClusterSolver.positions`."""
+
+    x_new: FloatArray
+    x_ref: FloatArray
+    targets: FloatArray | None
+    lattice: FloatArray | None
+    velocities: FloatArray | None
+    inv_dt: float
+    time: float
+    reference_time: float
+
+    def given_to(self, solver: ClusterSolver, multipliers: FloatArray | None) -> Outcome:
+        """Let `solver` do it."""
+        return solver.positions(*self[:6], multipliers, self.time, self.reference_time)
+
+    def polish(self, solver: ClusterSolver, multipliers: FloatArray | None) -> None:
+        """Let `solver` do it again from where it ended; adds to `multipliers`."""
+        more = None if multipliers is None else np.empty(len(multipliers))
+        again = self.given_to(solver, more)
+        if again.converged and multipliers is not None and more is not None:
+            multipliers += more
+
+
+class Rescuers:
+    """Solvers with step control for single clusters whose own solver has none; made when first needed.
+
+    Parameters
+    ----------
+    local : ConstraintSet
+    plan : Plan
+    """
+
+    def __init__(self, local: ConstraintSet, plan: Plan) -> None:
+        self._local, self._plan = local, plan
+        self._made: dict[int, ClusterSolver] = {}
+
+    def rescue(
+        self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None
+    ) -> Outcome:
+        """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
+        extra = np.zeros(self._local.n_rows)
+        for _ in range(MAX_RESCUES):
+            if outcome.worst_row < 0:
+                return outcome
+            row = int(solver.rows[outcome.worst_row])
+            rescuer = self._rescuer(row)
+            if rescuer is None:
+                return outcome
+            piece = np.zeros(len(rescuer.rows))
+            rescued = task.given_to(rescuer, piece)
+            if not rescued.converged:
+                where = int(rescuer.rows[rescued.worst_row]) if rescued.worst_row >= 0 else row
+                index = np.flatnonzero(solver.rows == where)
+                return rescued._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
+            extra[rescuer.rows] += piece
+            outcome = task.given_to(solver, multipliers)
+            if outcome.converged:
+                if multipliers is not None:
+                    multipliers += extra[solver.rows]
+                return outcome._replace(iterations=outcome.iterations + rescued.iterations)
+        return outcome
+
+    def _rescuer(self, row: int) -> ClusterSolver | None:
+        """A solver with step control for the cluster of `row`; None if its own solver has that already."""
+        plan = self._plan
+        label = int(plan.labels[row])
+        if label not in self._made:
+            rows = np.flatnonzero(plan.labels == label)
+            if len(rows) <= RESCUE_ROWS:
+                labels = np.zeros(len(rows), dtype=np.int64)
+                self._made[label] = GeneralClusters(self._local, rows, labels, plan.inverse_masses)
+            elif any(isinstance(solver, LongChains) and row in solver.rows for solver in plan.solvers):
+                self._made[label] = sparse_distances(self._local, rows, plan.inverse_masses)
+            else:
+                return None
+        return self._made[label]
 
 
 class FarStart:

@@ -17,14 +17,11 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
-from kcons.errors import InputError
-from kcons.far_starts import RESCUE_ROWS, FarStart
-from kcons.plan import ClusterSolver, LongChains, Plan, make_plan, sparse_distances
-from kcons.solvers.general import GeneralClusters
-from kcons.solvers.outcome import Outcome
+from kcons.errors import ContradictionError, InputError, KconsError
+from kcons.far_starts import FarStart, Rescuers, Task
+from kcons.plan import Plan, make_plan
 
-#: Rescues of single clusters by the damped solver within one call, before the call fails.
-MAX_RESCUES = 20
+_FLOAT = np.dtype(np.float64)
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
 #: More Newton iterations than a time step of any use takes: the start was far off.
@@ -77,7 +74,9 @@ class Motion:
     ) -> None:
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
-        x = _positions(positions, constraint_set.n_atoms, "positions")
+        self._shape = (constraint_set.n_atoms, 3)
+        x = _positions(positions, self._shape, "positions")
+        self._given = constraint_set
         self.constraint_set = without_second_order_rows(constraint_set, x, time, convert=degenerate == "convert")
         self.n_atoms = constraint_set.n_atoms
         self.masses = constraint_set.masses
@@ -88,9 +87,19 @@ class Motion:
             self._local = self.constraint_set
         else:
             self._local, _ = self.constraint_set.subset(np.arange(self.constraint_set.n_rows))
-        self.plan: Plan = make_plan(self._local, x if self._atoms is None else x[self._atoms], time)
+        self.plan: Plan = make_plan(
+            self._local, x if self._atoms is None else x[self._atoms], time, self.constraint_set
+        )
         self._touched = touched
-        self._rescuers: dict[int, ClusterSolver] = {}
+        # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
+        self._flat: IntArray | None = None
+        if self._atoms is not None:
+            self._flat = (3 * self._atoms[:, None] + np.arange(3)).ravel()
+        self._lattice = self._local.lattice
+        self._moving = self._local.moving
+        self._several = len(self.plan.solvers) > 1 or len(self.plan.pinned) > 0
+        self._iterations = [0] * len(self.plan.solvers)
+        self._rescuers = Rescuers(self._local, self.plan)
 
     @property
     def rank(self) -> int:
@@ -143,32 +152,40 @@ class Motion:
         InputError
             Wrong shapes, or a NaN or infinity in the positions of a constrained atom.
         """
-        x = _positions(x_new, self.n_atoms, "x_new")
-        ref = _positions(x_ref, self.n_atoms, "x_ref")
-        if out is None:
-            out = x.copy()
-        elif out is not x_new:
-            _check_out(out, self.n_atoms)
-            np.copyto(out, x)
-        elif out is not x:
-            raise InputError("in-place work needs a contiguous float64 array", item="out")
+        x = _positions(x_new, self._shape, "x_new")
+        ref = _positions(x_ref, self._shape, "x_ref")
+        if out is not None:
+            _check_out(out, self._shape)
         inv_dt = 0.0
         if velocities is not None:
-            _check_out(velocities, self.n_atoms, "velocities")
+            _check_out(velocities, self._shape, "velocities")
             if not dt or not np.isfinite(dt):
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / dt
+        if multipliers is not None:
+            self._check_multipliers(multipliers)
         reference_time = time if reference_time is None else reference_time
-        if self._atoms is None:
-            self._positions_direct(out, ref, time, reference_time, velocities, inv_dt, multipliers)
-            return out
         atoms = self._atoms
-        part = out[atoms]
-        speeds = None if velocities is None else velocities[atoms]
-        self._positions_direct(part, ref[atoms], time, reference_time, speeds, inv_dt, multipliers)
-        out[atoms] = part
+        if atoms is None:
+            work = x if out is x_new else x.copy()
+            if np.may_share_memory(work, ref):
+                ref = ref.copy()
+            self._positions_direct(work, ref, time, reference_time, velocities, inv_dt, multipliers)
+            if out is None:
+                return work
+            if out is not x_new:
+                np.copyto(out, work)
+            return out
+        part = x.take(atoms, 0)
+        speeds = None if velocities is None else velocities.take(atoms, 0)
+        self._positions_direct(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers)
+        if out is None:
+            out = x.copy()
+        elif out is not x_new:
+            np.copyto(out, x)
+        out.put(self._flat, part)
         if velocities is not None:
-            velocities[atoms] = speeds
+            velocities.put(self._flat, speeds)
         return out
 
     def _positions_direct(
@@ -183,106 +200,65 @@ class Motion:
     ) -> None:
         """Run all solvers on the local arrays in place; restore them and raise if one fails."""
         plan = self.plan
-        targets = self._local.target(time) if self._local.moving else None
+        lattice = self._cell()
+        targets = self._local.target(time) if self._moving else None
         # One solver alone restores what it changed; several need a copy to go back to.
-        several = len(plan.solvers) > 1 or len(plan.pinned) > 0
-        saved = (x.copy(), None if velocities is None else velocities.copy()) if several else None
+        saved = (x.copy(), None if velocities is None else velocities.copy()) if self._several else None
         if len(plan.pinned):
-            x[plan.pinned] = plan.pinned_targets(targets, self._local)
-        for solver in plan.solvers:
+            x[plan.pinned] = plan.pinned_targets(targets)
+            if plan.loose is not None and saved is not None:
+                try:
+                    plan.check_loose_rows(x, time)
+                except ContradictionError:
+                    np.copyto(x, saved[0])
+                    raise
+        found: list[FloatArray | None] = []
+        for k, solver in enumerate(plan.solvers):
             lam = None if multipliers is None else np.empty(len(solver.rows))
-            outcome = solver.positions(
-                x, ref, targets, self._local.lattice, velocities, inv_dt, lam, time, reference_time
-            )
-            if not outcome.converged:
+            outcome = solver.positions(x, ref, targets, lattice, velocities, inv_dt, lam, time, reference_time)
+            if not outcome.converged or outcome.iterations > MANY_ITERATIONS:
                 if saved is None:
                     saved = (x.copy(), None if velocities is None else velocities.copy())
-                error = diagnosis.unusable(self._local, self._numbers, {"x_new": x, "x_ref": ref}, outcome, solver)
-                if error is None:
-                    outcome = self._rescue(
-                        solver, outcome, x, ref, targets, velocities, inv_dt, lam, time, reference_time
-                    )
+                task = Task(x, ref, targets, lattice, velocities, inv_dt, time, reference_time)
+                error: KconsError | None = None
+                if not outcome.converged:
+                    arrays = {"x_new": x, "x_ref": ref}
+                    error = diagnosis.unusable(self._local, self._atoms, arrays, outcome, solver)
+                    if error is None:
+                        outcome = self._rescuers.rescue(solver, outcome, task, lam)
                 if not outcome.converged:
                     np.copyto(x, saved[0])
                     if velocities is not None and saved[1] is not None:
                         np.copyto(velocities, saved[1])
-                    raise error or diagnosis.positions_failed(self._local, self._numbers, outcome, solver, plan)
-            if outcome.iterations > MANY_ITERATIONS:
-                # A far start leaves the rounding of its size; once more from the near end removes it.
-                self._polish(solver, x, ref, targets, velocities, inv_dt, lam, time, reference_time)
-            if multipliers is not None and lam is not None:
-                multipliers[solver.rows] = lam
+                    raise error or diagnosis.positions_failed(self._local, self._atoms, outcome, solver, plan)
+                if outcome.iterations > MANY_ITERATIONS:
+                    # A far start leaves the rounding of its size; once more from the near end removes it.
+                    task.polish(solver, lam)
+            self._iterations[k] = outcome.iterations
+            found.append(lam)
+        if multipliers is not None:
+            self._collect(found, multipliers)
 
-    def _polish(
-        self,
-        solver: ClusterSolver,
-        x: FloatArray,
-        ref: FloatArray,
-        targets: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        lam: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> None:
-        more = None if lam is None else np.empty(len(lam))
-        again = solver.positions(x, ref, targets, self._local.lattice, velocities, inv_dt, more, time, reference_time)
-        if again.converged and lam is not None and more is not None:
-            lam += more
+    def _collect(self, found: list[FloatArray | None], multipliers: FloatArray) -> None:
+        """Multipliers of all solvers by row; 0 for rows that none of them has."""
+        if (self.plan.labels < 0).any():
+            multipliers[:] = 0.0
+        for solver, lam in zip(self.plan.solvers, found, strict=True):
+            multipliers[solver.rows] = lam
 
-    def _rescue(
-        self,
-        solver: ClusterSolver,
-        outcome: Outcome,
-        x: FloatArray,
-        ref: FloatArray,
-        targets: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        lam: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
-        """Solve the failing cluster by damped Newton, then let the fast solver go on from there."""
-        extra = np.zeros(self._local.n_rows)
-        for _ in range(MAX_RESCUES):
-            if outcome.worst_row < 0:
-                return outcome
-            row = int(solver.rows[outcome.worst_row])
-            general = self._rescuer(row)
-            if general is None:
-                return outcome
-            piece = np.zeros(len(general.rows))
-            rescued = general.positions(
-                x, ref, targets, self._local.lattice, velocities, inv_dt, piece, time, reference_time
-            )
-            if not rescued.converged:
-                where = int(general.rows[rescued.worst_row]) if rescued.worst_row >= 0 else row
-                index = np.flatnonzero(solver.rows == where)
-                return rescued._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
-            extra[general.rows] += piece
-            outcome = solver.positions(
-                x, ref, targets, self._local.lattice, velocities, inv_dt, lam, time, reference_time
-            )
-            if outcome.converged:
-                if lam is not None:
-                    lam += extra[solver.rows]
-                return outcome
-        return outcome
+    def _cell(self) -> FloatArray | None:
+        """The cell as it is now, which a barostat may have changed in the set that was given."""
+        for source in (self._given, self.constraint_set):
+            if source.lattice is not self._lattice:
+                self._lattice = source.lattice
+                self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
+        return self._lattice
 
-    def _rescuer(self, row: int) -> ClusterSolver | None:
-        """A solver with step control for the cluster of `row`; None if its own solver has that already."""
-        label = int(self.plan.labels[row])
-        if label not in self._rescuers:
-            rows = np.flatnonzero(self.plan.labels == label)
-            if len(rows) <= RESCUE_ROWS:
-                labels = np.zeros(len(rows), dtype=np.int64)
-                self._rescuers[label] = GeneralClusters(self._local, rows, labels, self.plan.inverse_masses)
-            elif any(isinstance(solver, LongChains) and row in solver.rows for solver in self.plan.solvers):
-                self._rescuers[label] = sparse_distances(self._local, rows, self.plan.inverse_masses)
-            else:
-                return None
-        return self._rescuers[label]
+    def _check_multipliers(self, multipliers: FloatArray) -> None:
+        n = self.constraint_set.n_rows
+        good = isinstance(multipliers, np.ndarray) and multipliers.dtype == np.float64 and multipliers.shape == (n,)
+        if not good or not multipliers.flags.writeable:
+            raise InputError(f"multipliers must be a writable float64 array of shape ({n},)", item="multipliers")
 
     def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
         """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
@@ -295,18 +271,20 @@ class Motion:
         InfeasibleError
             The residual cannot be made smaller; nothing was changed.
         """
-        result = _positions(x, self.n_atoms, "positions").copy()
+        if out is not None:
+            _check_out(out, self._shape)
+        self._cell()
+        result = _positions(x, self._shape, "positions").copy()
         local = result if self._atoms is None else result[self._atoms]
-        targets = self._local.target(time) if self._local.moving else None
+        targets = self._local.target(time) if self._moving else None
         if len(self.plan.pinned):
-            local[self.plan.pinned] = self.plan.pinned_targets(targets, self._local)
-        start = FarStart(self._local, self.plan, self._numbers, self._positions_direct, self._tangents)
+            local[self.plan.pinned] = self.plan.pinned_targets(targets)
+        start = FarStart(self._local, self.plan, self._atoms, self._positions_direct, self._tangents)
         start.restore(local, time)
         if self._atoms is not None:
             result[self._atoms] = local
         if out is None:
             return result
-        _check_out(out, self.n_atoms)
         np.copyto(out, result)
         return out
 
@@ -339,25 +317,36 @@ class Motion:
         ConvergenceError, InputError
             As `project_positions`; nothing was changed.
         """
-        y = _positions(v, self.n_atoms, "velocities")
-        here = _positions(x, self.n_atoms, "positions")
+        y = _positions(v, self._shape, "velocities")
+        here = _positions(x, self._shape, "positions")
+        if out is not None:
+            _check_out(out, self._shape)
+        if multipliers is not None:
+            self._check_multipliers(multipliers)
+        atoms = self._atoms
+        if atoms is None:
+            work = y if out is v else y.copy()
+            if np.may_share_memory(work, here):
+                here = here.copy()
+            self._tangents(here, work, self._rates(here, time), time, multipliers, "velocity")
+            if out is None:
+                return work
+            if out is not v:
+                np.copyto(out, work)
+            return out
+        here = here.take(atoms, 0)
+        part = y.take(atoms, 0)
+        self._tangents(here, part, self._rates(here, time), time, multipliers, "velocity")
         if out is None:
             out = y.copy()
         elif out is not v:
-            _check_out(out, self.n_atoms)
             np.copyto(out, y)
-        elif out is not y:
-            raise InputError("in-place work needs a contiguous float64 array", item="out")
-        atoms = self._atoms
-        local_x = here if atoms is None else here[atoms]
-        local_v = out if atoms is None else out[atoms]
-        rates = None
-        if self.plan.driven:
-            rates = self._local.velocity_target(local_x, time)
-        self._tangents(local_x, local_v, rates, time, multipliers, "velocity")
-        if atoms is not None:
-            out[atoms] = local_v
+        out.put(self._flat, part)
         return out
+
+    def _rates(self, x: FloatArray, time: float) -> FloatArray | None:
+        """c of A v = c at local positions; None if it is 0."""
+        return self._local.velocity_target(x, time) if self.plan.driven else None
 
     def _tangents(
         self,
@@ -369,19 +358,21 @@ class Motion:
         what: str,
     ) -> None:
         plan = self.plan
-        several = len(plan.solvers) > 1 or len(plan.pinned) > 0
-        saved = y.copy() if several else None
+        lattice = self._cell()
+        saved = y.copy() if self._several else None
         if len(plan.pinned):
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
+        found: list[FloatArray | None] = []
         for solver in plan.solvers:
             lam = None if multipliers is None else np.empty(len(solver.rows))
-            outcome = solver.tangents(x, y, rates, self._local.lattice, lam, time)
+            outcome = solver.tangents(x, y, rates, lattice, lam, time)
             if not outcome.converged:
                 if saved is not None:
                     np.copyto(y, saved)
-                raise diagnosis.tangents_failed(self._local, self._numbers, x, y, outcome, solver, what, plan)
-            if multipliers is not None and lam is not None:
-                multipliers[solver.rows] = lam
+                raise diagnosis.tangents_failed(self._local, self._atoms, x, y, outcome, solver, what, plan)
+            found.append(lam)
+        if multipliers is not None:
+            self._collect(found, multipliers)
 
     def acceleration(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected)."""
@@ -398,14 +389,14 @@ class Motion:
     def constraint_force(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """z = M a - f, the constraint force, shape (n_atoms, 3) (notes eq. 101)."""
         lam = self._accelerate(x, v, f, time)[1]
-        here = _positions(x, self.n_atoms, "positions")
+        here = _positions(x, self._shape, "positions")
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
     def _accelerate(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> tuple[FloatArray, FloatArray]:
-        here = _positions(x, self.n_atoms, "positions")
-        speed = _positions(v, self.n_atoms, "velocities")
-        force = _positions(f, self.n_atoms, "forces")
+        here = _positions(x, self._shape, "positions")
+        speed = _positions(v, self._shape, "velocities")
+        force = _positions(f, self._shape, "forces")
         with np.errstate(divide="ignore", invalid="ignore"):
             a = force / self.masses[:, None]
         local_x, local_v = (here, speed) if self._atoms is None else (here[self._atoms], speed[self._atoms])
@@ -414,7 +405,7 @@ class Motion:
             b = self._local.acceleration_target(local_x, local_v, time)
         if not np.all(np.isfinite(b)):
             arrays = {"velocity": local_v, "position": local_x}
-            raise diagnosis.undefined_row(self._local, self._numbers, arrays, int(np.argmin(np.isfinite(b))))
+            raise diagnosis.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
         mu = np.zeros(self._local.n_rows)
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
@@ -435,10 +426,11 @@ class Motion:
         if not self.plan.dependent:
             return lam
         jacobian = self._local.jacobian(x, time)
+        movable = np.repeat(self.plan.inverse_masses > 0, 3)
         for rows in self.plan.dependent:
             part = jacobian[rows]
             transposed = part.T.tocsr()
-            used = np.flatnonzero(np.diff(transposed.indptr))
+            used = np.flatnonzero((np.diff(transposed.indptr) > 0) & movable)
             transposed = transposed[used]
             force = transposed @ lam[rows]
             if len(rows) <= DENSE_ROWS:
@@ -449,68 +441,57 @@ class Motion:
                 lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
         return lam
 
-    def project_forces(self, x: ArrayLike, f: ArrayLike, *, out: FloatArray | None = None) -> FloatArray:
+    def project_forces(
+        self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
+    ) -> FloatArray:
         """f + z with b = 0: what is left of the force on the surface, for optimisers, shape (n_atoms, 3)."""
-        force = _positions(f, self.n_atoms, "forces")
-        here = _positions(x, self.n_atoms, "positions")
+        force = _positions(f, self._shape, "forces")
+        here = _positions(x, self._shape, "positions")
+        if out is not None:
+            _check_out(out, self._shape)
+        touched, masses = self._touched, self._local.masses[:, None]
+        local = force if self._atoms is None else force.take(touched, 0)
+        y = local * self.plan.inverse_masses[:, None]
+        self._tangents(here if self._atoms is None else here.take(touched, 0), y, None, time, None, "force")
+        if self._atoms is None:
+            y, masses = y.take(touched, 0), masses[touched]
         result = force.copy() if out is None else out
-        if result is not force:
+        if result is not f:
             np.copyto(result, force)
-        if len(self._touched) == 0:
-            return result
-        atoms = self._atoms
-        masses = self._local.masses[:, None]
-        local_f = force if atoms is None else force[atoms]
-        y = local_f * self.plan.inverse_masses[:, None]
-        self._tangents(here if atoms is None else here[atoms], y, None, 0.0, None, "force")
-        y *= masses
-        if atoms is None:
-            # Atoms that no row touches keep their force to the last bit.
-            if len(self._touched) == self.n_atoms:
-                np.copyto(result, y)
-            else:
-                result[self._touched] = y[self._touched]
-        else:
-            result[atoms] = y
+        # Atoms that no row touches keep their force to the last bit.
+        result[touched] = y * masses
         return result
 
     # -- report ---------------------------------------------------------------------------------
 
     def report(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0) -> diagnosis.Report:
         """Rows, rank, condition, residuals and the solver of each kind of cluster, at `x` (and `v`)."""
-        here = _positions(x, self.n_atoms, "positions")
-        speed = None if v is None else _positions(v, self.n_atoms, "velocities")
+        here = _positions(x, self._shape, "positions")
+        speed = None if v is None else _positions(v, self._shape, "velocities")
         return diagnosis.make_report(self.constraint_set, self.plan, here, speed, time)
-
-    @property
-    def _numbers(self) -> IntArray | None:
-        """Global numbers of the local atoms, None if they are the same."""
-        return self._atoms
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"
 
 
-def _positions(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
-    if (
-        type(values) is np.ndarray
-        and values.dtype == np.float64
-        and values.shape == (n_atoms, 3)
-        and values.flags.c_contiguous
-    ):
+def _positions(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
+    if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.c_contiguous:
         return values
-    array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
-    if array.shape != (n_atoms, 3):
-        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
+    try:
+        array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+    if array.shape != shape:
+        raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
     return array
 
 
-def _check_out(out: FloatArray, n_atoms: int, item: str = "out") -> None:
+def _check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
     if (
         not isinstance(out, np.ndarray)
-        or out.dtype != np.float64
-        or out.shape != (n_atoms, 3)
-        or not out.flags.c_contiguous
-        or not out.flags.writeable
+        or out.dtype is not _FLOAT
+        and out.dtype != _FLOAT
+        or out.shape != shape
+        or not out.flags.carray
     ):
-        raise InputError(f"{item} must be a writeable, contiguous float64 array of shape ({n_atoms}, 3)", item=item)
+        raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)

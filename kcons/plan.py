@@ -76,6 +76,10 @@ class Plan:
 
     Attributes
     ----------
+    constraint_set : ConstraintSet
+        What the solvers work on.
+    named : ConstraintSet
+        The same rows with the atom numbers that the user knows, for messages.
     solvers : list of ClusterSolver
     labels : ndarray of int, shape (n_rows,)
         Cluster of each row; -1 for rows that hold fixed atoms or lie between fixed atoms only.
@@ -90,9 +94,12 @@ class Plan:
     kinds : list of ClusterKind
     dependent : list of ndarray of int
         Rows of each cluster in which rows may depend on each other.
+    loose : ndarray of int or None
+        Rows between fixed atoms that motion of these may break.
     """
 
     constraint_set: ConstraintSet
+    named: ConstraintSet
     solvers: list[ClusterSolver]
     labels: IntArray
     pinned: IntArray
@@ -102,12 +109,49 @@ class Plan:
     driven: bool
     kinds: list[ClusterKind] = field(default_factory=list)
     dependent: list[IntArray] = field(default_factory=list)
+    loose: IntArray | None = None
+    _places: FloatArray | None = None
 
-    def pinned_targets(self, targets: FloatArray | None, local: ConstraintSet) -> FloatArray:
+    def pinned_targets(self, targets: FloatArray | None) -> FloatArray:
         """Where fixed atoms are held, shape (len(pinned), 3)."""
-        if targets is None:
-            targets = local.target(0.0)
-        return targets[self.pinned_rows].reshape(-1, 3)
+        if targets is not None:
+            return targets[self.pinned_rows].reshape(-1, 3)
+        if self._places is None:
+            self._places = self.constraint_set.target(0.0)[self.pinned_rows].reshape(-1, 3)
+        return self._places
+
+    def check_loose_rows(self, x: FloatArray, time: float) -> None:
+        """Refuse rows between fixed atoms only that are not fulfilled; the others need no solver.
+
+        Raises
+        ------
+        ContradictionError
+            A position row is off at `x`, or a velocity row asks for another speed than that of the atoms.
+        """
+        if self.loose is None:
+            return
+        whole = self.constraint_set
+        with np.errstate(invalid="ignore"):
+            miss = np.abs(whole.value(x, time))
+            allowed = np.maximum(whole.tolerance(x, time), 1e-10 * whole.scale)
+            if not whole.holonomic[self.loose].all():
+                speed = whole.velocity_target(x, time)
+                v = np.zeros_like(x)
+                v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
+                jacobian = whole.jacobian(x, time)
+                size = np.abs(speed) + abs(jacobian) @ np.abs(v.ravel())
+                free = ~whole.holonomic
+                miss[free] = np.abs(jacobian @ v.ravel() - speed)[free]
+                allowed[free] = 1e-10 * size[free]
+        bad = self.loose[~(miss[self.loose] <= allowed[self.loose])]
+        if len(bad):
+            row = int(bad[0])
+            raise ContradictionError(
+                f"row {self.named.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}; "
+                "remove it or free one of its atoms",
+                rows=[row],
+                atoms=self.named.row_atoms(row),
+            )
 
     def general_for_all(self, limit: int) -> GeneralClusters:
         """The damped solver for every cluster, for positions that are far off.
@@ -120,7 +164,7 @@ class Plan:
         rows = np.flatnonzero(self.labels >= 0)
         sizes = np.bincount(self.labels[rows])
         if len(sizes) and sizes.max() > limit:
-            name = self.constraint_set.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
+            name = self.named.row_name(int(rows[np.argmax(self.labels[rows] == np.argmax(sizes))]))
             raise UnsupportedError(
                 f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
                 "to the constraints (minimise with harmonic bonds first), or hold fewer rows"
@@ -128,8 +172,20 @@ class Plan:
         return GeneralClusters(self.constraint_set, rows, self.labels[rows], self.inverse_masses)
 
 
-def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float) -> Plan:
-    """Find the clusters, their rank, and a solver for each."""
+def make_plan(
+    constraint_set: ConstraintSet, positions: FloatArray, time: float, named: ConstraintSet | None = None
+) -> Plan:
+    """Find the clusters, their rank, and a solver for each.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+    positions : ndarray, shape (n_atoms, 3)
+    time : float
+    named : ConstraintSet, optional
+        The same rows on the atom numbers of the whole system, for messages.
+    """
+    named = constraint_set if named is None else named
     pinned, pinned_rows = _pinned(constraint_set)
     inverse_masses = np.zeros(constraint_set.n_atoms)
     touched = constraint_set.touched
@@ -138,9 +194,16 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
         inverse_masses[touched] /= constraint_set.masses[touched]
     inverse_masses[pinned] = 0.0
     labels = cluster_labels(constraint_set, pinned, pinned_rows)
-    _check_rows_between_fixed(constraint_set, positions, labels, pinned_rows, time)
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
-    plan = Plan(constraint_set, [], labels, pinned, pinned_rows, inverse_masses, len(pinned_rows), driven, [])
+    rank = len(pinned_rows)
+    plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, rank, driven)
+    loose = labels < 0
+    loose[pinned_rows] = False
+    if loose.any():
+        plan.loose = np.flatnonzero(loose)
+        plan.check_loose_rows(positions, time)
+        if not constraint_set.moving:
+            plan.loose = None
     for shape in classify(constraint_set, labels, inverse_masses):
         solver = _solver(shape, constraint_set, inverse_masses, labels, time)
         if shape.independent:
@@ -157,7 +220,7 @@ def make_plan(constraint_set: ConstraintSet, positions: FloatArray, time: float)
                 solver = _solver(shape, constraint_set, inverse_masses, labels, time)
         plan.solvers.append(solver)
         plan.rank += rank
-        example = constraint_set.row_name(int(shape.rows.ravel()[0]))
+        example = named.row_name(int(shape.rows.ravel()[0]))
         plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
     return plan
 
@@ -180,27 +243,6 @@ def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
     if not atoms:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(atoms), np.concatenate(rows)
-
-
-def _check_rows_between_fixed(
-    constraint_set: ConstraintSet, positions: FloatArray, labels: IntArray, pinned_rows: IntArray, time: float
-) -> None:
-    """Rows between fixed atoms only are dropped if fulfilled, and refused if not."""
-    loose = labels < 0
-    loose[pinned_rows] = False
-    if not loose.any():
-        return
-    miss = np.abs(constraint_set.value(positions, time))
-    allowed = np.maximum(constraint_set.tolerance(positions, time), 1e-10 * constraint_set.scale)
-    bad = np.flatnonzero(loose & ~(miss <= allowed))
-    if len(bad):
-        row = int(bad[0])
-        raise ContradictionError(
-            f"row {constraint_set.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}; "
-            "remove it or free one of its atoms",
-            rows=[row],
-            atoms=constraint_set.row_atoms(row),
-        )
 
 
 class DistanceClusters:

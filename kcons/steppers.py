@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-import scipy.sparse.csgraph
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
@@ -432,10 +431,12 @@ class _VelocityRows:
     """
 
     def __init__(self, system: System) -> None:
+        from scipy.sparse.csgraph import connected_components  # slow to import, rarely needed
+
         self.system = system
         whole = system.motion.constraint_set
         links = whole.incidence @ whole.incidence.T
-        labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+        labels = connected_components(links, directed=False)[1]
         velocity = ~whole.holonomic
         self.rows: IntArray = np.flatnonzero(np.isin(labels, labels[velocity])).astype(np.int64)
         self.held, self.atoms = whole.subset(self.rows)

@@ -131,6 +131,7 @@ class GeneralClusters:
         reference_time: float,
     ) -> Outcome:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
+        self.subset.lattice = lattice
         state = x_new[self.atoms]
         with np.errstate(all="ignore"):
             reference = self._data(x_ref[self.atoms], reference_time)
@@ -281,6 +282,7 @@ class GeneralClusters:
         time: float,
     ) -> Outcome:
         """y <- y - M^-1 A^T mu with A y = rates, in place; see `Motion.project_velocities`."""
+        self.subset.lattice = lattice
         with np.errstate(all="ignore"):
             data = self._data(x[self.atoms], time)
             local = y[self.atoms]
