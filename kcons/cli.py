@@ -103,6 +103,7 @@ def _compare(chosen: argparse.Namespace) -> int:
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
     asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt}
+    _check_scene(chosen)
     with Bars() as watcher:
         watcher.begin("building the scene" + ("" if compare.kernels_cached() else "; compiling kernels (once)"), 1)
         scene = _scene(chosen, quick=chosen.quick)
@@ -120,13 +121,20 @@ def _compare(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
+def _check_scene(chosen: argparse.Namespace) -> None:
     from kcons import scenes
 
     if chosen.scene is None:
         raise InputError(f"name a scene: {', '.join(scenes.SCENES)}", item="scene")
+    if chosen.scene not in scenes.SCENES:
+        raise InputError(f"there is no scene {chosen.scene!r}; there are {', '.join(scenes.SCENES)}", item="scene")
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
+
+
+def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
+    from kcons import scenes
+
     return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick)
 
 
@@ -157,6 +165,7 @@ def _console() -> Console:
 def _plan(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return _list()
+    _check_scene(chosen)
     scene = _scene(chosen)
     print(scene.title)
     print(scene.motion.report(scene.positions, scene.velocities))
