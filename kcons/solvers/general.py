@@ -162,14 +162,19 @@ class GeneralClusters:
         """Damped Newton along fixed directions, all clusters of a batch side by side, in place."""
         held = self._held[batch.rows]
         size0 = np.linalg.norm(b0, axis=2)
-        bad = held & ~(size0 > 0)
+        bad = held & ~(np.isfinite(size0) & (size0 > 0))
         if bad.any():
             return _failed(batch, bad, 0)
         unit0 = np.where(held[..., None], b0 / size0[..., None], 0.0)
+        # Unknowns are the parts along an orthonormal basis of the reference rows: the matrix then has the
+        # condition of the rows and not its square, and dependent rows are out of it from the start.
+        u0, s0, v0t = np.linalg.svd(unit0, full_matrices=False)
+        kept = s0 > RANK_TOLERANCE * s0[:, :1]
+        basis = v0t * kept[..., None]
         scale = self._scale[batch.rows]
         root_w = self._root_w[batch.columns]
         flat, flat_moves = state.reshape(-1), moves.reshape(-1)
-        lam = np.zeros(batch.rows.shape)
+        along = np.zeros(kept.shape)
         sigma = self._sigma(batch, state, time) * held
         error = _rms(sigma / scale)
         done = np.zeros(len(batch.rows), dtype=bool)
@@ -184,7 +189,8 @@ class GeneralClusters:
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
                 if turned.any():
                     return _failed(batch, turned, iteration)
-                total[batch.rows] = np.where(held, lam / np.where(held, size0, 1.0), 0.0)
+                unit_lam = np.einsum("nkr,nr->nk", u0, np.where(kept, along / np.where(kept, s0, 1.0), 0.0))
+                total[batch.rows] = np.where(held, unit_lam / np.where(held, size0, 1.0), 0.0)
                 where = np.unravel_index(int(np.argmax(relative)), relative.shape)
                 return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))
             size = np.linalg.norm(b, axis=2)
@@ -192,8 +198,9 @@ class GeneralClusters:
             if bad.any():
                 return _failed(batch, bad, iteration)
             safe = np.where(held, size, 1.0)
-            step = -_least_norm(np.einsum("nkc,njc->nkj", b, unit0) / safe[..., None], sigma / safe)
-            shift = root_w * np.einsum("nkc,nk->nc", unit0, step)
+            rows = np.where(held[..., None], b / safe[..., None], 0.0)
+            step = -_least_norm(np.einsum("nkc,nrc->nkr", rows, basis), sigma / safe)
+            shift = root_w * np.einsum("nrc,nr->nc", basis, step)
             here = flat[batch.columns]
             factor = np.where(done, 0.0, 1.0)
             for _ in range(_HALVINGS):
@@ -210,7 +217,7 @@ class GeneralClusters:
                 flat[batch.columns] = here
                 return _failed(batch, held & worse[:, None], iteration, relative)
             polished |= settled
-            lam += factor[:, None] * step
+            along += factor[:, None] * step
             flat_moves[batch.columns] += factor[:, None] * shift
             sigma, error = trial, trial_error
         return _failed(batch, held & ~done[:, None], MAX_ITERATIONS, np.abs(sigma) / scale)
