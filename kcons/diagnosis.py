@@ -8,12 +8,38 @@ from typing import Protocol
 
 import numpy as np
 
+from kcons.conditioning import worst_condition
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
-from kcons.plan import ClusterKind, Plan
+from kcons.plan import Plan
 from kcons.solvers.outcome import Outcome
+
+
+@dataclass(frozen=True)
+class KindReport:
+    """Clusters of one kind at given positions.
+
+    Attributes
+    ----------
+    solver : str
+    clusters, rows, rank : int
+    condition : float
+        Of the worst cluster, see `kcons.conditioning`; NaN where it was not asked for or is out of reach.
+    iterations : int
+        Newton iterations of the worst cluster in the last position projection; 0 before the first.
+    example : str
+        Name of one row.
+    """
+
+    solver: str
+    clusters: int
+    rows: int
+    rank: int
+    condition: float
+    iterations: int
+    example: str
 
 
 @dataclass(frozen=True)
@@ -23,22 +49,28 @@ class Report:
     Attributes
     ----------
     rows, rank, degrees_of_freedom : int
+    condition : float
+        The largest of the clusters' conditions; NaN if one is not known, 1 without clusters.
     residual : float
         max |sigma|, natural units.
     velocity_residual : float
         max |A v - c| with rows scaled to unit norm; NaN without velocities.
+    iterations : int
+        Newton iterations of the last position projection.
     worst_row : str
-        Name of the row with the largest |sigma|.
-    kinds : sequence of ClusterKind
+        Name of the row with the largest |sigma| for its scale.
+    kinds : sequence of KindReport
     """
 
     rows: int
     rank: int
     degrees_of_freedom: int
+    condition: float
     residual: float
     velocity_residual: float
+    iterations: int
     worst_row: str
-    kinds: Sequence[ClusterKind]
+    kinds: Sequence[KindReport]
 
     def __str__(self) -> str:
         lines = [
@@ -47,30 +79,66 @@ class Report:
         ]
         if not np.isnan(self.velocity_residual):
             lines.append(f"max |A v - c| {self.velocity_residual:.2e}")
-        lines.append(f"{'solver':<12}{'clusters':>9}{'rows':>9}{'rank':>9}  for example")
-        lines += [f"{k.solver:<12}{k.clusters:>9}{k.rows:>9}{k.rank:>9}  {k.example}" for k in self.kinds]
+        titles = f"{'clusters':>9}{'rows':>9}{'rank':>9}{'condition':>11}{'iterations':>12}"
+        lines.append(f"{'solver':<12}{titles}  for example")
+        for k in self.kinds:
+            condition = "-" if np.isnan(k.condition) else f"{k.condition:.3g}"
+            iterations = k.iterations or "-"
+            numbers = f"{k.clusters:>9}{k.rows:>9}{k.rank:>9}{condition:>11}{iterations:>12}"
+            lines.append(f"{k.solver:<12}{numbers}  {k.example}")
         return "\n".join(lines)
 
 
-def make_report(constraint_set: ConstraintSet, plan: Plan, x: FloatArray, v: FloatArray | None, time: float) -> Report:
-    """Evaluate the set at `x` (and `v`)."""
+def make_report(
+    constraint_set: ConstraintSet,
+    plan: Plan,
+    x: FloatArray,
+    v: FloatArray | None,
+    time: float,
+    iterations: Sequence[int],
+    *,
+    condition: bool = True,
+) -> Report:
+    """Evaluate the set at `x` (and `v`); `iterations` by solver of the plan."""
     sigma = np.abs(constraint_set.value(x, time))
     worst = int(np.argmax(sigma / constraint_set.scale)) if len(sigma) else -1
     speed = float("nan")
+    jacobian = constraint_set.jacobian(x, time)
     if v is not None:
-        jacobian = constraint_set.jacobian(x, time)
         norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
         miss = np.abs(jacobian @ v.ravel() - constraint_set.velocity_target(x, time))
         speed = float(np.max(miss / np.where(norms > 0, norms, 1.0), initial=0.0))
+    conditions = [float("nan")] * len(plan.kinds)
+    if condition:
+        inverse_masses = _inverse_masses(constraint_set)
+        conditions = [
+            worst_condition(jacobian, inverse_masses, solver.rows, plan.labels, deficiency=kind.rows - kind.rank)
+            for solver, kind in zip(plan.solvers, plan.kinds, strict=True)
+        ]
+    kinds = [
+        KindReport(k.solver, k.clusters, k.rows, k.rank, found, count, k.example)
+        for k, found, count in zip(plan.kinds, conditions, iterations, strict=True)
+    ]
     return Report(
         rows=constraint_set.n_rows,
         rank=plan.rank,
         degrees_of_freedom=3 * constraint_set.n_atoms - plan.rank,
+        condition=float(np.max(conditions, initial=1.0)),
         residual=float(np.max(sigma, initial=0.0)),
         velocity_residual=speed,
+        iterations=max(iterations, default=0),
         worst_row=constraint_set.row_name(worst) if worst >= 0 else "no rows",
-        kinds=plan.kinds,
+        kinds=kinds,
     )
+
+
+def _inverse_masses(constraint_set: ConstraintSet) -> FloatArray:
+    """1/m of the atoms that rows touch, 0 for fixed atoms, shape (n_atoms,)."""
+    fixed = [c.atoms.ravel() for c in constraint_set.constraints if c.family == "FixedAtoms"]
+    movable = np.setdiff1d(constraint_set.touched, np.concatenate(fixed)) if fixed else constraint_set.touched
+    inverse = np.zeros(constraint_set.n_atoms)
+    inverse[movable] = 1.0 / constraint_set.masses[movable]
+    return inverse
 
 
 class HasRows(Protocol):
@@ -190,7 +258,8 @@ def tangents_failed(
     name, atoms = _row_label(constraint_set, numbers, row)
     return ConvergenceError(
         f"the {what} projection leaves a residual of {outcome.residual:.3g} in row {name}: the rows contradict "
-        "each other at these positions (A A+ b differs from b), or a gradient is undefined there",
+        "each other at these positions (A A+ b differs from b), or a gradient is undefined there. Remove or change "
+        "one of the rows, or move its atoms off the singular point",
         residual=outcome.residual,
         iterations=outcome.iterations,
         row=row,

@@ -63,9 +63,7 @@ class Rescuers:
         self._local, self._plan = local, plan
         self._made: dict[int, ClusterSolver] = {}
 
-    def rescue(
-        self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None
-    ) -> Outcome:
+    def rescue(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
         extra = np.zeros(self._local.n_rows)
         for _ in range(MAX_RESCUES):

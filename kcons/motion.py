@@ -7,6 +7,7 @@ that names the row, with nothing changed, where there is no solution.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Literal
 
 import numpy as np
@@ -92,9 +93,7 @@ class Motion:
         )
         self._touched = touched
         # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
-        self._flat: IntArray | None = None
-        if self._atoms is not None:
-            self._flat = (3 * self._atoms[:, None] + np.arange(3)).ravel()
+        self._flat: IntArray = (3 * touched[:, None] + np.arange(3)).ravel() if self._atoms is not None else touched
         self._lattice = self._local.lattice
         self._moving = self._local.moving
         self._several = len(self.plan.solvers) > 1 or len(self.plan.pinned) > 0
@@ -159,7 +158,7 @@ class Motion:
         inv_dt = 0.0
         if velocities is not None:
             _check_out(velocities, self._shape, "velocities")
-            if not dt or not np.isfinite(dt):
+            if not dt or not isfinite(dt):
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / dt
         if multipliers is not None:
@@ -184,7 +183,7 @@ class Motion:
         elif out is not x_new:
             np.copyto(out, x)
         out.put(self._flat, part)
-        if velocities is not None:
+        if velocities is not None and speeds is not None:
             velocities.put(self._flat, speeds)
         return out
 
@@ -464,11 +463,19 @@ class Motion:
 
     # -- report ---------------------------------------------------------------------------------
 
-    def report(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0) -> diagnosis.Report:
-        """Rows, rank, condition, residuals and the solver of each kind of cluster, at `x` (and `v`)."""
+    def report(
+        self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True
+    ) -> diagnosis.Report:
+        """Rows, rank, condition, residuals, iterations and the solver of each kind of cluster, at `x` (and `v`).
+
+        ``condition=False`` leaves out the condition numbers, which take longer than all else in the report.
+        """
         here = _positions(x, self._shape, "positions")
         speed = None if v is None else _positions(v, self._shape, "velocities")
-        return diagnosis.make_report(self.constraint_set, self.plan, here, speed, time)
+        self._cell()
+        return diagnosis.make_report(
+            self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition
+        )
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"
@@ -487,11 +494,5 @@ def _positions(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArr
 
 
 def _check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
-    if (
-        not isinstance(out, np.ndarray)
-        or out.dtype is not _FLOAT
-        and out.dtype != _FLOAT
-        or out.shape != shape
-        or not out.flags.carray
-    ):
+    if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
