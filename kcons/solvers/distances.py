@@ -15,6 +15,7 @@ from kcons.solvers.elimination import FAST, UIntArray, make_pattern
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
 from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.narrow import (
+    add_to_point,
     dot,
     entry,
     first_vector,
@@ -28,7 +29,6 @@ from kcons.solvers.narrow import (
     second_vector,
     store_first,
     store_line,
-    store_point,
     store_quad,
 )
 from kcons.solvers.outcome import Outcome
@@ -235,9 +235,10 @@ def _begin(first, last, first_atom, last_atom, x_new, x_ref, lengths, lattice, p
         miss = 0.5 * (d2 - dot(q, q))
         store_line(state, 8 * k, q, s, pair(0.0, miss))
         store_quad(starts, 4 * k, q)
-        put(starts, 4 * k + 3, 1.0 / d2)
+        inverse = 1.0 / d2
+        put(starts, 4 * k + 3, inverse)
         put(solution, k, 0.0)
-        e = abs(miss) / d2
+        e = abs(miss) * inverse
         total += e
         error = max(error, e)
     for a in range(first_atom, last_atom):
@@ -251,7 +252,7 @@ def _image(vector, lattice):  # type: ignore[no-untyped-def]
     return quad(x, y, z, 0.0)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore[no-untyped-def]
     """Current vectors and right-hand sides; largest and total relative error of the lengths."""
     error, total = 0.0, 0.0
@@ -454,7 +455,7 @@ def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def
 def _apply(x, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)
-        store_point(x, g, load_point(x, g) + load_quad(moves, 4 * a))
+        add_to_point(x, g, load_quad(moves, 4 * a))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -462,8 +463,8 @@ def _apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)
         move = load_quad(moves, 4 * a)
-        store_point(x, g, load_point(x, g) + move)
-        store_point(v, g, load_point(v, g) + inv_dt * move)
+        add_to_point(x, g, move)
+        add_to_point(v, g, inv_dt * move)
 
 
 def _aligned(size: int) -> FloatArray:

@@ -15,6 +15,7 @@ George & Liu, Computer Solution of Large Sparse Positive Definite Systems (1981)
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 
 import numba as nb
@@ -30,6 +31,9 @@ FAST = {"contract", "arcp", "nsz"}
 
 #: A pivot below this part of its diagonal marks a row that depends on earlier ones.
 PIVOT_TOLERANCE = 1e-10
+
+#: Places between a row and its children in the elimination tree, where other rows can stand between.
+DISTANCE = 2
 
 
 @dataclass(frozen=True)
@@ -273,35 +277,30 @@ def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
-    """Children before parents, branch by branch; the two main branches of a tree alternate.
+    """Children before parents, branch by branch; neighbouring branches of a tree alternate.
 
-    Rows of different branches do not wait for each other, so alternating them halves the time lost to
-    the latency of the pivots' divisions.
+    A row waits for the pivots of its children, each a division late. So a row is put at least `DISTANCE`
+    places behind its children where there are others to go first, those earliest in postorder.
     """
     n = len(parent)
-    child = np.full(n, -1, np.int64)
+    following = np.full(n, -1, np.int64)
     sibling = np.full(n, -1, np.int64)
-    size = np.ones(n, np.int64)
-    for step in range(n):
-        if parent[step] >= 0:
-            size[parent[step]] += size[step]
+    waiting = np.zeros(n, np.int64)
     for step in range(n - 1, -1, -1):
         if parent[step] >= 0:
-            sibling[step] = child[parent[step]]
-            child[parent[step]] = step
-    following = child.copy()
-    result = np.empty(n, np.int64)
-    stack = np.empty(n, np.int64)
+            sibling[step] = following[parent[step]]
+            following[parent[step]] = step
+            waiting[parent[step]] += 1
+    order = np.empty(n, np.int64)
     place = np.empty(n, np.int64)
-    buffer = np.empty(n, np.int64)
+    stack = np.empty(n, np.int64)
     clusters = np.empty(n + 1, np.int64)
     n_clusters = 0
     number = 0
     for root in range(n):
         if parent[root] >= 0:
             continue
-        first = number
-        clusters[n_clusters] = first
+        clusters[n_clusters] = number
         n_clusters += 1
         top = 0
         stack[0] = root
@@ -312,51 +311,34 @@ def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
                 stack[top] = following[node]
                 following[node] = sibling[following[node]]
             else:
-                result[number] = node
+                order[number] = node
                 place[node] = number
                 number += 1
                 top -= 1
-        # Go down from the root to where the tree splits; alternate the biggest branch with the rest.
-        node = root
-        biggest = -1
-        while True:
-            biggest = -1
-            below = 0
-            branch = child[node]
-            while branch >= 0:
-                below += size[branch]
-                if biggest < 0 or size[branch] > size[biggest]:
-                    biggest = branch
-                branch = sibling[branch]
-            if biggest < 0 or 10 * size[biggest] <= 9 * below:
-                break
-            node = biggest
-        if biggest < 0:
-            continue
-        stop = place[node]
-        begin = stop - (size[node] - 1)
-        inner_stop = place[biggest] + 1
-        inner_begin = inner_stop - size[biggest]
-        count = stop - begin
-        inner = inner_stop - inner_begin
-        outer = count - inner
-        a, b = inner_begin, begin
-        if b == inner_begin:
-            b = inner_stop
-        for k in range(count):
-            done_a = a - inner_begin
-            done_b = k - done_a
-            if done_b >= outer or (done_a < inner and done_a * outer <= done_b * inner):
-                buffer[k] = result[a]
-                a += 1
-            else:
-                buffer[k] = result[b]
-                b += 1
-                if b == inner_begin:
-                    b = inner_stop
-        for k in range(count):
-            result[begin + k] = buffer[k]
     clusters[n_clusters] = n
+    result = np.empty(n, np.int64)
+    queue = np.empty(n, np.int64)
+    since = np.empty(n, np.int64)
+    for c in range(n_clusters):
+        # Rows whose children have gone stand in a queue, and after their delay in a heap by place.
+        ready = [np.int64(0) for _ in range(0)]
+        for k in range(clusters[c], clusters[c + 1]):
+            if waiting[order[k]] == 0:
+                ready.append(k)
+        head = tail = clusters[c]
+        for k in range(clusters[c], clusters[c + 1]):
+            while head < tail and (since[head] + DISTANCE <= k or len(ready) == 0):
+                heapq.heappush(ready, place[queue[head]])
+                head += 1
+            node = order[heapq.heappop(ready)]
+            result[k] = node
+            above = parent[node]
+            if above >= 0:
+                waiting[above] -= 1
+                if waiting[above] == 0:
+                    queue[tail] = above
+                    since[tail] = k
+                    tail += 1
     return result, clusters[: n_clusters + 1].copy()
 
 

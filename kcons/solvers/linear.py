@@ -19,6 +19,7 @@ from kcons.solvers.narrow import (
     number,
     pair,
     put,
+    rolled,
     second_vector,
     settled,
     store_pair,
@@ -31,6 +32,26 @@ CHANGE, RIGHT = 6, 7
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
+    """Assemble entry p of a row (vectors x, y, z: s and r) and take it from its column; returns the entry."""
+    l = 8 * entry(columns, p)
+    both = x * load_pair(state, l) + y * load_pair(state, l + 2) + z * load_pair(state, l + 4)
+    both = number(couplings, p) * both + load_pair(entries, 4 * p + 2)
+    low, up = inverse * lane(both, 0), lane(both, 1)
+    done = pair(low, up)
+    store_quad(entries, 4 * p, settled(done))
+    store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+    return done
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _update(t, one, two, targets, entries):  # type: ignore[no-untyped-def]
+    """Take the product of two entries of a row, to columns l and m, from A_ml and A_lm."""
+    e = 4 * entry(targets, t) + 2
+    store_pair(entries, e, load_pair(entries, e) - swapped(one) * two)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep."""
     begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
@@ -44,24 +65,55 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
         inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
         put(pivots, k, inverse)
         end = entry(links, 4 * k + 4)
-        for p in range(begin, end):
-            l = 8 * entry(columns, p)
-            both = x * load_pair(state, l) + y * load_pair(state, l + 2) + z * load_pair(state, l + 4)
-            both = number(couplings, p) * both + load_pair(entries, 4 * p + 2)
-            low, up = inverse * lane(both, 0), lane(both, 1)
-            store_quad(entries, 4 * p, settled(pair(low, up)))
-            store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
-        for p in range(begin, end - 1):
-            mine = swapped(load_pair(entries, 4 * p))
-            for q in range(p + 1, end):
-                e = 4 * entry(targets, t) + 2
-                # For an entry (l, m), l < m: A_ml -= low_m up_l, A_lm -= low_l up_m.
-                store_pair(entries, e, load_pair(entries, e) - mine * load_pair(entries, 4 * q))
-                t += 1
+        # Few entries are the rule; spelt out, their numbers stay in registers.
+        count = end - begin
+        if count == 1:
+            _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+        elif count == 2:
+            one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+            two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
+            _update(t, one, two, targets, entries)
+            t += 1
+        elif count == 3:
+            one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
+            two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
+            three = _eliminate(begin + 2, x, y, z, inverse, right, columns, couplings, state, entries)
+            _update(t, one, two, targets, entries)
+            _update(t + 1, one, three, targets, entries)
+            _update(t + 2, two, three, targets, entries)
+            t += 3
+        else:
+            for p in range(begin, end):
+                rolled()
+                _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries)
+            for p in range(begin, end - 1):
+                rolled()
+                mine = load_pair(entries, 4 * p)
+                for q in range(p + 1, end):
+                    rolled()
+                    _update(t, mine, load_pair(entries, 4 * q), targets, entries)
+                    t += 1
         begin = end
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries):  # type: ignore[no-untyped-def]
+    l = 8 * entry(columns, p)
+    inner = sx * number(state, l + 1) + sy * number(state, l + 3) + sz * number(state, l + 5)
+    up = number(couplings, p) * inner + number(entries, 4 * p + 2)
+    low = up * inverse
+    store_quad(entries, 4 * p, settled(pair(low, up)))
+    store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
+    return low, up
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _update_symmetric(t, low, up, targets, entries):  # type: ignore[no-untyped-def]
+    e = 4 * entry(targets, t) + 2
+    put(entries, e, number(entries, e) - low * up)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def factor_symmetric(first, last, links, columns, targets, couplings, weights, state, entries, pivots):  # type: ignore[no-untyped-def]
     """`factor` for r = s: half the work."""
     begin, t = entry(links, 4 * first), entry(links, 4 * first + 1)
@@ -73,23 +125,37 @@ def factor_symmetric(first, last, links, columns, targets, couplings, weights, s
         inverse = 1.0 / d if d > PIVOT_TOLERANCE * whole else 0.0
         put(pivots, k, inverse)
         end = entry(links, 4 * k + 4)
-        for p in range(begin, end):
-            l = 8 * entry(columns, p)
-            inner = sx * number(state, l + 1) + sy * number(state, l + 3) + sz * number(state, l + 5)
-            up = number(couplings, p) * inner + number(entries, 4 * p + 2)
-            low = up * inverse
-            store_quad(entries, 4 * p, settled(pair(low, up)))
-            store_pair(state, l + CHANGE, load_pair(state, l + CHANGE) - low * pair(up, right))
-        for p in range(begin, end - 1):
-            low = number(entries, 4 * p)
-            for q in range(p + 1, end):
-                e = 4 * entry(targets, t) + 2
-                put(entries, e, number(entries, e) - low * number(entries, 4 * q + 1))
-                t += 1
+        count = end - begin
+        if count == 1:
+            _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+        elif count == 2:
+            low, _up = _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _low2, up2 = _eliminate_symmetric(begin + 1, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _update_symmetric(t, low, up2, targets, entries)
+            t += 1
+        elif count == 3:
+            low, _up = _eliminate_symmetric(begin, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            low2, up2 = _eliminate_symmetric(begin + 1, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _low3, up3 = _eliminate_symmetric(begin + 2, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            _update_symmetric(t, low, up2, targets, entries)
+            _update_symmetric(t + 1, low, up3, targets, entries)
+            _update_symmetric(t + 2, low2, up3, targets, entries)
+            t += 3
+        else:
+            for p in range(begin, end):
+                rolled()
+                _eliminate_symmetric(p, sx, sy, sz, inverse, right, columns, couplings, state, entries)
+            for p in range(begin, end - 1):
+                rolled()
+                low = number(entries, 4 * p)
+                for q in range(p + 1, end):
+                    rolled()
+                    _update_symmetric(t, low, number(entries, 4 * q + 1), targets, entries)
+                    t += 1
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
     """Forward substitution with the factor kept from before."""
     begin = entry(links, 4 * first)
@@ -97,12 +163,13 @@ def forward(first, last, links, columns, state, entries):  # type: ignore[no-unt
         right = number(state, 8 * k + RIGHT)
         end = entry(links, 4 * k + 4)
         for p in range(begin, end):
+            rolled()
             l = 8 * entry(columns, p) + RIGHT
             put(state, l, number(state, l) - number(entries, 4 * p) * right)
         begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def backward(first, last, links, columns, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along s in the same sweep."""
     end = entry(links, 4 * last)
@@ -113,6 +180,7 @@ def backward(first, last, links, columns, state, entries, pivots, moves, solutio
         step = number(state, 8 * k + RIGHT)
         begin = entry(links, 4 * k)
         for p in range(begin, end):
+            rolled()
             step -= number(entries, 4 * p + 1) * number(state, 8 * entry(columns, p) + RIGHT)
         end = begin
         step *= number(pivots, k)

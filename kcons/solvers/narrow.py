@@ -127,6 +127,19 @@ store_quad = _writer(_QUAD, quad_type)
 
 
 @intrinsic
+def rolled(typingctx):
+    """Stands in a loop of few turns and keeps the compiler from unrolling it."""
+
+    def codegen(context, builder, sig, args):
+        kind = ir.FunctionType(ir.VoidType(), [])
+        nothing = ir.InlineAsm(kind, "", "", side_effect=True)
+        builder.call(nothing, [], attrs=("convergent", "nounwind"))
+        return context.get_dummy_value()
+
+    return types.void(), codegen
+
+
+@intrinsic
 def entry(typingctx, table, start):
     """``table[start]`` of a uint32 array as int64; the table must not change while a kernel runs."""
 
@@ -225,17 +238,21 @@ def load_point(typingctx, points, offset):
 
 
 @intrinsic
-def store_point(typingctx, points, offset, value):
-    """Inverse of `load_point`."""
+def add_to_point(typingctx, points, offset, value):
+    """Add the first three numbers of a quad to a point.
+
+    Reads what it writes and no more: an entry written just before would hold up a wider read.
+    """
     if points.layout != "C":
         return None
 
     def codegen(context, builder, sig, args):
         pointer = _pointer(context, builder, sig.args[0], *args[:2])
-        front = _shuffle(builder, args[2], args[2], [0, 1])
-        builder.store(front, builder.bitcast(pointer, ir.PointerType(_PAIR)), align=8)
-        last = builder.extract_element(args[2], _INT32(2))
-        builder.store(last, builder.gep(pointer, [_INT64(2)]), align=8)
+        front = builder.bitcast(pointer, ir.PointerType(_PAIR))
+        total = builder.fadd(builder.load(front, align=8), _shuffle(builder, args[2], args[2], [0, 1]), flags=_FLAGS)
+        builder.store(total, front, align=8)
+        back = builder.gep(pointer, [_INT64(2)])
+        builder.store(builder.fadd(builder.load(back), builder.extract_element(args[2], _INT32(2)), flags=_FLAGS), back)
         return context.get_dummy_value()
 
     return types.void(points, types.int64, quad_type), codegen
