@@ -1,7 +1,10 @@
 """Values and gradients of compiled rows: distances, angles, dihedrals, linear rows, spheres, cylinders.
 
 Scalar code for one row at a time. Positions are held as ``base + moves`` so that differences of atoms that
-lie far from the origin keep their digits while moves are small.
+lie far from the origin keep their digits while moves are small; both as quads (x, y, z, any) by atom.
+
+A gradient is stored by slot (one atom of one row). The line of a slot holds two gradients number by number,
+now and at the reference, then the atom's inverse mass: n0 r0 n1 r1 n2 r2 w -.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import numpy as np
 from kcons.constraints.constraint import RowKind
 from kcons.solvers.elimination import FAST
 from kcons.solvers.lattice import nearest_image
+from kcons.solvers.narrow import dot, entry, lane, load_quad, number, put, quad
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
@@ -25,18 +29,18 @@ CYLINDER = int(RowKind.CYLINDER)
 PARAMETERS = 12
 
 
+#: Which of the two gradients in a slot's line.
+NOW, REFERENCE = 0, 1
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _difference(i, j, base, moves, lattice, periodic):  # type: ignore[no-untyped-def]
-    x = base[4 * i] - base[4 * j]
-    y = base[4 * i + 1] - base[4 * j + 1]
-    z = base[4 * i + 2] - base[4 * j + 2]
+    d = load_quad(base, 4 * i) - load_quad(base, 4 * j)
     if periodic:
-        x, y, z = nearest_image(x, y, z, lattice)
-    return (
-        x + (moves[4 * i] - moves[4 * j]),
-        y + (moves[4 * i + 1] - moves[4 * j + 1]),
-        z + (moves[4 * i + 2] - moves[4 * j + 2]),
-    )
+        x, y, z = nearest_image(lane(d, 0), lane(d, 1), lane(d, 2), lattice)
+        d = quad(x, y, z, 0.0)
+    d = d + (load_quad(moves, 4 * i) - load_quad(moves, 4 * j))
+    return lane(d, 0), lane(d, 1), lane(d, 2)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -45,30 +49,24 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _put(gradient, slot, x, y, z):  # type: ignore[no-untyped-def]
-    gradient[3 * slot] = x
-    gradient[3 * slot + 1] = y
-    gradient[3 * slot + 2] = z
+def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
+    put(lines, place, x)
+    put(lines, place + 2, y)
+    put(lines, place + 4, z)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def value_and_gradient(kind, slot, slot_atoms, parameters, base, moves, lattice, periodic, gradient):  # type: ignore[no-untyped-def]
-    """Natural coordinate of one row; writes its gradient into `gradient` from slot `slot` on.
+def value_and_gradient(kind, slot, slot_atoms, parameters, offset, base, moves, lattice, periodic, lines, which):  # type: ignore[no-untyped-def]
+    """Natural coordinate of a row that is neither a distance nor linear; writes its gradient into the lines.
 
-    Angles: dtheta/dr_i = u x (u x w) / (u^2 |u x w|). Dihedrals: Blondel & Karplus,
-    J. Comput. Chem. 17, 1132 (1996).
+    `offset` is where the row's parameters begin. Angles: dtheta/dr_i = u x (u x w) / (u^2 |u x w|).
+    Dihedrals: Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996).
     """
-    if kind == DISTANCE:
-        x, y, z = _difference(slot_atoms[slot], slot_atoms[slot + 1], base, moves, lattice, periodic)
-        length = math.sqrt(x * x + y * y + z * z)
-        x, y, z = x / length, y / length, z / length
-        _put(gradient, slot, x, y, z)
-        _put(gradient, slot + 1, -x, -y, -z)
-        return length
+    place = 8 * slot + which
     if kind == ANGLE:
-        j = slot_atoms[slot + 1]
-        ux, uy, uz = _difference(slot_atoms[slot], j, base, moves, lattice, periodic)
-        wx, wy, wz = _difference(slot_atoms[slot + 2], j, base, moves, lattice, periodic)
+        j = entry(slot_atoms, slot + 1)
+        ux, uy, uz = _difference(entry(slot_atoms, slot), j, base, moves, lattice, periodic)
+        wx, wy, wz = _difference(entry(slot_atoms, slot + 2), j, base, moves, lattice, periodic)
         cx, cy, cz = _cross(ux, uy, uz, wx, wy, wz)
         c = math.sqrt(cx * cx + cy * cy + cz * cz)
         fu = 1.0 / ((ux * ux + uy * uy + uz * uz) * c)
@@ -77,15 +75,15 @@ def value_and_gradient(kind, slot, slot_atoms, parameters, base, moves, lattice,
         bx, by, bz = _cross(cx, cy, cz, wx, wy, wz)
         ax, ay, az = fu * ax, fu * ay, fu * az
         bx, by, bz = fw * bx, fw * by, fw * bz
-        _put(gradient, slot, ax, ay, az)
-        _put(gradient, slot + 1, -(ax + bx), -(ay + by), -(az + bz))
-        _put(gradient, slot + 2, bx, by, bz)
+        _put(lines, place, ax, ay, az)
+        _put(lines, place + 8, -(ax + bx), -(ay + by), -(az + bz))
+        _put(lines, place + 16, bx, by, bz)
         return math.atan2(c, ux * wx + uy * wy + uz * wz)
     if kind == DIHEDRAL:
-        j, k = slot_atoms[slot + 1], slot_atoms[slot + 2]
-        fx, fy, fz = _difference(slot_atoms[slot], j, base, moves, lattice, periodic)
+        j, k = entry(slot_atoms, slot + 1), entry(slot_atoms, slot + 2)
+        fx, fy, fz = _difference(entry(slot_atoms, slot), j, base, moves, lattice, periodic)
         gx, gy, gz = _difference(j, k, base, moves, lattice, periodic)
-        hx, hy, hz = _difference(slot_atoms[slot + 3], k, base, moves, lattice, periodic)
+        hx, hy, hz = _difference(entry(slot_atoms, slot + 3), k, base, moves, lattice, periodic)
         ax, ay, az = _cross(fx, fy, fz, gx, gy, gz)
         bx, by, bz = _cross(hx, hy, hz, gx, gy, gz)
         g = math.sqrt(gx * gx + gy * gy + gz * gz)
@@ -96,62 +94,71 @@ def value_and_gradient(kind, slot, slot_atoms, parameters, base, moves, lattice,
         ga, gb = g / a2, g / b2
         fa = (fx * gx + fy * gy + fz * gz) / (a2 * g)
         hb = (hx * gx + hy * gy + hz * gz) / (b2 * g)
-        _put(gradient, slot, -ga * ax, -ga * ay, -ga * az)
+        _put(lines, place, -ga * ax, -ga * ay, -ga * az)
         tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
-        _put(gradient, slot + 1, ga * ax + tx, ga * ay + ty, ga * az + tz)
-        _put(gradient, slot + 2, -tx - gb * bx, -ty - gb * by, -tz - gb * bz)
-        _put(gradient, slot + 3, gb * bx, gb * by, gb * bz)
+        _put(lines, place + 8, ga * ax + tx, ga * ay + ty, ga * az + tz)
+        _put(lines, place + 16, -tx - gb * bx, -ty - gb * by, -tz - gb * bz)
+        _put(lines, place + 24, gb * bx, gb * by, gb * bz)
         return value
-    i = slot_atoms[slot]
-    x = base[4 * i] + moves[4 * i]
-    y = base[4 * i + 1] + moves[4 * i + 1]
-    z = base[4 * i + 2] + moves[4 * i + 2]
+    i = entry(slot_atoms, slot)
+    r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
+    cx, cy, cz = number(parameters, offset), number(parameters, offset + 1), number(parameters, offset + 2)
+    x, y, z = lane(r, 0) - cx, lane(r, 1) - cy, lane(r, 2) - cz
     if kind == SPHERE:
-        x, y, z = x - parameters[0], y - parameters[1], z - parameters[2]
         length = math.sqrt(x * x + y * y + z * z)
-        _put(gradient, slot, x / length, y / length, z / length)
+        _put(lines, place, x / length, y / length, z / length)
         return length
     # Cylinder: distance from the axis through the point with the unit direction n.
-    nx, ny, nz = parameters[3], parameters[4], parameters[5]
-    x, y, z = x - parameters[0], y - parameters[1], z - parameters[2]
+    nx, ny, nz = number(parameters, offset + 3), number(parameters, offset + 4), number(parameters, offset + 5)
     along = x * nx + y * ny + z * nz
     x, y, z = x - along * nx, y - along * ny, z - along * nz
     length = math.sqrt(x * x + y * y + z * z)
-    _put(gradient, slot, x / length, y / length, z / length)
+    _put(lines, place, x / length, y / length, z / length)
     return length
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def linear_value(slot, end, slot_atoms, parameters, base, moves, gradient):  # type: ignore[no-untyped-def]
+def linear_value(slot, end, slot_atoms, parameters, offset, base, moves, lines, which):  # type: ignore[no-untyped-def]
     """sum c . r of a linear row; small moves and large positions are summed apart."""
     whole, change = 0.0, 0.0
     for p in range(slot, end):
-        a = slot_atoms[p]
-        for axis in range(3):
-            c = parameters[3 * (p - slot) + axis]
-            gradient[3 * p + axis] = c
-            whole += c * base[4 * a + axis]
-            change += c * moves[4 * a + axis]
+        a = 4 * entry(slot_atoms, p)
+        at = offset + 3 * (p - slot)
+        c = quad(number(parameters, at), number(parameters, at + 1), number(parameters, at + 2), 0.0)
+        _put(lines, 8 * p + which, lane(c, 0), lane(c, 1), lane(c, 2))
+        whole += dot(c, load_quad(base, a))
+        change += dot(c, load_quad(moves, a))
     return whole + change
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
-    first, last, kinds, slots, slot_atoms, parameters, base, moves, lattice, periodic, values, gradient
+    first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, which
 ):
-    """Values and gradients of rows first to last."""
+    """Values and gradients of rows first to last; ``links[4 k + 2]`` is the first slot of row k."""
     for k in range(first, last):
-        if kinds[k] == LINEAR:
-            values[k] = linear_value(
-                slots[k], slots[k + 1], slot_atoms, parameters[PARAMETERS * k :], base, moves, gradient
-            )
+        kind = entry(kinds, k)
+        slot = entry(links, 4 * k + 2)
+        if kind == DISTANCE:
+            i, j = entry(slot_atoms, slot), entry(slot_atoms, slot + 1)
+            x, y, z = _difference(i, j, base, moves, lattice, periodic)
+            length = math.sqrt(x * x + y * y + z * z)
+            inverse = 1.0 / length
+            x, y, z = inverse * x, inverse * y, inverse * z
+            _put(lines, 8 * slot + which, x, y, z)
+            _put(lines, 8 * slot + 8 + which, -x, -y, -z)
+            put(values, k, length)
+        elif kind == LINEAR:
+            end = entry(links, 4 * k + 6)
+            put(values, k, linear_value(slot, end, slot_atoms, parameters, PARAMETERS * k, base, moves, lines, which))
         else:
-            values[k] = value_and_gradient(
-                kinds[k], slots[k], slot_atoms, parameters[PARAMETERS * k :], base, moves, lattice, periodic, gradient
+            value = value_and_gradient(
+                kind, slot, slot_atoms, parameters, PARAMETERS * k, base, moves, lattice, periodic, lines, which
             )
+            put(values, k, value)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def miss(kind, value, target):  # type: ignore[no-untyped-def]
     """target - value, for dihedrals by the shorter way round."""
     difference = target - value

@@ -45,7 +45,7 @@ def _eliminate(p, x, y, z, inverse, right, columns, couplings, state, entries): 
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _update(t, one, two, targets, entries):  # type: ignore[no-untyped-def]
+def update(t, one, two, targets, entries):  # type: ignore[no-untyped-def]
     """Take the product of two entries of a row, to columns l and m, from A_ml and A_lm."""
     e = 4 * entry(targets, t) + 2
     store_pair(entries, e, load_pair(entries, e) - swapped(one) * two)
@@ -72,15 +72,15 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
         elif count == 2:
             one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
             two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
-            _update(t, one, two, targets, entries)
+            update(t, one, two, targets, entries)
             t += 1
         elif count == 3:
             one = _eliminate(begin, x, y, z, inverse, right, columns, couplings, state, entries)
             two = _eliminate(begin + 1, x, y, z, inverse, right, columns, couplings, state, entries)
             three = _eliminate(begin + 2, x, y, z, inverse, right, columns, couplings, state, entries)
-            _update(t, one, two, targets, entries)
-            _update(t + 1, one, three, targets, entries)
-            _update(t + 2, two, three, targets, entries)
+            update(t, one, two, targets, entries)
+            update(t + 1, one, three, targets, entries)
+            update(t + 2, two, three, targets, entries)
             t += 3
         else:
             for p in range(begin, end):
@@ -91,7 +91,7 @@ def factor(first, last, links, columns, targets, couplings, weights, state, entr
                 mine = load_pair(entries, 4 * p)
                 for q in range(p + 1, end):
                     rolled()
-                    _update(t, mine, load_pair(entries, 4 * q), targets, entries)
+                    update(t, mine, load_pair(entries, 4 * q), targets, entries)
                     t += 1
         begin = end
 

@@ -1,7 +1,7 @@
 """Rows of mixed kinds, coupled in any way: sparse elimination with general gradients.
 
 The counterpart of `kcons.solvers.distances` for clusters that also hold angles, dihedrals, planes and other
-compiled rows. Gradients are stored by slot (one atom of one row, three numbers).
+compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.coordinates` says.
 """
 
 from __future__ import annotations
@@ -12,9 +12,30 @@ import numpy as np
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.coordinates import PARAMETERS, evaluate, miss
+from kcons.solvers.coordinates import NOW, PARAMETERS, REFERENCE, evaluate, miss
 from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, make_pattern
 from kcons.solvers.lattice import NO_LATTICE
+from kcons.solvers.linear import update
+from kcons.solvers.narrow import (
+    add_to_point,
+    dot,
+    entry,
+    first_vector,
+    lane,
+    load_pair,
+    load_point,
+    load_quad,
+    number,
+    pair,
+    put,
+    quad,
+    rolled,
+    second_vector,
+    settled,
+    store_pair,
+    store_quad,
+    swapped,
+)
 from kcons.solvers.outcome import Outcome
 
 MAX_ITERATIONS = 50
@@ -49,26 +70,30 @@ class SparseRows:
         order = pattern.order
         self.rows: IntArray = rows[order]
         widths = np.diff(start)[order]
-        self._slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
+        slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
-        self._clusters = pattern.clusters
-        self._atoms, self._atom_start, self._slot_atoms = _number_atoms(
-            flat, self._slots, pattern.clusters, len(inverse_masses)
-        )
-        self._w = inverse_masses[self._atoms]
-        triple, left, right = _triples(pattern.start, pattern.columns, self._slots, self._slot_atoms, self._w)
-        self._tables = (pattern.start, pattern.columns, pattern.target_start, pattern.targets, triple, left, right)
+        self._atoms, atom_start, slot_atoms = _number_atoms(flat, slots, pattern.clusters, len(inverse_masses))
+        w = inverse_masses[self._atoms]
+        triple, sides, masses = _triples(pattern.start, pattern.columns, slots, slot_atoms, w)
+        # Row by row: its first entry, its first target, its first slot.
+        links = np.zeros((len(rows) + 1, 4), np.uint32)
+        links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
+        self._links = links.ravel()
         kinds, parameters = _kinds_and_parameters(constraint_set)
-        self._kinds = kinds[self.rows]
-        self._parameters = np.ascontiguousarray(parameters[self.rows]).ravel()
+        self._tables = (
+            pattern.clusters, self._atoms, atom_start, slot_atoms, kinds[self.rows].astype(np.uint32),
+            np.ascontiguousarray(parameters[self.rows]).ravel(), self._links, pattern.columns, pattern.targets,
+            triple, sides, masses,
+        )  # fmt: skip
         self._scale = constraint_set.scale[self.rows]
         self._targets = np.ascontiguousarray(constraint_set.target(0.0)[self.rows])
-        n, entries = len(rows), len(pattern.columns)
-        self._gradients = np.zeros((2, 3 * int(self._slots[-1])))
-        self._work = np.zeros((5, n))
-        self._entries = np.zeros(4 * entries)
-        self._base = np.zeros(4 * len(self._atoms))
-        self._moves = np.zeros(4 * len(self._atoms))
+        n = len(rows)
+        lines = np.zeros((int(slots[-1]), 8))
+        lines[:, 6] = w[slot_atoms]
+        # By slot; by row: accumulated change of the pivot and right-hand side; by entry.
+        self._lines, self._state, self._entries = lines.ravel(), np.zeros(2 * n), np.zeros(4 * len(pattern.columns))
+        self._pivots, self._values, self._floor = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._base, self._moves = np.zeros(4 * len(self._atoms)), np.zeros(4 * len(self._atoms))
         self._solution = np.zeros(n)
         self._kept_moves = np.zeros(len(self._moves))
         self._kept_solution = np.zeros(n)
@@ -91,10 +116,8 @@ class SparseRows:
         for careful in (False, True):
             failed, residual, iterations, worst = _positions(
                 careful, x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
-                self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
-                self._parameters, self._scale, *self._tables, self._gradients, self._work,
-                self._entries, self._base, self._moves, self._solution,
-                self._kept_moves, self._kept_solution,
+                *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
+                self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             if not failed:
                 break
@@ -120,9 +143,8 @@ class SparseRows:
         wanted = self._targets if rates is None else rates[self.rows]
         failed, residual, iterations, worst = _tangents(
             x, y, wanted, rates is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
-            self._clusters, self._atoms, self._atom_start, self._w, self._slots, self._slot_atoms, self._kinds,
-            self._parameters, *self._tables, self._gradients, self._work,
-            self._entries, self._base, self._moves, self._speeds, self._solution,
+            *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
+            self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
         if failed:
             return Outcome(False, residual, iterations, worst)
@@ -136,7 +158,7 @@ class SparseRows:
         outcome = self.tangents(x, np.zeros_like(x), None, lattice, None, 0.0)
         if not outcome.converged:
             return len(self.rows)
-        return int(np.count_nonzero(self._work[1]))
+        return int(np.count_nonzero(self._pivots))
 
 
 def _kinds_and_parameters(constraint_set: ConstraintSet) -> tuple[IntArray, FloatArray]:
@@ -174,12 +196,12 @@ def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-de
 
 @nb.njit(cache=True)
 def _triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
-    """For each entry (k, l) of the matrix: pairs of slots of k and l on one movable atom."""
-    begin = np.zeros(len(columns) + 1, np.int64)
+    """For each entry (k, l) of the matrix: pairs of slots of k and l on one movable atom, and its inverse mass."""
+    begin = np.zeros(len(columns) + 1, np.uint32)
     for fill in range(2):
         if fill == 1:
-            left = np.empty(begin[-1], np.uint32)
-            right = np.empty(begin[-1], np.uint32)
+            sides = np.empty(2 * begin[-1], np.uint32)
+            masses = np.empty(begin[-1])
         used = 0
         for k in range(len(start) - 1):
             for e in range(start[k], start[k + 1]):
@@ -188,121 +210,157 @@ def _triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-d
                     for q in range(slots[l], slots[l + 1]):
                         if slot_atoms[p] == slot_atoms[q] and w[slot_atoms[p]] > 0:
                             if fill == 1:
-                                left[used] = p
-                                right[used] = q
+                                sides[2 * used] = p
+                                sides[2 * used + 1] = q
+                                masses[used] = w[slot_atoms[p]]
                             used += 1
                 begin[e + 1] = used
-    return begin, left, right
+    return begin, sides, masses
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _factor(  # type: ignore[no-untyped-def]
-    first, last, start, columns, target_start, targets, triple, left, right, slots, slot_atoms, w,
-    now, ref, work, entries,
-):  # fmt: skip
+    first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
+):
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
 
-    `now` and `ref` are the gradients on the left and right of M^-1; `work` holds the accumulated change of the
-    pivot, its reciprocal, and the right-hand side. Accumulated changes are left at zero.
+    Entries are stored as in `kcons.solvers.linear`; accumulated changes are left at zero.
     """
-    change, pivot, side = work[0], work[1], work[2]
+    begin, t, slot = entry(links, 4 * first), entry(links, 4 * first + 1), 8 * entry(links, 4 * first + 2)
     for k in range(first, last):
+        stop = 8 * entry(links, 4 * k + 6)
         whole = 0.0
-        for p in range(slots[k], slots[k + 1]):
-            whole += w[slot_atoms[p]] * (
-                now[3 * p] * ref[3 * p] + now[3 * p + 1] * ref[3 * p + 1] + now[3 * p + 2] * ref[3 * p + 2]
-            )
-        d = whole + change[k]
-        change[k] = 0.0
+        while slot < stop:
+            rolled()
+            inner = number(lines, slot) * number(lines, slot + 1) + number(lines, slot + 2) * number(lines, slot + 3)
+            whole += number(lines, slot + 6) * (inner + number(lines, slot + 4) * number(lines, slot + 5))
+            slot += 8
+        d = whole + number(state, 2 * k)
+        put(state, 2 * k, 0.0)
+        right = number(state, 2 * k + 1)
         inverse = 1.0 / d if abs(d) > PIVOT_TOLERANCE * abs(whole) else 0.0
-        pivot[k] = inverse
-        bk = side[k]
-        begin, end = start[k], start[k + 1]
+        put(pivots, k, inverse)
+        end = entry(links, 4 * k + 4)
+        u = entry(triple, begin)
         for p in range(begin, end):
-            l = columns[p]
-            up, low = entries[4 * p + 2], entries[4 * p + 3]
-            for t in range(triple[p], triple[p + 1]):
-                a, b = 3 * left[t], 3 * right[t]
-                m = w[slot_atoms[left[t]]]
-                up += m * (now[a] * ref[b] + now[a + 1] * ref[b + 1] + now[a + 2] * ref[b + 2])
-                low += m * (now[b] * ref[a] + now[b + 1] * ref[a + 1] + now[b + 2] * ref[a + 2])
-            low *= inverse
-            entries[4 * p] = up
-            entries[4 * p + 1] = low
-            entries[4 * p + 2] = 0.0
-            entries[4 * p + 3] = 0.0
-            change[l] -= low * up
-            side[l] -= low * bk
-        t = target_start[k]
-        for p in range(begin, end):
-            up, low = entries[4 * p], entries[4 * p + 1]
+            rolled()
+            both = load_pair(entries, 4 * p + 2)
+            stop = entry(triple, p + 1)
+            while u < stop:
+                rolled()
+                a, b = 8 * entry(sides, 2 * u), 8 * entry(sides, 2 * u + 1)
+                inner2 = swapped(load_pair(lines, a)) * load_pair(lines, b)
+                inner2 = inner2 + swapped(load_pair(lines, a + 2)) * load_pair(lines, b + 2)
+                inner2 = inner2 + swapped(load_pair(lines, a + 4)) * load_pair(lines, b + 4)
+                both = both + number(masses, u) * inner2
+                u += 1
+            l = 2 * entry(columns, p)
+            low, up = inverse * lane(both, 0), lane(both, 1)
+            store_quad(entries, 4 * p, settled(pair(low, up)))
+            store_pair(state, l, load_pair(state, l) - low * pair(up, right))
+        for p in range(begin, end - 1):
+            rolled()
+            mine = load_pair(entries, 4 * p)
             for q in range(p + 1, end):
-                e = 4 * targets[t]
-                entries[e + 2] -= low * entries[4 * q]
-                entries[e + 3] -= entries[4 * q + 1] * up
+                rolled()
+                update(t, mine, load_pair(entries, 4 * q), targets, entries)
                 t += 1
+        begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _forward(first, last, start, columns, work, entries):  # type: ignore[no-untyped-def]
-    side = work[2]
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _forward(first, last, links, columns, state, entries):  # type: ignore[no-untyped-def]
+    begin = entry(links, 4 * first)
     for k in range(first, last):
-        bk = side[k]
-        for p in range(start[k], start[k + 1]):
-            side[columns[p]] -= entries[4 * p + 1] * bk
+        right = number(state, 2 * k + 1)
+        end = entry(links, 4 * k + 4)
+        for p in range(begin, end):
+            rolled()
+            l = 2 * entry(columns, p) + 1
+            put(state, l, number(state, l) - number(entries, 4 * p) * right)
+        begin = end
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _backward(first, last, start, columns, slots, slot_atoms, w, ref, work, entries, moves, solution):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution):  # type: ignore[no-untyped-def]
     """Backward substitution; adds to the multipliers and moves the atoms along the reference gradients."""
-    pivot, side = work[1], work[2]
+    end, slot = entry(links, 4 * last), entry(links, 4 * last + 2)
     for back in range(last - first):
         k = last - 1 - back
-        step = side[k]
-        for p in range(start[k], start[k + 1]):
-            step -= entries[4 * p] * side[columns[p]]
-        step *= pivot[k]
-        side[k] = step
-        solution[k] += step
-        for p in range(slots[k], slots[k + 1]):
-            a = slot_atoms[p]
-            f = step * w[a]
-            moves[4 * a] += f * ref[3 * p]
-            moves[4 * a + 1] += f * ref[3 * p + 1]
-            moves[4 * a + 2] += f * ref[3 * p + 2]
+        step = number(state, 2 * k + 1)
+        begin = entry(links, 4 * k)
+        for p in range(begin, end):
+            rolled()
+            step -= number(entries, 4 * p + 1) * number(state, 2 * entry(columns, p) + 1)
+        end = begin
+        step *= number(pivots, k)
+        put(state, 2 * k + 1, step)
+        put(solution, k, number(solution, k) + step)
+        stop = entry(links, 4 * k + 2)
+        while slot > stop:
+            rolled()
+            slot -= 1
+            a = 4 * entry(slot_atoms, slot)
+            f = step * number(lines, 8 * slot + 6)
+            store_quad(moves, a, load_quad(moves, a) + f * second_vector(lines, 8 * slot))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _begin(  # type: ignore[no-untyped-def]
+    first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
+    scale, lines, values, floor, base, moves, solution,
+):  # fmt: skip
+    """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
+    zero = quad(0.0, 0.0, 0.0, 0.0)
+    for a in range(first_atom, last_atom):
+        store_quad(base, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
+        store_quad(moves, 4 * a, zero)
+    evaluate(
+        first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, REFERENCE
+    )
+    for a in range(first_atom, last_atom):
+        store_quad(base, 4 * a, load_point(x_new, 3 * entry(atoms, a)))
+    for k in range(first, last):
+        put(solution, k, 0.0)
+        # Of absolute positions for rows on space, of the row's own size for others.
+        reach = 0.0
+        for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
+            rolled()
+            g, x = second_vector(lines, 8 * p), load_quad(base, 4 * entry(slot_atoms, p))
+            reach += np.sqrt(dot(g, g) * dot(x, x))
+        put(floor, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _measure(first, last, kinds, wanted, scale, floor, values, state):  # type: ignore[no-untyped-def]
+    """Right-hand sides; largest and total error, the row with the largest, and the largest excess over the floor."""
+    error, total, excess = 0.0, 0.0, 0.0
+    bad = first
+    for k in range(first, last):
+        off = miss(entry(kinds, k), number(values, k), number(wanted, k))
+        put(state, 2 * k + 1, off)
+        e = abs(off) / number(scale, k)
+        total += e
+        if e > error:
+            error = e
+            bad = k
+        excess = max(excess, abs(off) * number(floor, k))
+    return error, total, excess, bad
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds,
-    parameters, scale, start, columns, target_start, targets, triple, left, right, gradients, work, entries, base,
+    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters,
+    links, columns, targets, triple, sides, masses, scale, lines, state, entries, pivots, values, floor, base,
     moves, solution, kept_moves, kept_solution,
 ):  # fmt: skip
-    now, ref = gradients[0], gradients[1]
-    side, values, floor = work[2], work[3], work[4]
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
-        for a in range(atom_start[c], atom_start[c + 1]):
-            g = atoms[a]
-            for axis in range(3):
-                base[4 * a + axis] = x_ref[g, axis]
-                moves[4 * a + axis] = 0.0
-        evaluate(first, last, kinds, slots, slot_atoms, parameters, base, moves, lattice, periodic, values, ref)
-        for a in range(atom_start[c], atom_start[c + 1]):
-            g = atoms[a]
-            for axis in range(3):
-                base[4 * a + axis] = x_new[g, axis]
-        for k in range(first, last):
-            solution[k] = 0.0
-            # What rounding leaves: of absolute positions for rows on space, of the row's own size for others.
-            reach = 0.0
-            for p in range(slots[k], slots[k + 1]):
-                a = slot_atoms[p]
-                g2 = ref[3 * p] ** 2 + ref[3 * p + 1] ** 2 + ref[3 * p + 2] ** 2
-                x2 = base[4 * a] ** 2 + base[4 * a + 1] ** 2 + base[4 * a + 2] ** 2
-                reach += np.sqrt(g2 * x2)
-            floor[k] = max(1e-14 * scale[k], 2 * _EPS * reach)
+        _begin(
+            first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
+            parameters, links, scale, lines, values, floor, base, moves, solution,
+        )  # fmt: skip
         error = np.inf
         best = np.inf
         factored = False
@@ -310,19 +368,10 @@ def _positions(  # type: ignore[no-untyped-def]
         halvings = 0
         while True:
             previous = error
-            error, total = 0.0, 0.0
-            bad = first
-            evaluate(first, last, kinds, slots, slot_atoms, parameters, base, moves, lattice, periodic, values, now)
-            excess = 0.0
-            for k in range(first, last):
-                off = miss(kinds[k], values[k], wanted[k])
-                side[k] = off
-                e = abs(off) / scale[k]
-                total += e
-                if e > error:
-                    error = e
-                    bad = k
-                excess = max(excess, abs(off) / floor[k])
+            evaluate(
+                first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
+            )
+            error, total, excess, bad = _measure(first, last, kinds, wanted, scale, floor, values, state)
             if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
                 # Step control: go back half the way.
                 if halvings == MAX_HALVINGS:
@@ -336,7 +385,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 continue
             if not (total < np.inf):
                 for k in range(first, last):
-                    if not (abs(side[k]) < np.inf):
+                    if not (abs(state[2 * k + 1]) < np.inf):
                         return True, np.inf, iteration, k
             if iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
                 return True, error, iteration, bad
@@ -352,19 +401,17 @@ def _positions(  # type: ignore[no-untyped-def]
                     kept_solution[k] = solution[k]
             ratio = error / previous
             if factored and (error * ratio <= 4e-15 or ratio < 1e-4):
-                _forward(first, last, start, columns, work, entries)
+                _forward(first, last, links, columns, state, entries)
             else:
-                _factor(
-                    first, last, start, columns, target_start, targets, triple, left, right, slots, slot_atoms, w,
-                    now, ref, work, entries,
-                )  # fmt: skip
+                _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
                 factored = True
-            _backward(first, last, start, columns, slots, slot_atoms, w, ref, work, entries, moves, solution)
+            _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             iteration += 1
         for k in range(first, last):
             along = 0.0
-            for p in range(3 * slots[k], 3 * slots[k + 1]):
-                along += now[p] * ref[p]
+            for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
+                rolled()
+                along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
             # A gradient must not have turned by 90 degrees or more within the step.
             if not (along > 0.0):
                 return True, np.inf, iteration, k
@@ -376,63 +423,59 @@ def _positions(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(  # type: ignore[no-untyped-def]
-    x, y, wanted, driven, lattice, periodic, clusters, atoms, atom_start, w, slots, slot_atoms, kinds, parameters,
-    start, columns, target_start, targets, triple, left, right, gradients, work, entries, base, moves, speeds,
-    solution,
+    x, y, wanted, driven, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters, links,
+    columns, targets, triple, sides, masses, lines, state, entries, pivots, values, base, moves, speeds, solution,
 ):  # fmt: skip
-    ref = gradients[1]
-    side, values = work[2], work[3]
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
         for a in range(atom_start[c], atom_start[c + 1]):
-            g = atoms[a]
-            for axis in range(3):
-                base[4 * a + axis] = x[g, axis]
-                speeds[4 * a + axis] = y[g, axis]
-                moves[4 * a + axis] = 0.0
-        evaluate(first, last, kinds, slots, slot_atoms, parameters, base, moves, lattice, periodic, values, ref)
+            g = 3 * entry(atoms, a)
+            store_quad(base, 4 * a, load_point(x, g))
+            store_quad(speeds, 4 * a, load_point(y, g))
+            store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
+        evaluate(
+            first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, REFERENCE
+        )
         largest, total = 0.0, 0.0
         for k in range(first, last):
             goal = wanted[k] if driven else 0.0
             off, size = goal, abs(goal)
-            for p in range(slots[k], slots[k + 1]):
-                a = 4 * slot_atoms[p]
-                gx, gy, gz = ref[3 * p], ref[3 * p + 1], ref[3 * p + 2]
-                vx, vy, vz = speeds[a], speeds[a + 1], speeds[a + 2]
-                off -= gx * vx + gy * vy + gz * vz
-                size += abs(gx * vx) + abs(gy * vy) + abs(gz * vz)
-            side[k] = off
+            for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
+                rolled()
+                g = second_vector(lines, 8 * p)
+                put(lines, 8 * p, lane(g, 0))
+                put(lines, 8 * p + 2, lane(g, 1))
+                put(lines, 8 * p + 4, lane(g, 2))
+                part = g * load_quad(speeds, 4 * entry(slot_atoms, p))
+                off -= lane(part, 0) + lane(part, 1) + lane(part, 2)
+                size += abs(lane(part, 0)) + abs(lane(part, 1)) + abs(lane(part, 2))
+            put(state, 2 * k, 0.0)
+            put(state, 2 * k + 1, off)
             largest = max(largest, size)
             total += size
             solution[k] = 0.0
         if not (total < np.inf):
             for k in range(first, last):
-                if not (abs(side[k]) < np.inf):
+                if not (abs(state[2 * k + 1]) < np.inf):
                     return True, np.inf, 0, k
             return True, np.inf, 0, first
-        _factor(
-            first, last, start, columns, target_start, targets, triple, left, right, slots, slot_atoms, w,
-            ref, ref, work, entries,
-        )  # fmt: skip
+        _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
         iteration = 0
         while True:
-            _backward(first, last, start, columns, slots, slot_atoms, w, ref, work, entries, moves, solution)
+            _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
             iteration += 1
             error, total = 0.0, 0.0
             bad = first
             for k in range(first, last):
                 off = wanted[k] if driven else 0.0
-                for p in range(slots[k], slots[k + 1]):
-                    a = 4 * slot_atoms[p]
-                    off -= (
-                        ref[3 * p] * (speeds[a] + moves[a])
-                        + ref[3 * p + 1] * (speeds[a + 1] + moves[a + 1])
-                        + ref[3 * p + 2] * (speeds[a + 2] + moves[a + 2])
-                    )
-                side[k] = off
+                for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
+                    rolled()
+                    a = 4 * entry(slot_atoms, p)
+                    off -= dot(second_vector(lines, 8 * p), load_quad(speeds, a) + load_quad(moves, a))
+                put(state, 2 * k + 1, off)
                 total += abs(off)
                 if abs(off) > error:
                     error = abs(off)
@@ -442,7 +485,7 @@ def _tangents(  # type: ignore[no-untyped-def]
             if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
                 break
             previous = error
-            _forward(first, last, start, columns, work, entries)
+            _forward(first, last, links, columns, state, entries)
         if error > 1e3 * allowed:
             return True, error, iteration, bad
         if error >= worst:
@@ -454,7 +497,4 @@ def _tangents(  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, fastmath=FAST)
 def _apply(x, factor, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
-        g = atoms[a]
-        x[g, 0] += factor * moves[4 * a]
-        x[g, 1] += factor * moves[4 * a + 1]
-        x[g, 2] += factor * moves[4 * a + 2]
+        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
