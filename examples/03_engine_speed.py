@@ -499,6 +499,9 @@ def show(result: dict, console: Console) -> None:
             f"{r['sigma_over_tolerance']:.2f}", f"{r['velocity_error']:.0e}", f"{r['setup_s']:.3f}",
         )  # fmt: skip
     console.print(table)
+    machine = result["machine"]
+    versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "ase", "openmm"))
+    console.print(f"{machine['cpu']}, one thread; {versions}; commit {machine['commit']}, {machine['date']}")
     for name, peer in result["peers"].items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in peer.items()))
     for name, times in result["ase_step"].items():
