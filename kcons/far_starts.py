@@ -127,41 +127,20 @@ class FarStart:
         self._local, self._plan, self._numbers = local, plan, numbers
         self._positions, self._tangents = positions, tangents
 
-    def _nearest(self, x: FloatArray, time: float) -> bool:
-        """x <- x0 + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers.
-
-        Its fixed point is the foot of the mass-weighted perpendicular from x0. Where the iteration does not
-        settle, its first point is kept, which lies on the surface along the gradients at x0. False if there
-        is not even that.
-        """
-        first = x.copy()
-        try:
-            self._positions(first, x, time, time, None, 0.0, None)
-        except ConvergenceError:
-            return False
-        here, last = first, np.inf
-        for _ in range(NEAREST_ROUNDS):
-            ahead = x.copy()
-            try:
-                self._positions(ahead, here, time, time, None, 0.0, None)
-            except ConvergenceError:
-                here = first
-                break
-            move = float(np.max(np.abs(ahead - here), initial=0.0))
-            here = ahead
-            if move == 0.0 or (move > 0.5 * last and move < 1e-12):
-                break
-            if move > 2 * last:
-                here = first
-                break
-            last = move
-        np.copyto(x, here)
-        return True
-
     def restore(self, x: FloatArray, time: float) -> None:
         """Bring `x` onto the constraints in place, or raise `InfeasibleError`."""
-        if self._nearest(x, time):
-            return
+        start = x.copy()
+        here = x.copy()
+        try:
+            self._positions(here, start, time, time, None, 0.0, None)
+        except ConvergenceError:
+            self._reach(here, time)
+        if not self._settle(start, here, time):
+            self._descend(start, here, time)
+        np.copyto(x, here)
+
+    def _reach(self, x: FloatArray, time: float) -> None:
+        """Some point on the constraints, for starts too far off for one projection, in place."""
         start = x.copy()
         error = diagnosis.not_finite(self._local, self._numbers, {"positions": start})
         if error is not None:
@@ -172,21 +151,95 @@ class FarStart:
             outcome = general.restore(x, time=time)
             if not outcome.converged:
                 raise diagnosis.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
-        foot = start.copy()
-        try:
-            self._positions(foot, x, time, time, None, 0.0, None)
-        except ConvergenceError:
-            return
-        np.copyto(x, foot)
+
+    def _settle(self, start: FloatArray, x: FloatArray, time: float) -> bool:
+        """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.
+
+        Its fixed point is the foot of the mass-weighted perpendicular from the start. False, and `x` as it
+        was, where the iteration does not settle.
+        """
+        here, last = x, np.inf
+        for _ in range(NEAREST_ROUNDS):
+            ahead = start.copy()
+            try:
+                self._positions(ahead, here, time, time, None, 0.0, None)
+            except ConvergenceError:
+                return False
+            move = float(np.max(np.abs(ahead - here), initial=0.0))
+            here = ahead
+            if move == 0.0 or (move > 0.5 * last and move < 1e-12):
+                break
+            if move > 2 * last:
+                return False
+            last = move
+        np.copyto(x, here)
+        return True
+
+    def _descend(self, start: FloatArray, x: FloatArray, time: float) -> None:
+        """Walk along the constraints towards the start in place, as long as every cluster comes nearer to it.
+
+        Steps are the tangential part of start - x; its end is the foot of a perpendicular from the start.
+        """
+        plan = self._plan
+        atom_label = self._atom_labels()
+        inside = atom_label >= 0
+        mass = np.divide(1.0, plan.inverse_masses, out=np.zeros(len(x)), where=plan.inverse_masses > 0)[inside]
+        clusters = int(plan.labels.max(initial=-1)) + 1
+
+        def distance(y: FloatArray) -> FloatArray:
+            square = mass * np.sum((y - start)[inside] ** 2, axis=1)
+            return np.bincount(atom_label[inside], weights=square, minlength=clusters).astype(np.float64)
+
+        away = distance(x)
+        factor, last = np.ones(clusters), np.inf
+        for _ in range(NEAREST_ROUNDS):
+            step = start - x
+            step[~inside] = 0.0
+            size = float(np.max(np.abs(step), initial=0.0))
+            self._tangents(x, step, None, time, None, "position")
+            slope = float(np.max(np.abs(step), initial=0.0))
+            near = slope < 1e-6 * size  # where rounding hides which of two points is nearer
+            if slope <= 1e-13 * size:
+                return
+            if near and slope > 0.9 * last:  # swings about the foot
+                factor *= 0.5
+                if factor.max() < 0.05:
+                    return
+            last = slope
+            for _ in range(MAX_HALVINGS):
+                ahead = x + np.where(inside, factor[atom_label], 0.0)[:, None] * step
+                try:
+                    self._positions(ahead, x, time, time, None, 0.0, None)
+                except ConvergenceError as error:
+                    factor[error.cluster if error.cluster >= 0 else slice(None)] *= 0.5
+                    continue
+                now = distance(ahead)
+                worse = now > away * (1 + 1e-12) if near else now > away
+                if not worse.any():
+                    break
+                factor[worse] *= 0.5
+            else:
+                return
+            np.copyto(x, ahead)
+            away = now
+            if not near:
+                factor = np.minimum(1.0, 1.5 * factor)
+
+    def _atom_labels(self) -> IntArray:
+        """Cluster of each local atom, -1 for atoms that belong to none."""
+        incidence, labels = self._local.incidence, self._plan.labels
+        entry_label = np.repeat(labels, np.diff(incidence.indptr))
+        atom_label = np.full(self._local.n_atoms, -1, dtype=np.int64)
+        atom_label[incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
+        atom_label[self._plan.inverse_masses == 0] = -1
+        return atom_label
 
     def _gauss_newton(self, x: FloatArray, time: float) -> bool:
         """x <- x - f M^-1 A^T (A M^-1 A^T)^+ sigma in place, f halved cluster by cluster while |sigma| grows."""
         local, plan = self._local, self._plan
         member = plan.labels >= 0
         labels = plan.labels[member]
-        atom_label = np.full(local.n_atoms, -1, dtype=np.int64)
-        entry_label = np.repeat(plan.labels, np.diff(local.incidence.indptr))
-        atom_label[local.incidence.indices[entry_label >= 0]] = entry_label[entry_label >= 0]
+        atom_label = self._atom_labels()
         weight = 1.0 / local.scale[member] ** 2
 
         def misfit(sigma: FloatArray) -> FloatArray:

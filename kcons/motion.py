@@ -262,8 +262,8 @@ class Motion:
     def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
         """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
 
-        For initial positions, not for time steps. Damped Newton where the start is far off; where the search
-        for the nearest point does not settle, a point on the constraints along the gradients at the start.
+        For initial positions, not for time steps. Damped Newton where the start is far off; then along the
+        constraints to the foot of the mass-weighted perpendicular, x - x_0 = M^-1 A(x)^T Lambda.
 
         Raises
         ------

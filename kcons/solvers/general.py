@@ -142,7 +142,7 @@ class GeneralClusters:
                 outcome = self._newton(batch, state, moves, self._weighted(batch, reference), time, total)
                 if not outcome.converged:
                     return outcome
-                worst = max(worst, outcome, key=lambda o: o.residual)
+                worst = _worse(worst, outcome)
         x_new[self.atoms] = state
         if velocities is not None:
             velocities[self.atoms] += inv_dt * moves
@@ -232,7 +232,7 @@ class GeneralClusters:
                 if not outcome.converged:
                     x[self.atoms] = state  # for the report on how far it came
                     return outcome
-                worst = max(worst, outcome, key=lambda o: o.residual)
+                worst = _worse(worst, outcome)
         x[self.atoms] = state
         return worst
 
@@ -347,6 +347,12 @@ class GeneralClusters:
             s = np.linalg.svd(np.divide(b, size, out=np.zeros_like(b), where=size > 0), compute_uv=False)
             rank += int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
         return rank
+
+
+def _worse(one: Outcome, other: Outcome) -> Outcome:
+    """The outcome with the larger residual, with the larger number of iterations of the two."""
+    chosen = other if other.residual >= one.residual else one
+    return chosen._replace(iterations=max(one.iterations, other.iterations))
 
 
 def _failed(batch: _Batch, bad: NDArray[np.bool_], iterations: int, residual: FloatArray | None = None) -> Outcome:

@@ -1,0 +1,236 @@
+"""Damped Newton with dense algebra: batches of interpreted rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import constraints as held
+from kcons.constraint_set import ConstraintSet
+from kcons.motion import Motion
+from kcons.solvers.general import GeneralClusters
+
+WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
+
+
+def solver_of(rows, x, masses=None, labels=None) -> tuple[GeneralClusters, ConstraintSet]:
+    whole = ConstraintSet(rows, x, np.ones(len(x)) if masses is None else masses)
+    n = whole.n_rows
+    labels = np.zeros(n, dtype=np.int64) if labels is None else np.asarray(labels)
+    return GeneralClusters(whole, np.arange(n), labels, 1.0 / whole.masses), whole
+
+
+def positions(solver, x_new, x_ref, velocities=None, inv_dt=0.0, multipliers=None):
+    return solver.positions(x_new, x_ref, None, None, velocities, inv_dt, multipliers, 0.0, 0.0)
+
+
+def weighted_square(weights: np.ndarray) -> held.Custom:
+    return held.Custom(
+        np.arange(len(weights)),
+        lambda r: np.sum(weights * r * r, axis=(-1, -2)),
+        lambda r: 2 * weights * r,
+        lambda r, v: 2 * weights * v,
+    )
+
+
+def ellipsoid(atoms: np.ndarray) -> held.ImplicitSurface:
+    scale = np.array([1.0, 2.0, 3.0])
+    return held.ImplicitSurface(
+        atoms, lambda r: np.sum(scale * r * r, axis=1), lambda r: 2 * scale * r, lambda r, v: 2 * scale * v, target=None
+    )
+
+
+@pytest.mark.parametrize("surface", ["torus", "implicit"])
+def test_ten_thousand_particles_on_a_surface_are_one_batch(surface: str) -> None:
+    """Functions are called a few times for all rows, not once a row."""
+    n = 10_000
+    rng = np.random.default_rng(0)
+    u, w = rng.uniform(0, 2 * np.pi, (2, n))
+    x = np.stack([(2 + np.cos(u)) * np.cos(w), (2 + np.cos(u)) * np.sin(w), np.sin(u)], axis=1)
+    row = held.Torus(np.arange(n), [0, 0, 0], [0, 0, 1.0], 2.0) if surface == "torus" else ellipsoid(np.arange(n))
+    calls = 0
+    measure = type(row).measure
+
+    class Counted(type(row)):  # type: ignore[misc]
+        def measure(self, r, time):
+            nonlocal calls
+            calls += 1
+            return measure(self, r, time)
+
+    row.__class__ = Counted
+    whole = ConstraintSet(row, x, rng.uniform(1, 9, n))
+    motion = Motion(whole, x)
+    (kind,) = motion.plan.kinds
+    assert (kind.solver, kind.clusters, kind.rows, kind.rank) == ("general", n, n, n)
+    (solver,) = motion.plan.solvers
+    assert len(solver._batches) == 1
+    step = 0.02 * rng.normal(size=x.shape)
+    calls = 0
+    y = motion.project_positions(x + step, x)
+    assert calls <= 60
+    assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))
+    normal = whole.jacobian(x).data.reshape(-1, 3)
+    np.testing.assert_allclose(np.cross(y - x - step, normal), 0, atol=1e-13)
+    v = motion.project_velocities(y, step)
+    assert np.abs(np.sum(v * whole.jacobian(y).data.reshape(-1, 3), axis=1)).max() < 1e-14
+
+
+def test_batches_are_cluster_by_cluster() -> None:
+    """Clusters of several sizes in one call give what each gives alone."""
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(12, 3)) * 2
+    rows = [
+        held.RadiusOfGyration([[0, 1, 2], [3, 4, 5]]),
+        held.CenterDistance([[6, 7]], [[8]]),
+        held.Distance([(0, 1), (3, 4), (10, 11)]),
+    ]
+    masses = rng.uniform(1, 9, 12)
+    solver, whole = solver_of(rows, x, masses, labels=[0, 1, 2, 0, 1, 3])
+    assert sorted(len(b.rows) for b in solver._batches) == [1, 1, 2]
+    new = x + 0.05 * rng.normal(size=x.shape)
+    together, lam = new.copy(), np.empty(6)
+    assert positions(solver, together, x, multipliers=lam).converged
+    for rows_of_one in ([0, 3], [1, 4], [2], [5]):
+        alone = GeneralClusters(whole, np.array(rows_of_one), np.zeros(len(rows_of_one), int), 1 / masses)
+        single, part = new.copy(), np.empty(len(rows_of_one))
+        assert positions(alone, single, x, multipliers=part).converged
+        np.testing.assert_allclose(part, lam[rows_of_one], rtol=1e-11)
+        np.testing.assert_allclose(single[alone.atoms], together[alone.atoms], rtol=0, atol=1e-14)
+
+
+def test_dependent_rows_share_their_multiplier() -> None:
+    x = WATER + 0.3
+    once, _ = solver_of([held.RadiusOfGyration([[0, 1, 2]])], x)
+    thrice, whole = solver_of([held.RadiusOfGyration([[0, 1, 2]] * 3)], x)
+    assert once.rank(x, 0.0) == thrice.rank(x, 0.0) == 1
+    new = x + 0.1 * np.random.default_rng(0).normal(size=x.shape)
+    a, b, la, lb = new.copy(), new.copy(), np.empty(1), np.empty(3)
+    assert positions(once, a, x, multipliers=la).converged
+    assert positions(thrice, b, x, multipliers=lb).converged
+    np.testing.assert_allclose(b, a, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(lb, np.repeat(la / 3, 3), rtol=1e-12)
+    assert np.abs(whole.value(b)).max() < 1e-15
+    y, mu = np.random.default_rng(1).normal(size=x.shape), np.empty(3)
+    assert thrice.tangents(x, y, None, None, mu, 0.0).converged
+    np.testing.assert_allclose(mu, mu[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("exponent", range(2, 8))
+def test_rows_that_are_nearly_parallel(exponent: int) -> None:
+    """Newton has the condition of the rows and not its square: independent rows are all held."""
+    rng = np.random.default_rng(exponent)
+    x = rng.normal(size=(4, 3))
+    w = rng.uniform(0.5, 2, (4, 3))
+    rows = [weighted_square(w), weighted_square(w + 10.0**-exponent * rng.normal(size=(4, 3)))]
+    solver, whole = solver_of(rows, x)
+    assert solver.rank(x, 0.0) == 2
+    # A step that two such rows can answer: along the surface, and off it to second order.
+    v = Motion(whole, x).project_velocities(x, rng.normal(size=x.shape))
+    new = x + 1e-2 * np.sqrt(10.0**-exponent) * v
+    lam = np.empty(2)
+    y = new.copy()
+    outcome = positions(solver, y, x, multipliers=lam)
+    assert outcome.converged, outcome
+    assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))
+    from_lam = (whole.jacobian(x).T @ lam).reshape(-1, 3)
+    np.testing.assert_allclose(from_lam, y - new, rtol=0, atol=1e-13 + 1e-16 * np.abs(lam).max())
+
+
+def test_velocity_rows_move_no_positions() -> None:
+    rows = [held.RadiusOfGyration([[0, 1, 2]]), held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)]
+    solver, whole = solver_of(rows, WATER)
+    new, lam = WATER + 0.05, np.empty(2)
+    new[1] += 0.1
+    alone, _ = solver_of(rows[:1], WATER)
+    y, z = new.copy(), new.copy()
+    assert positions(solver, y, WATER, multipliers=lam).converged
+    assert positions(alone, z, WATER).converged
+    np.testing.assert_allclose(y, z, rtol=0, atol=1e-14)
+    assert lam[1] == 0.0
+    v = np.random.default_rng(0).normal(size=(3, 3))
+    rates = whole.velocity_target(WATER)
+    assert solver.tangents(WATER, v, rates, None, None, 0.0).converged
+    np.testing.assert_allclose(whole.jacobian(WATER) @ v.ravel(), rates, rtol=0, atol=1e-14)
+
+
+def test_only_velocity_rows() -> None:
+    solver, _ = solver_of([held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)], WATER)
+    y, lam = WATER + 0.5, np.empty(1)
+    assert positions(solver, y, WATER, multipliers=lam).converged
+    np.testing.assert_array_equal(y, WATER + 0.5)
+    assert lam[0] == 0.0
+
+
+def test_a_step_too_far_is_refused_and_changes_nothing() -> None:
+    """A sphere cannot be reached along a direction that passes it by."""
+    x = np.array([[1.0, 0, 0], [5.0, 0, 0]])
+    solver, _ = solver_of([ellipsoid(np.array([0, 1]))], x, labels=[0, 1])
+    new = x + [[0.0, 3.0, 0], [0.01, 0, 0]]
+    kept, v = new.copy(), np.ones((2, 3))
+    outcome = positions(solver, new, x, velocities=v, inv_dt=1.0)
+    assert not outcome.converged and outcome.worst_row == 0 and outcome.residual > 1e-3
+    np.testing.assert_array_equal(new, kept)
+    assert (v == 1).all()
+
+
+def test_the_other_side_is_no_solution() -> None:
+    """A gradient that turned by more than 90 degrees means that the wrong root was found."""
+    x = np.array([[1.0, 0, 0]])
+    solver, _ = solver_of([ellipsoid(np.array([0]))], x)
+    new = np.array([[-1.05, 0.0, 0]])
+    assert not positions(solver, new, x).converged
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_not_finite(bad: float) -> None:
+    x = np.array([[1.0, 0, 0], [5.0, 0, 0]])
+    solver, _ = solver_of([ellipsoid(np.array([0, 1]))], x, labels=[0, 1])
+    for wrong in ("new", "ref", "y"):
+        broken = x + 0.01
+        broken[1, 2] = bad
+        good = x.copy()
+        if wrong == "new":
+            outcome = positions(solver, broken, x)
+        elif wrong == "ref":
+            outcome = positions(solver, good, broken)
+        else:
+            outcome = solver.tangents(x, broken, None, None, None, 0.0)
+        assert not outcome.converged and outcome.worst_row == 1
+        np.testing.assert_array_equal(good, x)
+
+
+def test_a_gradient_that_vanishes() -> None:
+    x = np.array([[1.0, 0, 0], [1.0, 0, 0]])
+    solver, _ = solver_of([ellipsoid(np.array([0, 1]))], x, labels=[0, 1])
+    x[0] = 0.0
+    outcome = positions(solver, x.copy(), x)
+    assert not outcome.converged and outcome.worst_row == 0
+    outcome = solver.tangents(x, x.copy(), None, None, None, 0.0)
+    assert not outcome.converged and outcome.worst_row == 0
+
+
+def test_outcome_counts_iterations_even_without_residual() -> None:
+    x = np.array([[1.0, 0, 0]])
+    solver, _ = solver_of([held.Plane([0], [1.0, 0, 0])], x)
+    outcome = positions(solver, x + [[0.5, 0, 0]], x)
+    assert outcome == (True, 0.0, outcome.iterations, 0)
+    assert outcome.iterations > 0
+
+
+def test_no_rows() -> None:
+    solver, _ = solver_of([], WATER)
+    y = WATER.copy()
+    assert positions(solver, y, WATER).converged
+    assert solver.tangents(WATER, y, None, None, None, 0.0).converged
+    assert solver.restore(y, time=0.0).converged
+    assert solver.rank(WATER, 0.0) == 0
+    np.testing.assert_array_equal(y, WATER)
+
+
+def test_restore_stops_at_the_least_squares_optimum() -> None:
+    """Levenberg-Marquardt on rows that contradict: 4/3 is the smallest sum of squares."""
+    x = np.array([[0.2, 0.1, 0], [1.2, 0.0, 0.1]])
+    solver, whole = solver_of([held.Distance([0, 1], 1.0), held.Plane([0, 1], [1.0, 0, 0], [0.0, 3.0])], x)
+    outcome = solver.restore(x, time=0.0)
+    assert not outcome.converged
+    np.testing.assert_allclose(np.sum(whole.value(x) ** 2), 4 / 3, rtol=1e-6)

@@ -1,0 +1,193 @@
+"""The solver table: every line is picked for the shape it is made for, with its rank."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from kcons import constraints as held
+from kcons.constraint_set import ConstraintSet
+from kcons.errors import ContradictionError, UnsupportedError
+from kcons.motion import Motion
+from kcons.plan import make_plan
+
+WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+METHANE = np.vstack([np.zeros(3), 0.629 * TETRAHEDRON])
+OCTAHEDRON = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+HEXAGON = np.array([[np.cos(t), np.sin(t), 0.2 * (-1) ** k] for k, t in enumerate(np.arange(6) * np.pi / 3)])
+ZIGZAG = np.cumsum(np.tile([[0.8, 0.9, 0.1], [0.9, -0.8, 0.2]], (10, 1)), axis=0)
+
+
+def all_pairs(n: int) -> list[tuple[int, int]]:
+    return list(combinations(range(n), 2))
+
+
+def many(shape: np.ndarray, pairs, times: int) -> tuple[held.Distance, np.ndarray]:
+    shift = np.random.default_rng(0).uniform(-20, 20, (times, 1, 3))
+    rows = np.concatenate([np.array(pairs) + len(shape) * k for k in range(times)])
+    return held.Distance(rows), (shape + shift).reshape(-1, 3)
+
+
+def planned(rows, x, masses=None):
+    constraint_set = ConstraintSet(rows, x, np.ones(len(x)) if masses is None else masses)
+    return make_plan(constraint_set, np.asarray(x), 0.0)
+
+
+def lines(plan) -> list[tuple[str, int, int, int]]:
+    return [(k.solver, k.clusters, k.rows, k.rank) for k in plan.kinds]
+
+
+@pytest.mark.parametrize(
+    ("shape", "pairs", "times", "expected"),
+    [
+        (WATER, all_pairs(3), 1, ("water", 1, 3, 3)),
+        (WATER, all_pairs(3), 50, ("water", 50, 150, 150)),
+        (WATER[:2], [(0, 1)], 9, ("lanes", 9, 9, 9)),
+        (WATER, [(0, 1), (0, 2)], 9, ("lanes", 9, 18, 18)),
+        (METHANE, [(0, k) for k in range(1, 5)], 9, ("lanes", 9, 36, 36)),
+        (TETRAHEDRON, all_pairs(4), 9, ("lanes", 9, 54, 54)),
+        (ZIGZAG, [(k, k + 1) for k in range(19)], 3, ("chain", 3, 57, 57)),
+        (HEXAGON, [(k, (k + 1) % 6) for k in range(6)], 9, ("lanes", 9, 54, 54)),
+        (METHANE, all_pairs(5), 4, ("sparse", 4, 40, 36)),  # rank-deficient
+        (OCTAHEDRON, all_pairs(6), 2, ("sparse", 2, 30, 24)),
+        (WATER[:2], [(0, 1), (1, 0)], 9, ("sparse", 9, 18, 9)),  # small, and rank-deficient
+        (WATER, [*all_pairs(3), (0, 1)], 9, ("sparse", 9, 36, 27)),
+    ],
+)
+def test_table_for_distances(shape, pairs, times, expected) -> None:
+    rows, x = many(shape, pairs, times)
+    plan = planned(rows, x)
+    assert lines(plan) == [expected]
+    assert plan.rank == expected[3]
+    assert bool(plan.dependent) is (expected[3] < expected[2])
+    assert not plan.driven
+
+
+def test_dependent_rows_are_listed_cluster_by_cluster() -> None:
+    rows, x = many(METHANE, all_pairs(5), 3)
+    plan = planned(rows, x)
+    assert sorted(part.tolist() for part in plan.dependent) == [list(range(10 * k, 10 * k + 10)) for k in range(3)]
+
+
+def test_few_clusters_of_many_kinds_share_the_sparse_solver() -> None:
+    pairs, x, masses = [], [], []
+    for kind in range(4):
+        for _ in range(2):
+            pairs += [(len(x) + i, len(x) + j) for i, j in ((0, 1), (0, 2))]
+            x += list(WATER + 5.0 * len(x))
+            masses += [12.0 + kind, 1.0, 1.0]
+    plan = planned(held.Distance(pairs), np.array(x), np.array(masses))
+    assert lines(plan) == [("sparse", 8, 16, 16)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ([held.Distance([0, 1]), held.Angle([0, 1, 2])], ("mixed", 1, 2, 2)),
+        ([held.Sphere([0, 1, 2], [9.0, 0, 0])], ("mixed", 3, 3, 3)),
+        ([held.Distance([0, 1]), held.Plane([0, 1], [0, 0, 1.0])], ("mixed", 1, 3, 3)),
+        ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
+        ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("general", 1, 4, 4)),
+        ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("general", 1, 2, 1)),
+        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("general", 1, 1, 1)),
+    ],
+)
+def test_table_for_other_rows(rows, expected) -> None:
+    assert lines(planned(rows, ZIGZAG[:5])) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("fixed", "pairs", "expected"),
+    [
+        ([0], [(0, 1)], ("sparse", 1, 1, 1)),
+        ([0], [(0, 1), (0, 2)], ("sparse", 2, 2, 2)),
+        ([0, 3], [(0, 1), (1, 2), (2, 3)], ("sparse", 1, 3, 3)),
+        ([0, 1], [(0, 2), (1, 2), (0, 1)], ("sparse", 1, 2, 2)),  # the last row lies between fixed atoms
+        ([0, 1, 2], [(0, 3), (1, 3), (2, 3), (3, 4)], ("sparse", 1, 4, 4)),
+    ],
+)
+def test_anchored_clusters(fixed, pairs, expected) -> None:
+    x = np.vstack([WATER, [[0.2, 0.4, 1.1], [1.0, 1.0, 2.0]]])
+    plan = planned([held.FixedAtoms(fixed), held.Distance(pairs)], x)
+    assert lines(plan) == [expected]
+    assert plan.rank == expected[3] + 3 * len(fixed)
+    np.testing.assert_array_equal(plan.pinned, fixed)
+    assert (plan.inverse_masses[fixed] == 0).all()
+
+
+def test_a_bond_to_two_fixed_atoms_in_line_has_rank_one() -> None:
+    x = np.array([[-1.0, 0, 0], [0, 0, 0], [1.5, 0, 0]])
+    rows = [held.FixedAtoms([0, 2]), held.LinearCombination([1, 0], [[1.0, 0, 0], [-1, 0, 0]])]
+    rows.append(held.LinearCombination([1, 2], [[1.0, 0, 0], [-1, 0, 0]]))
+    plan = planned(rows, x)
+    assert lines(plan) == [("mixed", 1, 2, 1)]
+
+
+def test_rank_is_that_of_the_dense_matrix() -> None:
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        n = 12
+        x = rng.normal(size=(n, 3)) * 2
+        pairs = [rng.choice(n, 2, replace=False).tolist() for _ in range(int(rng.integers(1, 36)))]
+        constraint_set = ConstraintSet(held.Distance(pairs), x, 10 ** rng.uniform(0, 2, n))
+        plan = make_plan(constraint_set, x, 0.0)
+        A = constraint_set.jacobian(x).toarray()
+        assert plan.rank == np.linalg.matrix_rank(A / np.linalg.norm(A, axis=1)[:, None], tol=1e-8)
+
+
+# -- rows between fixed atoms -----------------------------------------------------------------------
+
+
+def test_fulfilled_rows_between_fixed_atoms_are_dropped() -> None:
+    plan = planned([held.FixedAtoms([0, 1]), held.Distance([[0, 1], [1, 2]])], WATER)
+    assert plan.labels.tolist() == [-1] * 7 + [0]
+    assert plan.rank == 7 and plan.loose is None
+
+
+@pytest.mark.parametrize(
+    "row",
+    [held.Distance([0, 1], 1.1), held.LinearVelocity([[0, 1]], np.eye(3)[:2], 0.5), held.Plane(0, [1.0, 0, 0], 2)],
+)
+def test_rows_between_fixed_atoms_that_contradict_are_refused(row) -> None:
+    far = np.vstack([np.full((20, 3), 9.0) + np.arange(20)[:, None], WATER])
+    shifted = row.renumbered(np.arange(3) + 20)
+    with pytest.raises(ContradictionError, match=r"between fixed atoms.*(free|remove)") as caught:
+        Motion(ConstraintSet([held.FixedAtoms([20, 21]), shifted], far, np.ones(23)), far)
+    assert caught.value.rows == (6,)
+    assert set(caught.value.atoms) <= {20, 21} and str(20) in str(caught.value)
+
+
+def test_atoms_fixed_on_a_path_that_breaks_a_row_between_them() -> None:
+    """Dropped rows are watched as long as something moves; nothing changes on failure."""
+    rows = [
+        held.FixedAtoms([0], lambda t: WATER[0]),
+        held.FixedAtoms([1], lambda t: WATER[1] + [0, 0, t]),
+        held.Distance([[0, 1], [1, 2]]),
+    ]
+    motion = Motion(ConstraintSet(rows, WATER, np.ones(3)), WATER)
+    assert motion.plan.loose is not None
+    motion.project_positions(WATER, WATER, time=0.0)
+    x, v = WATER + 0.01, np.zeros((3, 3))
+    kept = x.copy()
+    with pytest.raises(ContradictionError, match=r"#6 Distance\(0, 1\)"):
+        motion.project_positions(x, WATER, time=0.3, out=x, velocities=v, dt=0.1)
+    np.testing.assert_array_equal(x, kept)
+    assert not v.any()
+
+
+def test_velocity_row_between_fixed_atoms_that_agrees() -> None:
+    moving = held.FixedAtoms([0], held.MovingTarget(lambda t: [t, 0.0, 0.0], lambda t: [1.0, 0, 0], lambda t: 0.0))
+    plan = planned([moving, held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.0)], WATER)
+    assert plan.rank == 3
+    with pytest.raises(ContradictionError):
+        planned([moving, held.LinearVelocity([[0]], [[1.0, 0, 0]], 1.1)], WATER)
+
+
+def test_too_large_for_the_dense_rescue() -> None:
+    plan = planned(held.Distance([(k, k + 1) for k in range(19)]), ZIGZAG)
+    with pytest.raises(UnsupportedError, match="cluster of 19 rows around #0 Distance"):
+        plan.general_for_all(18)
+    assert len(plan.general_for_all(19).rows) == 19
