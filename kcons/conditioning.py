@@ -18,6 +18,8 @@ from kcons.solvers.general import RANK_TOLERANCE
 DENSE_ROWS = 300
 #: With dependent rows, for which the sparse way has no cheap answer, dense ones go this far.
 DENSE_DEPENDENT_ROWS = 1500
+#: Numbers in the dense matrices of one portion of clusters.
+PORTION = 4_000_000
 
 
 def worst_condition(
@@ -71,7 +73,7 @@ def _dense(unit: sp.csr_array, starts: IntArray, size: int) -> float:
     worst = 1.0
     widths = [np.diff(unit.indptr)[starts + k] for k in range(size)]
     most = int(sum(w.max() for w in widths))
-    portion = max(1, 4_000_000 // (size * most))
+    portion = max(1, PORTION // (size * most))
     for begin in range(0, len(starts), portion):
         some = starts[begin : begin + portion]
         n = len(some)

@@ -103,7 +103,8 @@ def make_report(
     sigma = np.abs(constraint_set.value(x, time))
     worst = int(np.argmax(sigma / constraint_set.scale)) if len(sigma) else -1
     speed = float("nan")
-    jacobian = constraint_set.jacobian(x, time)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jacobian = constraint_set.jacobian(x, time)
     if v is not None:
         norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
         miss = np.abs(jacobian @ v.ravel() - constraint_set.velocity_target(x, time))

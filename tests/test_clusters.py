@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_open_chains_beyond_the_lanes(rows: int) -> None:
         for k in range(2):
             atoms = shape.atoms[shape.starts[k] : shape.starts[k + 1]]
             walked = pairs[shape.rows[k * rows : (k + 1) * rows]]
-            for row, (a, b) in enumerate(zip(atoms, atoms[1:], strict=False)):
+            for row, (a, b) in enumerate(pairwise(atoms)):
                 assert {a, b} == set(walked[row])
 
 

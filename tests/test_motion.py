@@ -626,7 +626,7 @@ def raised(call) -> KconsError:
 
 
 def test_messages_say_what_to_do() -> None:
-    far = WATER + [[0, 0, 0], [7.0, 0, 0], [0, 0, 0]]
+    far = WATER + np.array([[0, 0, 0], [7.0, 0, 0], [0, 0, 0]])
     motion = Motion(ConstraintSet(held.Distance(TRIANGLE), WATER, np.ones(3)), WATER)
     error = raised(lambda: motion.project_positions(far, WATER))
     assert isinstance(error, ConvergenceError) and "use a smaller time step" in str(error)

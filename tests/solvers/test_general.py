@@ -165,7 +165,7 @@ def test_a_step_too_far_is_refused_and_changes_nothing() -> None:
     """A sphere cannot be reached along a direction that passes it by."""
     x = np.array([[1.0, 0, 0], [5.0, 0, 0]])
     solver, _ = solver_of([ellipsoid(np.array([0, 1]))], x, labels=[0, 1])
-    new = x + [[0.0, 3.0, 0], [0.01, 0, 0]]
+    new = x + np.array([[0.0, 3.0, 0], [0.01, 0, 0]])
     kept, v = new.copy(), np.ones((2, 3))
     outcome = positions(solver, new, x, velocities=v, inv_dt=1.0)
     assert not outcome.converged and outcome.worst_row == 0 and outcome.residual > 1e-3
@@ -212,7 +212,7 @@ def test_a_gradient_that_vanishes() -> None:
 def test_outcome_counts_iterations_even_without_residual() -> None:
     x = np.array([[1.0, 0, 0]])
     solver, _ = solver_of([held.Plane([0], [1.0, 0, 0])], x)
-    outcome = positions(solver, x + [[0.5, 0, 0]], x)
+    outcome = positions(solver, x + np.array([[0.5, 0, 0]]), x)
     assert outcome == (True, 0.0, outcome.iterations, 0)
     assert outcome.iterations > 0
 

@@ -1,0 +1,199 @@
+"""The report on a healthy set, and the sentences about one that is not."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from kcons import constraints as held
+from kcons import diagnosis
+from kcons.cli import main
+from kcons.constraint_set import ConstraintSet
+from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
+from kcons.motion import Motion
+from kcons.solvers.outcome import Outcome
+
+WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+METHANE = np.vstack([np.zeros(3), 0.629 * TETRAHEDRON])
+TRIANGLE = list(combinations(range(3), 2))
+
+
+def mixed_system(extra: int = 0) -> tuple[Motion, np.ndarray]:
+    """Water, methane by ten distances, an angle with its bonds, a radius of gyration; atoms from `extra` on."""
+    x = np.vstack([WATER, METHANE + 5, 1.1 * WATER - 5, WATER[:, ::-1] + 9])
+    rows = [
+        held.Distance(TRIANGLE),
+        held.Distance([(3 + i, 3 + j) for i, j in combinations(range(5), 2)]),
+        held.Distance([(8, 9), (8, 10)]),
+        held.Angle([(9, 8, 10)]),
+        held.RadiusOfGyration([[11, 12, 13]]),
+    ]
+    numbers = np.arange(len(x)) + extra
+    rows = [c.renumbered(numbers) for c in rows]
+    whole = np.vstack([np.arange(3.0 * extra).reshape(extra, 3) + 50, x])
+    masses = np.concatenate([np.ones(extra), [16.0, 1, 1], [12.0, 1, 1, 1, 1], [16.0, 1, 1], [3.0, 4, 5]])
+    return Motion(ConstraintSet(rows, whole, masses), whole), whole
+
+
+@pytest.mark.parametrize("extra", [0, 100])
+def test_report_says_it_all(extra: int) -> None:
+    motion, x = mixed_system(extra)
+    whole = motion.constraint_set
+    v = np.random.default_rng(0).normal(size=x.shape)
+    report = motion.report(x, v)
+    assert (report.rows, report.rank, report.degrees_of_freedom) == (17, 16, 3 * len(x) - 16)
+    assert [(k.solver, k.clusters, k.rows, k.rank) for k in report.kinds] == [
+        ("water", 1, 3, 3),
+        ("sparse", 1, 10, 9),
+        ("mixed", 1, 3, 3),
+        ("general", 1, 1, 1),
+    ]
+    A = whole.jacobian(x).toarray()
+    for kind, rows in zip(report.kinds, (range(3), range(3, 13), range(13, 16), [16]), strict=True):
+        B = A[list(rows)] / np.sqrt(np.repeat(whole.masses, 3))
+        s = np.linalg.svd(B / np.linalg.norm(B, axis=1)[:, None], compute_uv=False)
+        assert kind.condition == pytest.approx(s[0] / s[s > 1e-9][-1], rel=1e-9)
+        assert whole.row_name(rows[0]) == kind.example
+    assert report.condition == max(k.condition for k in report.kinds)
+    unit = A / np.linalg.norm(A, axis=1)[:, None]
+    assert report.velocity_residual == pytest.approx(np.abs(unit @ v.ravel()).max(), rel=1e-12)
+    assert report.iterations == 0 and all(k.iterations == 0 for k in report.kinds)
+    text = str(report)
+    for kind in report.kinds:
+        assert kind.solver in text and kind.example in text and f"{kind.condition:.3g}" in text
+    assert "rows 17, rank 16" in text and "condition" in text and "iterations" in text
+    assert f"degrees of freedom {report.degrees_of_freedom}" in text
+
+
+def test_report_on_fixed_atoms() -> None:
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
+    whole = ConstraintSet([held.FixedAtoms([0]), held.Distance([(0, 1), (1, 2)])], x, [0.0, 1.0, 1.0])
+    report = Motion(whole, x).report(x)
+    assert report.rank == 5 and report.kinds[0].rank == 2
+    # Unit rows (s_1) and (s_2 - s_1)/sqrt 2 at right angles: no coupling at all.
+    assert report.condition == pytest.approx(1.0, abs=1e-12)
+    assert np.isfinite(Motion(whole, x).report(x, np.zeros((3, 3))).velocity_residual)
+
+
+def test_iterations_are_those_of_the_last_step() -> None:
+    motion, x = mixed_system()
+    step = 0.05 * np.random.default_rng(1).normal(size=x.shape)
+    motion.project_positions(x + step, x)
+    far = motion.report(x)
+    assert far.iterations == max(k.iterations for k in far.kinds) >= 2
+    assert all(k.iterations >= 1 for k in far.kinds)
+    motion.project_positions(x + 1e-9 * step, x)
+    assert motion.report(x).iterations < far.iterations
+
+
+def test_condition_only_where_asked_for() -> None:
+    motion, x = mixed_system()
+    report = motion.report(x, condition=False)
+    assert np.isnan(report.condition) and all(np.isnan(k.condition) for k in report.kinds)
+    assert " - " in str(report) and "nan" not in str(report)
+    assert np.isnan(report.velocity_residual)
+
+
+def test_worst_row_is_named() -> None:
+    motion, x = mixed_system()
+    off = x.copy()
+    off[9] += 0.3
+    report = motion.report(off)
+    assert report.worst_row in ("#13 Distance(8, 9)", "#15 Angle(9, 8, 10)")
+    assert report.residual == np.abs(motion.constraint_set.value(off)).max()
+    assert report.worst_row in str(report)
+
+
+def test_report_at_a_time() -> None:
+    x = WATER[:2]
+    motion = Motion(ConstraintSet(held.Distance([0, 1], lambda t: 0.9572 + t), x, np.ones(2)), x)
+    assert motion.report(x, time=0.25).residual == pytest.approx(0.25, rel=1e-12)
+    v = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    assert motion.report(x, v, 0.25).velocity_residual == pytest.approx(0.0, abs=1e-11)
+
+
+@pytest.mark.parametrize("scene", ["water", "chain", "sphere"])
+def test_plan_prints_the_report(scene: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", scene, "--size", "27"]) == 0
+    page = capsys.readouterr().out
+    for word in ("clusters", "rank", "degrees of freedom", "condition", "solver"):
+        assert word in page
+
+
+# -- errors -----------------------------------------------------------------------------------------
+
+
+def bond(numbers: np.ndarray | None = None):
+    whole = ConstraintSet(held.Distance([0, 1]), WATER, np.ones(3))
+    motion = Motion(whole, WATER)
+    return whole, motion.plan, motion.plan.solvers[0], numbers
+
+
+@pytest.mark.parametrize("numbers", [None, np.array([70, 80, 90])])
+def test_positions_failed(numbers: np.ndarray | None) -> None:
+    whole, plan, solver, _ = bond()
+    error = diagnosis.positions_failed(whole, numbers, Outcome(False, 0.25, 7, 0), solver, plan)
+    names = (0, 1) if numbers is None else (70, 80)
+    assert isinstance(error, ConvergenceError)
+    assert (error.row, error.atoms, error.cluster, error.residual, error.iterations) == (0, names, 0, 0.25, 7)
+    assert f"#0 Distance({names[0]}, {names[1]})" in str(error) and "restore_positions" in str(error)
+    nameless = diagnosis.positions_failed(whole, numbers, Outcome(False, 0.25, 7, -1), solver, plan)
+    assert isinstance(nameless, ConvergenceError) and nameless.row == -1
+
+
+@pytest.mark.parametrize("numbers", [None, np.array([70, 80, 90])])
+def test_not_finite_names_array_and_atom(numbers: np.ndarray | None) -> None:
+    whole, *_ = bond()
+    assert diagnosis.not_finite(whole, numbers, {"x_new": WATER}) is None
+    broken = WATER.copy()
+    broken[2] = np.nan  # no row touches it
+    assert diagnosis.not_finite(whole, numbers, {"x_new": broken}) is None
+    broken[1, 0] = np.inf
+    error = diagnosis.not_finite(whole, numbers, {"x_new": WATER, "x_ref": broken})
+    atom = 1 if numbers is None else 80
+    assert isinstance(error, InputError) and error.item == "x_ref" and error.atoms == (atom,)
+    assert str(error).startswith(f"x_ref of atom {atom} is not finite")
+
+
+def test_coincident_atoms_come_before_all_else() -> None:
+    whole, plan, solver, _ = bond()
+    same = np.zeros((3, 3))
+    outcome = Outcome(False, np.inf, 0, 0)
+    for error in (
+        diagnosis.unusable(whole, None, {"x_new": WATER, "x_ref": same}, outcome, solver),
+        diagnosis.tangents_failed(whole, None, same, WATER, outcome, solver, "velocity", plan),
+        diagnosis.undefined_row(whole, None, {"velocity": WATER, "position": same}, 0),
+        diagnosis.restore_failed(whole, None, WATER, same, outcome, solver, 0.0),
+    ):
+        assert isinstance(error, SingularGeometryError)
+        assert error.rows == (0,) and error.atoms == (0, 1) and "move them apart" in str(error)
+    assert diagnosis.unusable(whole, None, {"x_new": same, "x_ref": WATER}, outcome, solver) is None
+
+
+def test_curvature_that_is_undefined() -> None:
+    x = np.array([[1.0, 0, 0], [0.0, 0, 0], [0.0, 1.0, 0]])
+    motion = Motion(ConstraintSet(held.Angle([0, 1, 2]), x, np.ones(3)), x)
+    straight = np.array([[1.0, 0, 0], [0.0, 0, 0], [-1.0, 0.0, 0]])
+    with pytest.raises(SingularGeometryError) as caught:
+        motion.acceleration(straight, x, x)
+    assert caught.value.rows == (0,) and caught.value.atoms == (0, 1, 2)
+
+
+def test_restore_failed_quotes_the_sum_of_squares() -> None:
+    whole, _, solver, _ = bond()
+    off = WATER + np.array([[0, 0, 0], [0.5, 0, 0], [0, 0, 0]])
+    error = diagnosis.restore_failed(whole, None, off, WATER, Outcome(False, 0.5, 9, 0), solver, 0.0)
+    assert isinstance(error, InfeasibleError)
+    assert "cannot go below 0.25 (sum of squares)" in str(error) and error.iterations == 9
+
+
+def test_wide_rows_are_cut_short() -> None:
+    x = np.random.default_rng(0).normal(size=(9, 3))
+    whole = ConstraintSet(held.RadiusOfGyration([np.arange(9)]), x, np.ones(9))
+    motion = Motion(whole, x)
+    error = diagnosis.positions_failed(whole, None, Outcome(False, 1.0, 1, 0), motion.plan.solvers[0], motion.plan)
+    assert "RadiusOfGyration(0, 1, 2, 3, 4, 5, ...)" in str(error)
+    assert isinstance(error, ConvergenceError) and error.atoms == tuple(range(9))
