@@ -417,12 +417,17 @@ def first_call() -> dict:
     with tempfile.TemporaryDirectory() as cache:
         environment = {**os.environ, "NUMBA_CACHE_DIR": cache}
         times = []
-        for _ in range(2):
+        for _ in range(6):
             done = subprocess.run(
                 [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
             )
             times.append([float(word) for word in done.stdout.split()])
-    return {"import_s": times[1][0], "first_call_s": times[0][1], "first_call_cached_s": times[1][1]}
+    imports, first = np.array(times).T
+    return {
+        "import_s": float(np.median(imports[1:])),
+        "first_call_s": float(first[0]),
+        "first_call_cached_s": float(np.median(first[1:])),
+    }
 
 
 # -- the run --------------------------------------------------------------------------------------
