@@ -16,7 +16,6 @@ import numpy as np
 
 from kcons.constraints.constraint import RowKind
 from kcons.solvers.elimination import FAST
-from kcons.solvers.lattice import nearest_image
 from kcons.solvers.narrow import dot, entry, lane, load_quad, number, put, quad
 
 DISTANCE = int(RowKind.DISTANCE)
@@ -34,13 +33,27 @@ NOW, REFERENCE = 0, 1
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _difference(i, j, base, moves, lattice, periodic):  # type: ignore[no-untyped-def]
-    d = load_quad(base, 4 * i) - load_quad(base, 4 * j)
+def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-untyped-def]
+    """Vector from atom j to atom i, as three numbers."""
+    return _near(
+        load_quad(base, 4 * i) - load_quad(base, 4 * j),
+        load_quad(moves, 4 * i) - load_quad(moves, 4 * j),
+        cell, inverse, periodic,
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
+    # No arrays come here: one that passes a branch costs reference counting.
+    x, y, z = lane(whole, 0), lane(whole, 1), lane(whole, 2)
     if periodic:
-        x, y, z = nearest_image(lane(d, 0), lane(d, 1), lane(d, 2), lattice)
-        d = quad(x, y, z, 0.0)
-    d = d + (load_quad(moves, 4 * i) - load_quad(moves, 4 * j))
-    return lane(d, 0), lane(d, 1), lane(d, 2)
+        a = np.rint(x * inverse[0][0] + y * inverse[1][0] + z * inverse[2][0])
+        b = np.rint(x * inverse[0][1] + y * inverse[1][1] + z * inverse[2][1])
+        c = np.rint(x * inverse[0][2] + y * inverse[1][2] + z * inverse[2][2])
+        x -= a * cell[0][0] + b * cell[1][0] + c * cell[2][0]
+        y -= a * cell[0][1] + b * cell[1][1] + c * cell[2][1]
+        z -= a * cell[0][2] + b * cell[1][2] + c * cell[2][2]
+    return x + lane(change, 0), y + lane(change, 1), z + lane(change, 2)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -56,79 +69,41 @@ def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def value_and_gradient(kind, slot, slot_atoms, parameters, offset, base, moves, lattice, periodic, lines, which):  # type: ignore[no-untyped-def]
-    """Natural coordinate of a row that is neither a distance nor linear; writes its gradient into the lines.
-
-    `offset` is where the row's parameters begin. Angles: dtheta/dr_i = u x (u x w) / (u^2 |u x w|).
-    Dihedrals: Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996).
-    """
-    place = 8 * slot + which
-    if kind == ANGLE:
-        j = entry(slot_atoms, slot + 1)
-        ux, uy, uz = _difference(entry(slot_atoms, slot), j, base, moves, lattice, periodic)
-        wx, wy, wz = _difference(entry(slot_atoms, slot + 2), j, base, moves, lattice, periodic)
-        cx, cy, cz = _cross(ux, uy, uz, wx, wy, wz)
-        c = math.sqrt(cx * cx + cy * cy + cz * cz)
-        fu = 1.0 / ((ux * ux + uy * uy + uz * uz) * c)
-        fw = 1.0 / ((wx * wx + wy * wy + wz * wz) * c)
-        ax, ay, az = _cross(ux, uy, uz, cx, cy, cz)
-        bx, by, bz = _cross(cx, cy, cz, wx, wy, wz)
-        ax, ay, az = fu * ax, fu * ay, fu * az
-        bx, by, bz = fw * bx, fw * by, fw * bz
-        _put(lines, place, ax, ay, az)
-        _put(lines, place + 8, -(ax + bx), -(ay + by), -(az + bz))
-        _put(lines, place + 16, bx, by, bz)
-        return math.atan2(c, ux * wx + uy * wy + uz * wz)
-    if kind == DIHEDRAL:
-        j, k = entry(slot_atoms, slot + 1), entry(slot_atoms, slot + 2)
-        fx, fy, fz = _difference(entry(slot_atoms, slot), j, base, moves, lattice, periodic)
-        gx, gy, gz = _difference(j, k, base, moves, lattice, periodic)
-        hx, hy, hz = _difference(entry(slot_atoms, slot + 3), k, base, moves, lattice, periodic)
-        ax, ay, az = _cross(fx, fy, fz, gx, gy, gz)
-        bx, by, bz = _cross(hx, hy, hz, gx, gy, gz)
-        g = math.sqrt(gx * gx + gy * gy + gz * gz)
-        a2 = ax * ax + ay * ay + az * az
-        b2 = bx * bx + by * by + bz * bz
-        sx, sy, sz = _cross(bx, by, bz, ax, ay, az)
-        value = math.atan2((sx * gx + sy * gy + sz * gz) / g, ax * bx + ay * by + az * bz)
-        ga, gb = g / a2, g / b2
-        fa = (fx * gx + fy * gy + fz * gz) / (a2 * g)
-        hb = (hx * gx + hy * gy + hz * gz) / (b2 * g)
-        _put(lines, place, -ga * ax, -ga * ay, -ga * az)
-        tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
-        _put(lines, place + 8, ga * ax + tx, ga * ay + ty, ga * az + tz)
-        _put(lines, place + 16, -tx - gb * bx, -ty - gb * by, -tz - gb * bz)
-        _put(lines, place + 24, gb * bx, gb * by, gb * bz)
-        return value
-    i = entry(slot_atoms, slot)
-    r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
-    cx, cy, cz = number(parameters, offset), number(parameters, offset + 1), number(parameters, offset + 2)
-    x, y, z = lane(r, 0) - cx, lane(r, 1) - cy, lane(r, 2) - cz
-    if kind == SPHERE:
-        length = math.sqrt(x * x + y * y + z * z)
-        _put(lines, place, x / length, y / length, z / length)
-        return length
-    # Cylinder: distance from the axis through the point with the unit direction n.
-    nx, ny, nz = number(parameters, offset + 3), number(parameters, offset + 4), number(parameters, offset + 5)
-    along = x * nx + y * ny + z * nz
-    x, y, z = x - along * nx, y - along * ny, z - along * nz
-    length = math.sqrt(x * x + y * y + z * z)
-    _put(lines, place, x / length, y / length, z / length)
-    return length
+def angle(u, w):  # type: ignore[no-untyped-def]
+    """Angle between u and w and its gradients by both: dtheta/du = u x (u x w) / (u^2 |u x w|)."""
+    ux, uy, uz = u
+    wx, wy, wz = w
+    cx, cy, cz = _cross(ux, uy, uz, wx, wy, wz)
+    c = math.sqrt(cx * cx + cy * cy + cz * cz)
+    fu = 1.0 / ((ux * ux + uy * uy + uz * uz) * c)
+    fw = 1.0 / ((wx * wx + wy * wy + wz * wz) * c)
+    ax, ay, az = _cross(ux, uy, uz, cx, cy, cz)
+    bx, by, bz = _cross(cx, cy, cz, wx, wy, wz)
+    value = math.atan2(c, ux * wx + uy * wy + uz * wz)
+    return value, (fu * ax, fu * ay, fu * az), (fw * bx, fw * by, fw * bz)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def linear_value(slot, end, slot_atoms, parameters, offset, base, moves, lines, which):  # type: ignore[no-untyped-def]
-    """sum c . r of a linear row; small moves and large positions are summed apart."""
-    whole, change = 0.0, 0.0
-    for p in range(slot, end):
-        a = 4 * entry(slot_atoms, p)
-        at = offset + 3 * (p - slot)
-        c = quad(number(parameters, at), number(parameters, at + 1), number(parameters, at + 2), 0.0)
-        _put(lines, 8 * p + which, lane(c, 0), lane(c, 1), lane(c, 2))
-        whole += dot(c, load_quad(base, a))
-        change += dot(c, load_quad(moves, a))
-    return whole + change
+def dihedral(f, g, h):  # type: ignore[no-untyped-def]
+    """Dihedral of i, j, k, l from f = i - j, g = j - k, h = l - k, and its gradients by all but atom k, then t.
+
+    Atom k takes what the others leave. Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996).
+    """
+    fx, fy, fz = f
+    gx, gy, gz = g
+    hx, hy, hz = h
+    ax, ay, az = _cross(fx, fy, fz, gx, gy, gz)
+    bx, by, bz = _cross(hx, hy, hz, gx, gy, gz)
+    size = math.sqrt(gx * gx + gy * gy + gz * gz)
+    a2 = ax * ax + ay * ay + az * az
+    b2 = bx * bx + by * by + bz * bz
+    sx, sy, sz = _cross(bx, by, bz, ax, ay, az)
+    value = math.atan2((sx * gx + sy * gy + sz * gz) / size, ax * bx + ay * by + az * bz)
+    ga, gb = size / a2, size / b2
+    fa = (fx * gx + fy * gy + fz * gz) / (a2 * size)
+    hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)
+    tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
+    return value, (-ga * ax, -ga * ay, -ga * az), (tx, ty, tz), (gb * bx, gb * by, gb * bz)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -136,26 +111,75 @@ def evaluate(  # type: ignore[no-untyped-def]
     first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, which
 ):
     """Values and gradients of rows first to last; ``links[4 k + 2]`` is the first slot of row k."""
+    cell = (
+        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
+        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
+        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
+    )
+    inverse = (
+        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
+        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
+        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
+    )
     for k in range(first, last):
         kind = entry(kinds, k)
         slot = entry(links, 4 * k + 2)
+        place, offset = 8 * slot + which, PARAMETERS * k
+        i = entry(slot_atoms, slot)
         if kind == DISTANCE:
-            i, j = entry(slot_atoms, slot), entry(slot_atoms, slot + 1)
-            x, y, z = _difference(i, j, base, moves, lattice, periodic)
-            length = math.sqrt(x * x + y * y + z * z)
-            inverse = 1.0 / length
-            x, y, z = inverse * x, inverse * y, inverse * z
-            _put(lines, 8 * slot + which, x, y, z)
-            _put(lines, 8 * slot + 8 + which, -x, -y, -z)
-            put(values, k, length)
+            x, y, z = _difference(i, entry(slot_atoms, slot + 1), base, moves, cell, inverse, periodic)
+            value = math.sqrt(x * x + y * y + z * z)
+            x, y, z = x / value, y / value, z / value
+            _put(lines, place, x, y, z)
+            _put(lines, place + 8, -x, -y, -z)
+        elif kind == ANGLE:
+            j = entry(slot_atoms, slot + 1)
+            u = _difference(i, j, base, moves, cell, inverse, periodic)
+            w = _difference(entry(slot_atoms, slot + 2), j, base, moves, cell, inverse, periodic)
+            value, a, b = angle(u, w)
+            _put(lines, place, a[0], a[1], a[2])
+            _put(lines, place + 8, -(a[0] + b[0]), -(a[1] + b[1]), -(a[2] + b[2]))
+            _put(lines, place + 16, b[0], b[1], b[2])
+        elif kind == DIHEDRAL:
+            j, l = entry(slot_atoms, slot + 1), entry(slot_atoms, slot + 2)
+            f = _difference(i, j, base, moves, cell, inverse, periodic)
+            g = _difference(j, l, base, moves, cell, inverse, periodic)
+            h = _difference(entry(slot_atoms, slot + 3), l, base, moves, cell, inverse, periodic)
+            value, a, t, b = dihedral(f, g, h)
+            _put(lines, place, a[0], a[1], a[2])
+            _put(lines, place + 8, t[0] - a[0], t[1] - a[1], t[2] - a[2])
+            _put(lines, place + 16, -t[0] - b[0], -t[1] - b[1], -t[2] - b[2])
+            _put(lines, place + 24, b[0], b[1], b[2])
         elif kind == LINEAR:
-            end = entry(links, 4 * k + 6)
-            put(values, k, linear_value(slot, end, slot_atoms, parameters, PARAMETERS * k, base, moves, lines, which))
+            # sum c . r; small moves and large positions are summed apart.
+            whole, change = 0.0, 0.0
+            for p in range(slot, entry(links, 4 * k + 6)):
+                i = 4 * entry(slot_atoms, p)
+                c = quad(
+                    number(parameters, offset), number(parameters, offset + 1), number(parameters, offset + 2), 0.0
+                )
+                _put(lines, 8 * p + which, lane(c, 0), lane(c, 1), lane(c, 2))
+                whole += dot(c, load_quad(base, i))
+                change += dot(c, load_quad(moves, i))
+                offset += 3
+            value = whole + change
         else:
-            value = value_and_gradient(
-                kind, slot, slot_atoms, parameters, PARAMETERS * k, base, moves, lattice, periodic, lines, which
-            )
-            put(values, k, value)
+            r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
+            x = lane(r, 0) - number(parameters, offset)
+            y = lane(r, 1) - number(parameters, offset + 1)
+            z = lane(r, 2) - number(parameters, offset + 2)
+            if kind == CYLINDER:
+                # From the axis through the point with the unit direction n.
+                nx, ny, nz = (
+                    number(parameters, offset + 3),
+                    number(parameters, offset + 4),
+                    number(parameters, offset + 5),
+                )
+                along = x * nx + y * ny + z * nz
+                x, y, z = x - along * nx, y - along * ny, z - along * nz
+            value = math.sqrt(x * x + y * y + z * z)
+            _put(lines, place, x / value, y / value, z / value)
+        put(values, k, value)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")

@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.elimination import FAST, UIntArray, make_pattern
+from kcons.solvers.elimination import FAST, UIntArray, aligned, make_pattern
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
 from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.narrow import (
@@ -78,12 +78,12 @@ class SparseDistances:
         self._tables = (self._clusters, self._atoms, self._atom_start, self._w, links.ravel(),
             pattern.columns, pattern.targets, couplings, weights,
         )  # fmt: skip
-        self._state = _aligned(8 * len(rows))
-        self._entries = _aligned(4 * len(pattern.columns))
+        self._state = aligned(8 * len(rows))
+        self._entries = aligned(4 * len(pattern.columns))
         self._pivots = np.zeros(len(rows))
-        self._starts = _aligned(4 * len(rows))
-        self._places = _aligned(4 * len(self._atoms))
-        self._moves = _aligned(4 * len(self._atoms))
+        self._starts = aligned(4 * len(rows))
+        self._places = aligned(4 * len(self._atoms))
+        self._moves = aligned(4 * len(self._atoms))
         self._solution = np.zeros(len(rows))
         self._kept_moves = np.zeros(len(self._moves))
         self._kept_solution = np.zeros(len(rows))
@@ -465,10 +465,3 @@ def _apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
         move = load_quad(moves, 4 * a)
         add_to_point(x, g, move)
         add_to_point(v, g, inv_dt * move)
-
-
-def _aligned(size: int) -> FloatArray:
-    """Zeros that begin on a cache line."""
-    raw = np.zeros(size + 8)
-    offset = (-raw.ctypes.data // 8) % 8
-    return raw[offset : offset + size]

@@ -1,7 +1,7 @@
 """Sparse elimination of A M^-1 A^T: order and pattern found once, numbers filled in at every solve.
 
-Rows are eliminated by minimum degree (leaf first: trees have no fill), then renumbered in postorder of
-the elimination tree, so that clusters, and branches within them, lie together in memory. The pattern
+Rows are eliminated by minimum degree (leaf first: chains and hydrocarbons have no fill), then renumbered in
+postorder of the elimination tree, so that clusters, and branches within them, lie together in memory. The pattern
 is symmetric; the numbers need not be (Newton's matrix for positions is not).
 
 Storage, in elimination order: row k has diagonal `diagonal[k]` and, for every later row l = `columns[e]`
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
 
 UIntArray = NDArray[np.uint32]
 
@@ -342,6 +343,30 @@ def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
     return result, clusters[: n_clusters + 1].copy()
 
 
+@nb.njit(cache=True)
+def make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
+    """For each entry (k, l) of the matrix: pairs of slots of k and l on one movable atom, and its inverse mass."""
+    begin = np.zeros(len(columns) + 1, np.uint32)
+    for fill in range(2):
+        if fill == 1:
+            sides = np.empty(2 * begin[-1], np.uint32)
+            masses = np.empty(begin[-1])
+        used = 0
+        for k in range(len(start) - 1):
+            for e in range(start[k], start[k + 1]):
+                l = columns[e]
+                for p in range(slots[k], slots[k + 1]):
+                    for q in range(slots[l], slots[l + 1]):
+                        if slot_atoms[p] == slot_atoms[q] and w[slot_atoms[p]] > 0:
+                            if fill == 1:
+                                sides[2 * used] = p
+                                sides[2 * used + 1] = q
+                                masses[used] = w[slot_atoms[p]]
+                            used += 1
+                begin[e + 1] = used
+    return begin, sides, masses
+
+
 @nb.njit(cache=True, fastmath=FAST, inline="always")
 def substitute_forward(first, last, start, columns, lower, right):  # type: ignore[no-untyped-def]
     """L y = right in place for rows first to last, with unit L."""
@@ -360,3 +385,10 @@ def substitute_backward(first, last, start, columns, upper, pivot, right):  # ty
         for p in range(start[k], start[k + 1]):
             total -= upper[p] * right[columns[p]]
         right[k] = total * pivot[k]
+
+
+def aligned(size: int) -> FloatArray:
+    """Zeros that begin on a cache line."""
+    raw = np.zeros(size + 8)
+    offset = (-raw.ctypes.data // 8) % 8
+    return raw[offset : offset + size]

@@ -12,8 +12,8 @@ import numpy as np
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.coordinates import NOW, PARAMETERS, REFERENCE, evaluate, miss
-from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, make_pattern
+from kcons.solvers.coordinates import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
+from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, aligned, make_pattern, make_triples
 from kcons.solvers.lattice import NO_LATTICE
 from kcons.solvers.linear import update
 from kcons.solvers.narrow import (
@@ -74,7 +74,7 @@ class SparseRows:
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
         self._atoms, atom_start, slot_atoms = _number_atoms(flat, slots, pattern.clusters, len(inverse_masses))
         w = inverse_masses[self._atoms]
-        triple, sides, masses = _triples(pattern.start, pattern.columns, slots, slot_atoms, w)
+        triple, sides, masses = make_triples(pattern.start, pattern.columns, slots, slot_atoms, w)
         # Row by row: its first entry, its first target, its first slot.
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
@@ -88,16 +88,16 @@ class SparseRows:
         self._scale = constraint_set.scale[self.rows]
         self._targets = np.ascontiguousarray(constraint_set.target(0.0)[self.rows])
         n = len(rows)
-        lines = np.zeros((int(slots[-1]), 8))
-        lines[:, 6] = w[slot_atoms]
-        # By slot; by row: accumulated change of the pivot and right-hand side; by entry.
-        self._lines, self._state, self._entries = lines.ravel(), np.zeros(2 * n), np.zeros(4 * len(pattern.columns))
+        self._lines = aligned(8 * int(slots[-1]))
+        self._lines[6::8] = w[slot_atoms]
+        # By row: accumulated change of the pivot and right-hand side; by entry as in `kcons.solvers.linear`.
+        self._state, self._entries = aligned(2 * n), aligned(4 * len(pattern.columns))
         self._pivots, self._values, self._floor = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._base, self._moves = np.zeros(4 * len(self._atoms)), np.zeros(4 * len(self._atoms))
+        self._base, self._moves = aligned(4 * len(self._atoms)), aligned(4 * len(self._atoms))
         self._solution = np.zeros(n)
         self._kept_moves = np.zeros(len(self._moves))
         self._kept_solution = np.zeros(n)
-        self._speeds = np.zeros(4 * len(self._atoms))
+        self._speeds = aligned(4 * len(self._atoms))
 
     def positions(
         self,
@@ -192,30 +192,6 @@ def _number_atoms(flat, slots, clusters, n_atoms):  # type: ignore[no-untyped-de
             numbers[p] = place[a]
         atom_start[c + 1] = used
     return atoms[:used].copy(), atom_start, numbers
-
-
-@nb.njit(cache=True)
-def _triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
-    """For each entry (k, l) of the matrix: pairs of slots of k and l on one movable atom, and its inverse mass."""
-    begin = np.zeros(len(columns) + 1, np.uint32)
-    for fill in range(2):
-        if fill == 1:
-            sides = np.empty(2 * begin[-1], np.uint32)
-            masses = np.empty(begin[-1])
-        used = 0
-        for k in range(len(start) - 1):
-            for e in range(start[k], start[k + 1]):
-                l = columns[e]
-                for p in range(slots[k], slots[k + 1]):
-                    for q in range(slots[l], slots[l + 1]):
-                        if slot_atoms[p] == slot_atoms[q] and w[slot_atoms[p]] > 0:
-                            if fill == 1:
-                                sides[2 * used] = p
-                                sides[2 * used + 1] = q
-                                masses[used] = w[slot_atoms[p]]
-                            used += 1
-                begin[e + 1] = used
-    return begin, sides, masses
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -319,15 +295,20 @@ def _begin(  # type: ignore[no-untyped-def]
         first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, REFERENCE
     )
     for a in range(first_atom, last_atom):
-        store_quad(base, 4 * a, load_point(x_new, 3 * entry(atoms, a)))
+        point = load_point(x_new, 3 * entry(atoms, a))
+        store_quad(base, 4 * a, point)
+        put(base, 4 * a + 3, np.sqrt(dot(point, point)))
     for k in range(first, last):
         put(solution, k, 0.0)
         # Of absolute positions for rows on space, of the row's own size for others.
         reach = 0.0
         for p in range(entry(links, 4 * k + 2), entry(links, 4 * k + 6)):
             rolled()
-            g, x = second_vector(lines, 8 * p), load_quad(base, 4 * entry(slot_atoms, p))
-            reach += np.sqrt(dot(g, g) * dot(x, x))
+            size = number(base, 4 * entry(slot_atoms, p) + 3)
+            if entry(kinds, k) != DISTANCE:
+                g = second_vector(lines, 8 * p)
+                size *= np.sqrt(dot(g, g))
+            reach += size
         put(floor, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
 
 

@@ -1,0 +1,74 @@
+"""Compiled values and gradients against the constraint classes."""
+
+import numpy as np
+import pytest
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Angle, Cylinder, Dihedral, Distance, LinearCombination, Plane, RowKind, Sphere
+from kcons.solvers.coordinates import DIHEDRAL, evaluate, miss
+from kcons.solvers.rows import SparseRows
+
+KINDS = {
+    RowKind.DISTANCE: Distance([[3, 1], [7, 2]]),
+    RowKind.ANGLE: Angle([[0, 1, 2], [5, 3, 8]]),
+    RowKind.DIHEDRAL: Dihedral([[0, 1, 2, 3], [8, 6, 4, 2]]),
+    RowKind.LINEAR: LinearCombination([[4, 6, 7]], np.arange(9.0).reshape(1, 3, 3) - 3.5),
+    RowKind.SPHERE: Sphere([5, 6], [0.3, -1.0, 2.0]),
+    RowKind.CYLINDER: Cylinder([2, 8], [0.1, 0.2, 0.3], [1.0, 2.0, -0.5]),
+}
+
+
+def evaluated(constraints, x, cell=None, moves=0.0):
+    """Values and dense gradients of the kernel with positions split into whole and moves, in the set's order."""
+    constraint_set = ConstraintSet(constraints, x, np.ones(len(x)), cell=cell)
+    n = constraint_set.n_rows
+    solver = SparseRows(constraint_set, np.arange(n), np.ones(len(x)))
+    _, atoms, _, slot_atoms, kinds, parameters, links = solver._tables[:7]
+    base, change = np.zeros((2, len(atoms), 4))
+    base[:, :3], change[:, :3] = (x - moves)[atoms], np.broadcast_to(moves, x.shape)[atoms]
+    lattice = np.zeros((2, 3, 3)) if cell is None else constraint_set.lattice
+    values, lines = np.zeros(n), np.zeros(8 * len(slot_atoms))
+    for which in range(2):
+        evaluate(
+            0, n, kinds, links, slot_atoms, parameters, base.ravel(), change.ravel(), lattice, cell is not None,
+            values, lines, which,
+        )  # fmt: skip
+    slots = links.reshape(-1, 4)[:, 2]
+    lines = lines.reshape(-1, 8)
+    np.testing.assert_array_equal(lines[:, 0:6:2], lines[:, 1:6:2])
+    gradient = np.zeros((n, len(x), 3))
+    measured = np.zeros(n)
+    for k, row in enumerate(solver.rows):
+        measured[row] = values[k]
+        for p in range(slots[k], slots[k + 1]):
+            gradient[row, atoms[slot_atoms[p]]] += lines[p, 0:6:2]
+    return constraint_set, measured, gradient.reshape(n, -1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("cell", [None, np.array([[40.0, 0, 0], [6, 36, 0], [-4, 8, 44]])], ids=["open", "triclinic"])
+def test_rows_equal_their_constraints(kind, cell):
+    rng = np.random.default_rng(int(kind))
+    x = 2 * rng.normal(size=(9, 3))
+    if cell is not None and kind in (RowKind.DISTANCE, RowKind.ANGLE, RowKind.DIHEDRAL):
+        x = x + rng.integers(-1, 2, size=(9, 3)) @ cell
+    assert KINDS[kind].kind == kind
+    constraint_set, values, gradient = evaluated([KINDS[kind]], x, cell, 0.1 * rng.normal(size=(9, 3)))
+    np.testing.assert_allclose(values, constraint_set.measure(x), rtol=1e-13, atol=1e-13)
+    expected = constraint_set.jacobian(x).toarray()
+    np.testing.assert_allclose(
+        gradient, expected, atol=1e-13 * max(1, np.abs(expected).max()) * (1 if cell is None else 100)
+    )
+
+
+def test_all_kinds_together():
+    rng = np.random.default_rng(9)
+    x = 2 * rng.normal(size=(9, 3))
+    constraint_set, values, gradient = evaluated([*KINDS.values(), Plane([1], [0, 0.6, 0.8])], x)
+    np.testing.assert_allclose(values, constraint_set.measure(x), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(gradient, constraint_set.jacobian(x).toarray(), atol=1e-12)
+
+
+def test_dihedrals_miss_by_the_shorter_way():
+    assert miss(DIHEDRAL, 3.1, -3.1) == pytest.approx(2 * np.pi - 6.2)
+    assert miss(int(RowKind.ANGLE), 3.1, 0.1) == pytest.approx(-3.0)

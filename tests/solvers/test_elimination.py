@@ -1,0 +1,112 @@
+"""Order and pattern of the sparse elimination, and its sweeps against dense algebra."""
+
+import numpy as np
+import pytest
+
+from kcons.solvers.elimination import make_pattern
+from kcons.solvers.linear import backward, factor, forward
+
+
+def pattern_of(pairs, n_atoms):
+    flat = np.asarray(pairs, dtype=np.int64)
+    return make_pattern(2 * np.arange(len(flat) + 1), flat.ravel(), n_atoms)
+
+
+def random_tree(n_atoms, seed):
+    rng = np.random.default_rng(seed)
+    return [(int(rng.integers(max(0, k - 5), k)), k) for k in range(1, n_atoms)]
+
+
+def coupled(pairs):
+    """Row pairs that share an atom."""
+    sets = [set(pair) for pair in pairs]
+    return {(k, l) for k in range(len(pairs)) for l in range(len(pairs)) if k != l and sets[k] & sets[l]}
+
+
+RINGS = [(k, (k + 1) % 12) for k in range(12)] + [(k, 12 + k) for k in range(12)] + [(3, 24), (24, 9)]
+
+
+TREES = {
+    "path": [(k, k + 1) for k in range(30)],
+    "comb": [(k, k + 1) for k in range(20)] + [(k, 21 + k) for k in range(21)],
+    "alkane": [e for k in range(8) for e in ((3 * k, 3 * k + 1), (3 * k, 3 * k + 2), (3 * k, 3 * k + 3))],
+    "star": [(0, k) for k in range(1, 7)],
+}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_trees_have_no_fill(name):
+    pairs = TREES[name]
+    pattern = pattern_of(pairs, 50)
+    assert len(pattern.columns) == len(coupled(pairs)) // 2
+
+
+@pytest.mark.parametrize("pairs", [random_tree(40, 7), RINGS], ids=["tree", "rings"])
+def test_pattern_holds_every_coupling_and_closes_under_elimination(pairs):
+    pattern = pattern_of(pairs, 41)
+    assert sorted(pattern.order) == list(range(len(pairs)))
+    stored = {(k, int(l)) for k in range(len(pairs)) for l in pattern.columns[pattern.start[k] : pattern.start[k + 1]]}
+    place = np.argsort(pattern.order)
+    for k, l in coupled(pairs):
+        assert (min(place[k], place[l]), max(place[k], place[l])) in stored
+    assert all(k < l for k, l in stored)
+    for k in range(len(pairs)):
+        columns = pattern.columns[pattern.start[k] : pattern.start[k + 1]]
+        assert np.all(np.diff(columns.astype(int)) > 0)
+        t = pattern.target_start[k]
+        for p in range(len(columns)):
+            for q in range(p + 1, len(columns)):
+                e = pattern.targets[t]
+                assert pattern.columns[e] == columns[q]
+                assert pattern.start[columns[p]] <= e < pattern.start[columns[p] + 1]
+                t += 1
+
+
+def test_clusters_are_the_connected_parts():
+    pairs = [(0, 1), (5, 6), (1, 2), (6, 7), (9, 10)]
+    pattern = pattern_of(pairs, 11)
+    parts = [
+        {pairs[row] for row in pattern.order[a:b]}
+        for a, b in zip(pattern.clusters[:-1], pattern.clusters[1:], strict=True)
+    ]
+    assert sorted(map(sorted, parts)) == [[(0, 1), (1, 2)], [(5, 6), (6, 7)], [(9, 10)]]
+
+
+@pytest.mark.parametrize("pairs", [random_tree(40, 3), RINGS], ids=["tree", "rings"])
+def test_sweeps_solve_the_dense_system(pairs):
+    """Two right-hand sides with one factor of a matrix with r != s."""
+    n_atoms, n = 41, len(pairs)
+    rng = np.random.default_rng(0)
+    pattern = pattern_of(pairs, n_atoms)
+    ends = np.array(pairs)[pattern.order]
+    r, s = rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    r = s + 0.1 * r
+    w = rng.uniform(0.5, 2.0, n_atoms)
+    incidence = np.zeros((n, n_atoms))
+    incidence[np.arange(n), ends[:, 0]], incidence[np.arange(n), ends[:, 1]] = 1.0, -1.0
+    coupling = incidence @ np.diag(w) @ incidence.T
+    matrix = coupling * (r @ s.T)
+    links = np.zeros((n + 1, 4), np.uint32)
+    links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
+    row = np.repeat(np.arange(n), np.diff(pattern.start))
+    couplings = coupling[row, pattern.columns]
+    state = np.zeros((n, 8))
+    state[:, 0:6:2], state[:, 1:6:2] = r, s
+    right = rng.normal(size=(2, n))
+    state[:, 7] = right[0]
+    moves = np.zeros((n_atoms, 4))
+    moves[:, 3] = w
+    flat, entries, pivots, solution = state.ravel(), np.zeros(4 * len(row)), np.zeros(n), np.zeros(n)
+    tables = links.ravel(), pattern.columns
+    factor(0, n, *tables, pattern.targets, couplings, np.diag(coupling).copy(), flat, entries, pivots)
+    backward(0, n, *tables, flat, entries, pivots, moves.ravel(), solution)
+    first = np.linalg.solve(matrix, right[0])
+    np.testing.assert_allclose(solution, first, rtol=1e-9, atol=1e-9 * np.abs(first).max())
+    state[:, 7] = right[1]
+    forward(0, n, *tables, flat, entries)
+    backward(0, n, *tables, flat, entries, pivots, moves.ravel(), solution)
+    both = np.linalg.solve(matrix, right.sum(axis=0))
+    np.testing.assert_allclose(solution, both, rtol=1e-9, atol=1e-9 * np.abs(both).max())
+    expected = w[:, None] * (incidence.T @ (solution[:, None] * s))
+    np.testing.assert_allclose(moves[:, :3], expected, atol=1e-9 * np.abs(expected).max())
+    assert not entries.reshape(-1, 4)[:, 2:].any()

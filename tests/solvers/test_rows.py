@@ -1,0 +1,142 @@
+"""Mixed rows against a dense Newton iteration with the constraint classes."""
+
+import numpy as np
+import pytest
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
+from kcons.solvers.rows import SparseRows
+
+CONSTRAINTS = [
+    Distance([[0, 1], [1, 2], [2, 3], [3, 4], [6, 7]]),
+    Angle([[0, 1, 2], [2, 3, 4]]),
+    Dihedral([[0, 1, 2, 3], [1, 2, 3, 4]]),
+    Plane([4], [0.0, 0.6, 0.8]),
+    Sphere([6], [5.0, 5.0, 5.0]),
+    Cylinder([7], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]),
+]
+
+
+class Scene:
+    def __init__(self, cell=None, seed=0):
+        rng = np.random.default_rng(seed)
+        self.x_ref = 1.5 * rng.normal(size=(10, 3))
+        self.masses = rng.uniform(1, 16, 10)
+        self.set = ConstraintSet(CONSTRAINTS, self.x_ref, self.masses, cell=cell)
+        self.inv_mass = 1 / self.masses
+        self.x_new = self.x_ref + 0.01 * rng.normal(size=(10, 3))
+        self.y, self.velocities = rng.normal(size=(2, 10, 3))
+        self.lattice = None if cell is None else self.set.lattice
+
+    def solver(self):
+        return SparseRows(self.set, np.arange(self.set.n_rows), self.inv_mass)
+
+    def dense(self):
+        """Positions and multipliers of the literal Newton iteration."""
+        pull = np.repeat(self.inv_mass, 3)[:, None] * self.set.jacobian(self.x_ref).toarray().T
+        x, multipliers = self.x_new.copy(), np.zeros(self.set.n_rows)
+        for _ in range(20):
+            matrix = self.set.jacobian(x).toarray() @ pull
+            multipliers -= np.linalg.solve(matrix, self.set.value(x))
+            x = self.x_new + (pull @ multipliers).reshape(-1, 3)
+        return x, multipliers
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_matches_dense_newton(seed):
+    c = Scene(seed=seed)
+    solver = c.solver()
+    x, velocities, found = c.x_new.copy(), c.velocities.copy(), np.full(c.set.n_rows, np.nan)
+    outcome = solver.positions(x, c.x_ref, None, None, velocities, 500.0, found, 0.0, 0.0)
+    assert outcome.converged
+    expected, multipliers = c.dense()
+    np.testing.assert_allclose(x, expected, atol=1e-11)
+    np.testing.assert_allclose(found, multipliers[solver.rows], atol=1e-10)
+    np.testing.assert_allclose(velocities, c.velocities + 500 * (expected - c.x_new), atol=1e-8)
+    np.testing.assert_array_equal(x[[5, 8, 9]], c.x_new[[5, 8, 9]])
+    assert np.all(np.abs(c.set.value(x)) <= c.set.tolerance(x))
+
+
+@pytest.mark.parametrize("driven", [False, True])
+def test_tangents_match_dense_solve(driven):
+    c = Scene(seed=1)
+    rates = np.random.default_rng(2).normal(size=c.set.n_rows) if driven else None
+    solver = c.solver()
+    y, found = c.y.copy(), np.full(c.set.n_rows, np.nan)
+    assert solver.tangents(c.x_ref, y, rates, None, found, 0.0).converged
+    a = c.set.jacobian(c.x_ref).toarray()
+    pull = np.repeat(c.inv_mass, 3)[:, None] * a.T
+    wanted = rates if driven else 0.0
+    multipliers = np.linalg.solve(a @ pull, a @ c.y.ravel() - wanted)
+    np.testing.assert_allclose(y, c.y - (pull @ multipliers).reshape(-1, 3), atol=1e-11)
+    np.testing.assert_allclose(found, multipliers[solver.rows], atol=1e-10)
+    assert np.abs(a @ y.ravel() - wanted).max() <= 2e-14
+
+
+def test_periodic_equals_unwrapped():
+    """Internal rows only: spheres and planes stand in space."""
+    rng = np.random.default_rng(3)
+    x_ref = 1.5 * rng.normal(size=(10, 3))
+    cell = np.array([[20.0, 0, 0], [3, 18, 0], [-2, 4, 22]])
+    x_new = x_ref + 0.01 * rng.normal(size=(10, 3))
+    jumps = rng.integers(-2, 3, size=(2, 10, 3)) @ cell
+    results = []
+    for shift, box in ((np.zeros((2, 10, 3)), None), (jumps, cell)):
+        given = ConstraintSet(CONSTRAINTS[:3], x_ref + shift[1], np.ones(10), cell=box)
+        solver = SparseRows(given, np.arange(given.n_rows), np.ones(10))
+        x = x_new + shift[0]
+        lattice = None if box is None else given.lattice
+        assert solver.positions(x, x_ref + shift[1], None, lattice, None, 0.0, None, 0.0, 0.0).converged
+        results.append(x - shift[0])
+    np.testing.assert_allclose(results[1], results[0], atol=1e-11)
+
+
+def test_pinned_atoms_stay():
+    c = Scene(seed=4)
+    c.inv_mass[2] = 0.0
+    x, y = c.x_new.copy(), c.y.copy()
+    x[2], y[2] = c.x_ref[2], 0.0
+    assert c.solver().positions(x, c.x_ref, None, None, None, 0.0, None, 0.0, 0.0).converged
+    assert c.solver().tangents(c.x_ref, y, None, None, None, 0.0).converged
+    np.testing.assert_array_equal(x[2], c.x_ref[2])
+    np.testing.assert_array_equal(y[2], 0.0)
+    assert np.all(np.abs(c.set.value(x)) <= c.set.tolerance(x))
+
+
+@pytest.mark.parametrize("damage", ["nan", "flipped", "coincident"])
+def test_failure_changes_nothing(damage):
+    c = Scene(seed=5)
+    if damage == "nan":
+        c.x_new[7, 2] = np.nan
+    elif damage == "flipped":
+        c.x_new[:5] = -c.x_ref[:5]
+    else:
+        c.x_ref[6] = c.x_ref[7]
+    x, velocities = c.x_new.copy(), c.velocities.copy()
+    solver = c.solver()
+    outcome = solver.positions(x, c.x_ref, None, None, velocities, 500.0, None, 0.0, 0.0)
+    assert not outcome.converged
+    row = solver.rows[outcome.worst_row]
+    assert (set(c.set.row_atoms(int(row))) <= {6, 7}) == (damage != "flipped")
+    np.testing.assert_array_equal(x, c.x_new)
+    np.testing.assert_array_equal(velocities, c.velocities)
+
+
+def test_failed_tangents_change_nothing():
+    c = Scene(seed=6)
+    c.y[3, 1] = np.nan
+    y = c.y.copy()
+    assert not c.solver().tangents(c.x_ref, y, None, None, None, 0.0).converged
+    np.testing.assert_array_equal(y, c.y)
+
+
+def test_dependent_rows_are_dropped():
+    """Three sides of a triangle leave nothing for its angle."""
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(3, 3))
+    given = ConstraintSet([Distance([[0, 1], [1, 2], [2, 0]]), Angle([[0, 1, 2]])], x, np.ones(3))
+    solver = SparseRows(given, np.arange(4), np.ones(3))
+    assert solver.rank(x, None) == 3
+    y = rng.normal(size=(3, 3))
+    assert solver.tangents(x, y, None, None, None, 0.0).converged
+    assert np.abs(given.jacobian(x) @ y.ravel()).max() <= 1e-13
