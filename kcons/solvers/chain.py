@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.groups import NO_NUMBERS, NO_POINTS, aligned, lattice_kind
+from kcons.solvers.groups import NO_NUMBERS, NO_POINTS, lattice_kind
 from kcons.solvers.outcome import Outcome
 from kcons.solvers.simd import WIDTH
+from kcons.solvers.storage import aligned
 from kcons.solvers.strips import SHORT, long_strip, short_strip, whole_slots
 from kcons.solvers.sweeps import SLOT, project
 

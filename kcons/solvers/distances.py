@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.elimination import FAST, UIntArray, aligned, make_pattern
+from kcons.solvers.elimination import FAST, UIntArray, make_pattern
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
 from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.narrow import (
@@ -32,6 +32,7 @@ from kcons.solvers.narrow import (
     store_quad,
 )
 from kcons.solvers.outcome import Outcome
+from kcons.solvers.storage import aligned
 
 #: Newton stops at this relative error of a length in relative coordinates (a few roundings).
 LENGTH_TOLERANCE = 4e-15

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.target import FloatArray
 
 UIntArray = NDArray[np.uint32]
 
@@ -365,30 +364,3 @@ def make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyp
                             used += 1
                 begin[e + 1] = used
     return begin, sides, masses
-
-
-@nb.njit(cache=True, fastmath=FAST, inline="always")
-def substitute_forward(first, last, start, columns, lower, right):  # type: ignore[no-untyped-def]
-    """L y = right in place for rows first to last, with unit L."""
-    for k in range(first, last):
-        bk = right[k]
-        for p in range(start[k], start[k + 1]):
-            right[columns[p]] -= lower[p] * bk
-
-
-@nb.njit(cache=True, fastmath=FAST, inline="always")
-def substitute_backward(first, last, start, columns, upper, pivot, right):  # type: ignore[no-untyped-def]
-    """U x = right in place for rows first to last; `pivot` holds reciprocals, 0 for dependent rows."""
-    for k in range(last, first, -1):
-        k -= np.uint64(1)
-        total = right[k]
-        for p in range(start[k], start[k + 1]):
-            total -= upper[p] * right[columns[p]]
-        right[k] = total * pivot[k]
-
-
-def aligned(size: int) -> FloatArray:
-    """Zeros that begin on a cache line."""
-    raw = np.zeros(size + 8)
-    offset = (-raw.ctypes.data // 8) % 8
-    return raw[offset : offset + size]

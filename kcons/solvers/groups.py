@@ -22,17 +22,6 @@ NO_LATTICE = np.zeros((2, 3, 3))
 OPEN, ORTHORHOMBIC, TRICLINIC = 0, 1, 2
 
 
-def aligned(n: int) -> NDArray[np.float64]:
-    """Uninitialised doubles that begin with a cache line.
-
-    A vector fills a whole line; on NumPy's 16-byte alignment most accesses
-    would touch two, which costs a third of a chain's time.
-    """
-    room = np.empty(n + WIDTH)
-    skip = -room.ctypes.data % (8 * WIDTH) // 8
-    return room[skip : skip + n]
-
-
 def lattice_kind(lattice: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], int]:
     """The lattice as kernels take it, and which minimum image it needs."""
     if lattice is None:

@@ -21,7 +21,6 @@ from kcons.solvers.groups import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
-    aligned,
     dot,
     lane_tables,
     lattice_kind,
@@ -49,6 +48,7 @@ from kcons.solvers.simd import (
     stack,
     store,
 )
+from kcons.solvers.storage import aligned
 
 LARGEST = 6
 """Rows of the largest cluster; its matrix of 36 vectors stays in the first cache."""

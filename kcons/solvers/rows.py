@@ -13,7 +13,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.coordinates import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
-from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, aligned, make_pattern, make_triples
+from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.lattice import NO_LATTICE
 from kcons.solvers.linear import update
 from kcons.solvers.narrow import (
@@ -37,6 +37,7 @@ from kcons.solvers.narrow import (
     swapped,
 )
 from kcons.solvers.outcome import Outcome
+from kcons.solvers.storage import aligned
 
 MAX_ITERATIONS = 50
 #: Halvings of one Newton step by the step control.

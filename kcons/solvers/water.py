@@ -19,7 +19,6 @@ from kcons.solvers.groups import (
     SAVED,
     TANGENT_TOLERANCE,
     TINY,
-    aligned,
     dot,
     lane_tables,
     lattice_kind,
@@ -43,6 +42,7 @@ from kcons.solvers.simd import (
     square_root,
     store,
 )
+from kcons.solvers.storage import aligned
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Order of the three rows of a triangle, in local atoms."""
