@@ -129,6 +129,33 @@ class ConstraintSet:
         norms = np.linalg.norm(self.lattice[1], axis=0)
         return 0.5 / float(norms.max())
 
+    def check_half_box(self, positions: FloatArray | None = None, time: float = 0.0) -> None:
+        """Check all rows against half the box; without `positions`, distances only.
+
+        Raises
+        ------
+        InputError
+            A row whose minimum image is ambiguous.
+        """
+        if self.lattice is None:
+            return
+        longest, number = self._longest_distance
+        if longest >= self.half_width:
+            item = self.constraints[number]
+            self._check_half_box(item, np.zeros((item.n_rows, item.width, 3)), int(self.starts[number]), time)
+        for item, start in zip(self.constraints, self.starts, strict=False):
+            if item.half_box_rows and (item.family != "Distance" or item.moving) and positions is not None:
+                self._check_half_box(item, self.gather(item, positions), int(start), time)
+
+    @cached_property
+    def _longest_distance(self) -> tuple[float, int]:
+        """Longest distance that is held at a constant length, and the number of its constraint."""
+        lengths = [
+            float(c.target_at(0.0).max(initial=0.0)) if c.family == "Distance" and not c.moving else 0.0
+            for c in self.constraints
+        ]
+        return (max(lengths), int(np.argmax(lengths))) if lengths else (0.0, 0)
+
     def _check_half_box(self, item: Constraint, r: FloatArray, start: int, time: float) -> None:
         """Minimum images are unique only for vectors shorter than half the box."""
         if self.lattice is None or not item.half_box_rows:

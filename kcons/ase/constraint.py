@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import ase.constraints
 import numpy as np
 from ase import Atoms
 from ase.constraints.constraint import FixConstraint
-from numpy.typing import NDArray
 
 import kcons.constraints as families
+from kcons.ase.binding import Binding, bind, check_company, touched_atoms
+from kcons.ase.host import Watch, require_on_surface
+from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
@@ -27,52 +28,8 @@ __all__ = ["Constraints", "constrain"]
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
 
-#: How far positions may be off a row (relative to its scale) when ASE first moves them.
-START_TOLERANCE = 1e-6
-
-#: Arrays up to this length are compared fastest as bytes.
-_SHORT = 4096
-
 #: Families whose target is an absolute position: replicas take theirs from where they are.
 _PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", "Plane", "Line")
-
-#: ASE objects that only add forces, so that they get along with any constraint.
-_FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
-
-
-@dataclass
-class _Binding:
-    """The engine for one set of masses and one cell, and what it takes to see that these changed."""
-
-    motion: Motion
-    touched: IntArray
-    all_touched: bool
-    n_atoms: int
-    mass_array: str
-    mass_values: NDArray[Any]
-    mass_bytes: bytes | None  # the same, for short arrays
-    periodic: bool
-    pbc: bytes
-    cell: bytes
-    #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
-    weights: tuple[FloatArray, FloatArray, FloatArray] | None
-    others: tuple[Any, ...] = ()
-
-    def fits(self, atoms: Atoms) -> bool:
-        """Whether number of atoms, cell, periodicity and masses are still the same."""
-        # Every hook comes through here: compare bytes, which costs a fraction of a microsecond, and build nothing.
-        arrays = atoms.arrays
-        if len(arrays["positions"]) != self.n_atoms or atoms.pbc.tobytes() != self.pbc:
-            return False
-        if self.periodic and atoms.cell.array.tobytes() != self.cell:
-            return False
-        name = "masses" if "masses" in arrays else "numbers"
-        if name != self.mass_array:
-            return False
-        values = arrays[name] if self.all_touched else arrays[name][self.touched]
-        if self.mass_bytes is not None:
-            return bool(values.tobytes() == self.mass_bytes)
-        return bool((values == self.mass_values).all())
 
 
 class Constraints(FixConstraint):
@@ -99,7 +56,7 @@ class Constraints(FixConstraint):
     ------
     UnsupportedError
         At the first use: a target that moves with time, or a velocity constraint. ASE tells constraints
-        neither the time nor the time step; use `kcons.steppers` for these.
+        neither the time nor the time step; `ConstrainedDynamics` takes these.
 
     Notes
     -----
@@ -132,8 +89,8 @@ class Constraints(FixConstraint):
         if repeated is not None:
             (a, b, c), n = repeated
             self._repeated = ((a, b, c), n)
-        self._binding: _Binding | None = None
-        self._on_surface = False
+        self._binding: Binding | None = None
+        self._forget()
 
     # -- the engine -----------------------------------------------------------------------------
 
@@ -149,87 +106,37 @@ class Constraints(FixConstraint):
         """
         return self._bound(atoms).motion
 
-    def _bound(self, atoms: Atoms) -> _Binding:
+    def _bound(self, atoms: Atoms) -> Binding:
         bound = self._binding
         if bound is None or not bound.fits(atoms):
             bound = self._bind(atoms)
+        else:
+            bound.follow_cell(atoms, atoms.cell.array)
         present = atoms.constraints
-        if len(present) > 1 and not _same(present, bound.others):
-            self._check_others(present, bound)
+        if len(present) > 1:
+            check_company(present, self, bound)
         return bound
 
-    def _bind(self, atoms: Atoms) -> _Binding:
+    def _bind(self, atoms: Atoms) -> Binding:
         given = self._repaired(atoms) if self._repeated is not None else self.constraints
         for item in given:
             if item.moving or not item.holonomic:
                 what = "moves with time" if item.holonomic else "constrains velocities"
                 raise UnsupportedError(
-                    f"{item!r} {what}; ASE's dynamics give constraints neither time nor time step. "
-                    "Use kcons.steppers (System, Rattle, run) for it"
+                    f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
+                    "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
                 )
-        periodic = bool(atoms.pbc.any())
-        held = ConstraintSet(
-            given,
-            atoms.arrays["positions"],
-            atoms.get_masses(),
-            cell=atoms.cell.array if periodic else None,
-            pbc=atoms.pbc,
-        )
-        motion = Motion(held, atoms.arrays["positions"], degenerate=self.degenerate)
-        touched = _touched(held.constraints)
-        all_touched = len(touched) == len(atoms)
-        name = "masses" if "masses" in atoms.arrays else "numbers"
-        values = atoms.arrays[name] if all_touched else atoms.arrays[name][touched]
-        bound = _Binding(
-            motion=motion,
-            touched=touched,
-            all_touched=all_touched,
-            n_atoms=len(atoms),
-            mass_array=name,
-            mass_values=values.copy(),
-            mass_bytes=values.tobytes() if len(values) <= _SHORT else None,
-            periodic=periodic,
-            pbc=atoms.pbc.tobytes(),
-            cell=atoms.cell.array.tobytes(),
-            weights=_weights(motion) if all_touched else None,
-        )
-        self.constraints = held.constraints
+        bound = bind(given, atoms, self.degenerate)
+        self.constraints = bound.given
         self._repeated = None
         self._binding = bound
-        self._on_surface = False
+        self._forget()
         return bound
 
-    def _check_others(self, present: Sequence[Any], bound: _Binding) -> None:
-        """Refuse company that ASE would apply one after the other with this object."""
-        for other in present:
-            if other is self or isinstance(other, _FORCES_ONLY):
-                continue
-            if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in self.constraints):
-                continue  # a common shift of all atoms changes no row
-            indices = other.get_indices() if hasattr(other, "get_indices") else np.arange(bound.n_atoms)
-            shared = np.intersect1d(np.arange(bound.n_atoms)[indices], bound.touched)
-            if len(shared):
-                raise UnsupportedError(
-                    f"{type(other).__name__} acts on atom {shared[0]}, which kcons holds too; ASE would apply the two "
-                    f"one after the other, and neither would hold. Put all of it into one Constraints object"
-                    f"{_REPLACEMENTS.get(type(other).__name__, '')}"
-                )
-        bound.others = tuple(present)
-
-    def _require_on_surface(self, bound: _Binding, x: FloatArray) -> None:
-        held = bound.motion.constraint_set
-        miss = np.abs(held.value(x))
-        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x))
-        if not np.all(miss <= allowed):
-            row = int(np.argmax(miss / allowed))
-            raise InputError(
-                f"atoms are off row {held.row_name(row)} by {miss[row]:.6g} (held at {held.target()[row]:.6g}); moving "
-                "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
-                "Constraints.restore(atoms) first",
-                item="positions",
-                atoms=held.row_atoms(row),
-            )
-        self._on_surface = True
+    def _forget(self) -> None:
+        """What is known of the positions is void."""
+        self._on_surface = False
+        self._watch = Watch()
 
     # -- ASE's hooks ----------------------------------------------------------------------------
 
@@ -238,7 +145,9 @@ class Constraints(FixConstraint):
         bound = self._bound(atoms)
         old = atoms.arrays["positions"]
         if not self._on_surface:
-            self._require_on_surface(bound, old)
+            require_on_surface(bound.motion.constraint_set, old)
+            self._on_surface = True
+        asked = self._watch.ask(new)
         try:
             if new.flags.c_contiguous and new.dtype == np.float64:
                 bound.motion.project_positions(new, old, out=new)
@@ -250,10 +159,23 @@ class Constraints(FixConstraint):
                 "followed by Constraints.restore(atoms)"
             )
             raise
+        self._watch.accept(asked, new, bound.cell, atoms)
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
-        """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0."""
+        """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
+
+        Raises
+        ------
+        UnsupportedError
+            The atoms are off the constraints, or were moved past them: only dynamics set momenta, and such
+            dynamics do not respect constraints.
+        """
         bound = self._bound(atoms)
+        if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
+            if not self._on_surface:
+                require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
+                self._on_surface = True
+            self._watch.check_momenta(bound.motion.constraint_set, bound.cell, atoms.arrays["positions"])
         if bound.weights is None or momenta.shape != bound.weights[0].shape:
             # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
             self._project_covector(atoms, momenta)
@@ -262,6 +184,30 @@ class Constraints(FixConstraint):
         np.multiply(momenta, inverse_masses, velocities)
         bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
         np.multiply(velocities, masses, momenta)
+
+    def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
+        """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
+
+        z is the instantaneous constraint force at the present positions, momenta and forces, so that
+        ``get_stress(include_ideal_gas=True)`` is the full pressure (an ideal gas of rigid molecules gives
+        N k T / V). Without momenta, or where they are zero, it is the static part, which makes the stress the
+        derivative of the energy under a strain after which the constraints are restored. Rows with a place
+        in space count as external forces and have no part.
+        """
+        motion = self._bound(atoms).motion
+        x = atoms.arrays["positions"]
+        masses = atoms.get_masses()[:, None]
+        v = np.zeros_like(x)
+        if "momenta" in atoms.arrays:
+            np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
+        forces = np.asarray(atoms.get_forces(md=True), dtype=np.float64)  # with those of Hookean and the like
+        stress -= constraint_virial(motion, x, v, forces)[VOIGT] / atoms.get_volume()
+
+    def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
+        """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
+        bound = self._binding
+        if bound is not None and bound.fits(atoms):
+            bound.follow_cell(atoms, np.asarray(cell, dtype=np.float64))
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
@@ -281,7 +227,7 @@ class Constraints(FixConstraint):
 
     def get_indices(self) -> IntArray:
         """All atoms that some row touches."""
-        return _touched(self.constraints)
+        return touched_atoms(self.constraints)
 
     def index_shuffle(self, atoms: Atoms, ind: Any) -> None:
         """Keep the rows whose atoms are all in the slice `ind`, renumbered.
@@ -367,14 +313,14 @@ class Constraints(FixConstraint):
         # each object takes a new engine where it needs one.
         twin = object.__new__(Constraints)
         twin.__dict__.update(self.__dict__)
-        twin._on_surface = False
+        twin._forget()
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Constraints:
         return self.copy()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_binding": None, "_on_surface": False}
+        return {**self.__dict__, "_binding": None, "_on_surface": False, "_watch": Watch()}
 
     @property
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
@@ -465,45 +411,14 @@ def constrain(
         if project:
             held.restore(atoms)
         bound = held._bound(atoms)
-        held._require_on_surface(bound, atoms.arrays["positions"])
+        require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
+        held._on_surface = True
         if "momenta" in atoms.arrays:
             atoms.set_momenta(atoms.arrays["momenta"])
     except KconsError:
         atoms.set_constraint(before)
         raise
     return held
-
-
-_REPLACEMENTS = {
-    "FixAtoms": ", with FixedAtoms for what FixAtoms held",
-    "FixBondLengths": ", with Distance for what FixBondLengths held",
-    "FixInternals": ", with Distance, Angle and Dihedral for what FixInternals held",
-    "FixLinearTriatomic": ", with Distance and LinearRelation for what FixLinearTriatomic held",
-    "FixCom": ", with CenterOfMass for what FixCom held",
-    "FixSubsetCom": ", with CenterOfMass for what FixSubsetCom held",
-    "FixedPlane": ", with Plane for what FixedPlane held",
-    "FixedLine": ", with Line for what FixedLine held",
-    "FixCartesian": ", with LinearCombination for what FixCartesian held",
-}
-
-
-def _touched(constraints: Sequence[Constraint]) -> IntArray:
-    atoms = [c.atoms.ravel() for c in constraints]
-    return np.unique(np.concatenate(atoms)) if atoms else np.zeros(0, dtype=np.int64)
-
-
-def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
-    masses = np.repeat(motion.masses, 3).reshape(-1, 3)
-    for item in motion.constraint_set.constraints:
-        if item.family == "FixedAtoms":
-            masses[item.atoms.ravel()] = np.inf
-    inverse_masses = 1.0 / masses
-    masses[np.isinf(masses)] = 0.0
-    return masses, inverse_masses, np.empty_like(masses)
-
-
-def _same(present: Sequence[Any], known: Sequence[Any]) -> bool:
-    return len(present) == len(known) and all(a is b for a, b in zip(present, known, strict=True))
 
 
 def _register() -> None:

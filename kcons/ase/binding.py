@@ -1,0 +1,145 @@
+"""The engine for one `Atoms`, and what it takes to see that it no longer fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import ase.constraints
+import numpy as np
+from ase import Atoms
+from numpy.typing import NDArray
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import UnsupportedError
+from kcons.motion import Motion
+
+#: Arrays up to this length are compared fastest as bytes.
+_SHORT = 4096
+
+#: ASE objects that only add forces, so that they get along with any constraint.
+FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
+
+
+@dataclass
+class Binding:
+    """The engine for one set of masses and one cell, and what it takes to see that these changed."""
+
+    motion: Motion
+    given: tuple[Constraint, ...]
+    touched: IntArray
+    all_touched: bool
+    n_atoms: int
+    mass_array: str
+    mass_values: NDArray[Any]
+    mass_bytes: bytes | None  # the same, for short arrays
+    periodic: bool
+    pbc: bytes
+    cell: bytes
+    #: m and 1/m (0 for fixed atoms) for each component, and room for velocities; None if only some atoms are held.
+    weights: tuple[FloatArray, FloatArray, FloatArray] | None
+    others: tuple[Any, ...] = ()
+
+    def fits(self, atoms: Atoms) -> bool:
+        """Whether number of atoms, periodicity and masses are still the same."""
+        # Every hook comes through here: compare bytes, which costs a fraction of a microsecond, and build nothing.
+        arrays = atoms.arrays
+        if len(arrays["positions"]) != self.n_atoms or atoms.pbc.tobytes() != self.pbc:
+            return False
+        name = "masses" if "masses" in arrays else "numbers"
+        if name != self.mass_array:
+            return False
+        values = arrays[name] if self.all_touched else arrays[name][self.touched]
+        if self.mass_bytes is not None:
+            return bool(values.tobytes() == self.mass_bytes)
+        return bool((values == self.mass_values).all())
+
+    def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
+        """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""
+        if self.periodic:
+            content = cell.tobytes()
+            if content != self.cell:
+                self.motion.set_cell(cell, atoms.pbc, atoms.arrays["positions"])
+                self.cell = content
+
+
+def bind(
+    given: Sequence[Constraint], atoms: Atoms, degenerate: Literal["convert", "raise"], time: float = 0.0
+) -> Binding:
+    """A new engine for `given` on `atoms`."""
+    periodic = bool(atoms.pbc.any())
+    x = atoms.arrays["positions"]
+    held = ConstraintSet(
+        given, x, atoms.get_masses(), cell=atoms.cell.array if periodic else None, pbc=atoms.pbc, time=time
+    )
+    motion = Motion(held, x, degenerate=degenerate, time=time)
+    touched = touched_atoms(held.constraints)
+    all_touched = len(touched) == len(atoms)
+    name = "masses" if "masses" in atoms.arrays else "numbers"
+    values = atoms.arrays[name] if all_touched else atoms.arrays[name][touched]
+    return Binding(
+        motion=motion,
+        given=held.constraints,
+        touched=touched,
+        all_touched=all_touched,
+        n_atoms=len(atoms),
+        mass_array=name,
+        mass_values=values.copy(),
+        mass_bytes=values.tobytes() if len(values) <= _SHORT else None,
+        periodic=periodic,
+        pbc=atoms.pbc.tobytes(),
+        cell=atoms.cell.array.tobytes(),
+        weights=_weights(motion) if all_touched else None,
+    )
+
+
+def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
+    """Refuse ASE constraints that would be applied one after the other with `own`."""
+    if len(present) == len(bound.others) and all(a is b for a, b in zip(present, bound.others, strict=True)):
+        return
+    for other in present:
+        if other is own or isinstance(other, FORCES_ONLY):
+            continue
+        if type(other) is ase.constraints.FixCom and all(c.translation_invariant for c in bound.given):
+            continue  # a common shift of all atoms changes no row
+        indices = other.get_indices() if hasattr(other, "get_indices") else np.arange(bound.n_atoms)
+        shared = np.intersect1d(np.arange(bound.n_atoms)[indices], bound.touched)
+        if len(shared):
+            raise UnsupportedError(
+                f"{type(other).__name__} acts on atom {shared[0]}, which kcons holds too; ASE would apply the two "
+                f"one after the other, and neither would hold. Put all of it into one Constraints object"
+                f"{_REPLACEMENTS.get(type(other).__name__, '')}"
+            )
+    bound.others = tuple(present)
+
+
+_REPLACEMENTS = {
+    "FixAtoms": ", with FixedAtoms for what FixAtoms held",
+    "FixBondLengths": ", with Distance for what FixBondLengths held",
+    "FixInternals": ", with Distance, Angle and Dihedral for what FixInternals held",
+    "FixLinearTriatomic": ", with Distance and LinearRelation for what FixLinearTriatomic held",
+    "FixCom": ", with CenterOfMass for what FixCom held",
+    "FixSubsetCom": ", with CenterOfMass for what FixSubsetCom held",
+    "FixedPlane": ", with Plane for what FixedPlane held",
+    "FixedLine": ", with Line for what FixedLine held",
+    "FixCartesian": ", with LinearCombination for what FixCartesian held",
+}
+
+
+def touched_atoms(constraints: Sequence[Constraint]) -> IntArray:
+    atoms = [c.atoms.ravel() for c in constraints]
+    return np.unique(np.concatenate(atoms)) if atoms else np.zeros(0, dtype=np.int64)
+
+
+def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
+    masses = np.repeat(motion.masses, 3).reshape(-1, 3)
+    for item in motion.constraint_set.constraints:
+        if item.family == "FixedAtoms":
+            masses[item.atoms.ravel()] = np.inf
+    inverse_masses = 1.0 / masses
+    masses[np.isinf(masses)] = 0.0
+    return masses, inverse_masses, np.empty_like(masses)

@@ -1,0 +1,147 @@
+"""Dynamics classes that move atoms past their constraints, found by what they do with positions."""
+
+from __future__ import annotations
+
+import numpy as np
+from ase import Atoms
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+
+#: How far positions may be off a row (relative to its scale) where ASE moves them or sets momenta.
+START_TOLERANCE = 1e-6
+#: Residual of asked positions, relative to the scale of the row, that no usable time step produces ...
+ABSURD = 0.3
+#: ... and how many steps in a row it takes to say so.
+ABSURD_STEPS = 3
+#: A correction (in Angstrom) below which the residual is not even looked at.
+_SMALL = 0.1
+
+ADVICE = (
+    "use kcons.ase.ConstrainedDynamics for constant energy, and ase.md.langevin.Langevin(fixcm=False) or "
+    "ase.md.bussi.Bussi for constant temperature; if the atoms were edited without constraints, call "
+    "Constraints.restore(atoms)"
+)
+
+
+class Watch:
+    """What a host has asked for and got, as far as it shows whether the host respects the constraints.
+
+    Only dynamics set momenta. So that is when positions must be on the constraints, and when it shows that the
+    host went on from its own copy of the positions instead of the corrected ones.
+    """
+
+    def __init__(self) -> None:
+        self._accepted: FloatArray | None = None
+        self._cell = b""
+        self._asked: FloatArray | None = None
+        self._momenta_since = False
+        self._counted = False
+        self._repeats = 0
+        self._absurd = 0
+        self._looked = True
+
+    def ask(self, new: FloatArray) -> FloatArray:
+        """Remember positions before they are corrected."""
+        asked = self._asked
+        if asked is not None and _same(asked, new):
+            if self._momenta_since and not self._counted:
+                self._counted = True
+                self._repeats += 1
+        else:
+            if not self._counted:
+                self._repeats = 0
+            self._counted = False
+            asked = new.copy()
+            self._looked = False
+        self._momenta_since = False
+        return asked
+
+    def accept(self, asked: FloatArray, new: FloatArray, cell: bytes, atoms: Atoms) -> None:
+        """Remember the corrected positions."""
+        own = new.base is None and new is not atoms.arrays["positions"] and new.dtype == np.float64
+        self._accepted = new if own else np.array(new, dtype=np.float64)
+        self._cell = cell
+        self._asked = asked
+        if self._counted and float(np.abs(asked - new).max(initial=0.0)) <= START_TOLERANCE:
+            self._repeats = 0  # positions that need no correction may be set as often as one likes
+
+    def check_momenta(self, held: ConstraintSet, cell: bytes, x: FloatArray) -> None:
+        """Momenta are about to be set at `x`.
+
+        Raises
+        ------
+        UnsupportedError
+            The positions are off the constraints, or the host keeps asking for its own uncorrected ones.
+        """
+        self._momenta_since = True
+        accepted = self._accepted
+        if accepted is None or self._cell != cell or not _same(accepted, x):
+            worst = worst_row(held, x)
+            if worst is not None and np.isfinite(worst[1]):  # the engine names positions that are not finite
+                row, miss = worst
+                raise UnsupportedError(
+                    f"momenta are set while the atoms are off row {held.row_name(row)} by {miss:.6g}: this dynamics "
+                    f"class moves atoms past their constraints (LangevinBAOAB does). Instead, {ADVICE}"
+                )
+            self._accepted, self._cell = x.copy(), cell
+        if self._repeats >= 2:
+            self._repeats = 0
+            raise UnsupportedError(
+                "this dynamics class asks again for positions that were corrected: it goes on from its own copy "
+                f"(NoseHooverChainNVT does), so that the constraints have no effect on it. Instead, {ADVICE}"
+            )
+        if not self._looked:
+            self._looked = True
+            self._check_correction(held, x)
+
+    def _check_correction(self, held: ConstraintSet, x: FloatArray) -> None:
+        asked = self._asked
+        if asked is None or not float(np.abs(asked - x).max(initial=0.0)) > _SMALL:
+            self._absurd = 0
+            return
+        miss = np.abs(held.value(asked)) / held.scale
+        self._absurd = self._absurd + 1 if miss.max(initial=0.0) > ABSURD else 0
+        if self._absurd >= ABSURD_STEPS:
+            self._absurd = 0
+            row = int(np.argmax(miss))
+            raise UnsupportedError(
+                f"in {ABSURD_STEPS} steps in a row, this dynamics class moved atoms off row {held.row_name(row)} by "
+                f"{miss[row]:.0%}: it goes on from its own copy of the positions (MelchionnaNPT does), or the time "
+                f"step is far too large. Instead, {ADVICE}"
+            )
+
+
+def worst_row(held: ConstraintSet, x: FloatArray) -> tuple[int, float] | None:
+    """The row that `x` violates most beyond START_TOLERANCE, and by how much; None if there is none."""
+    miss = np.abs(held.value(x))
+    allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x))
+    if np.all(miss <= allowed):
+        return None
+    row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss / allowed)))
+    return row, float(miss[row])
+
+
+def require_on_surface(held: ConstraintSet, x: FloatArray) -> None:
+    """Refuse positions that are off the constraints.
+
+    Raises
+    ------
+    InputError
+    """
+    worst = worst_row(held, x)
+    if worst is not None:
+        row, miss = worst
+        raise InputError(
+            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target()[row]:.6g}); moving "
+            "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
+            "Constraints.restore(atoms) first",
+            item="positions",
+            atoms=held.row_atoms(row),
+        )
+
+
+def _same(a: FloatArray, b: FloatArray) -> bool:
+    # Mostly they differ in the first number already.
+    return a.shape == b.shape and (not a.size or a[0, 0] == b[0, 0]) and bool((a == b).all())
