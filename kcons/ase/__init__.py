@@ -7,8 +7,17 @@ amu); targets are in Angstrom and radian.
 Importing this package registers the object with ASE, which makes files that contain it readable.
 """
 
+from kcons.ase.calculator import ConstrainedCalculator
 from kcons.ase.constraint import Constraints, constrain
+from kcons.ase.dynamics import ConstrainedDynamics
 from kcons.ase.translation import from_ase_constraints
 from kcons.ase.water import rigid_water
 
-__all__ = ["Constraints", "constrain", "from_ase_constraints", "rigid_water"]
+__all__ = [
+    "ConstrainedCalculator",
+    "ConstrainedDynamics",
+    "Constraints",
+    "constrain",
+    "from_ase_constraints",
+    "rigid_water",
+]

@@ -143,3 +143,13 @@ def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
     inverse_masses = 1.0 / masses
     masses[np.isinf(masses)] = 0.0
     return masses, inverse_masses, np.empty_like(masses)
+
+
+def applied_forces(atoms: Atoms) -> FloatArray:
+    """Forces of the calculator and of ASE objects that only add forces; a copy."""
+    forces = np.array(atoms.get_forces(apply_constraint=False), dtype=np.float64)
+    if forces.shape == (len(atoms), 3):  # otherwise whoever asked complains
+        for item in atoms.constraints:
+            if isinstance(item, FORCES_ONLY):
+                item.adjust_forces(atoms, forces)
+    return forces

@@ -12,7 +12,7 @@ from ase import Atoms
 from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
-from kcons.ase.binding import Binding, bind, check_company, touched_atoms
+from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.host import Watch, require_on_surface
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraint_set import ConstraintSet
@@ -200,8 +200,7 @@ class Constraints(FixConstraint):
         v = np.zeros_like(x)
         if "momenta" in atoms.arrays:
             np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
-        forces = np.asarray(atoms.get_forces(md=True), dtype=np.float64)  # with those of Hookean and the like
-        stress -= constraint_virial(motion, x, v, forces)[VOIGT] / atoms.get_volume()
+        stress -= constraint_virial(motion, x, v, applied_forces(atoms))[VOIGT] / atoms.get_volume()
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""

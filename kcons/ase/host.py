@@ -113,28 +113,28 @@ class Watch:
             )
 
 
-def worst_row(held: ConstraintSet, x: FloatArray) -> tuple[int, float] | None:
+def worst_row(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> tuple[int, float] | None:
     """The row that `x` violates most beyond START_TOLERANCE, and by how much; None if there is none."""
-    miss = np.abs(held.value(x))
-    allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x))
+    miss = np.abs(held.value(x, time))
+    allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
     if np.all(miss <= allowed):
         return None
     row = int(np.argmax(np.where(np.isnan(miss), np.inf, miss / allowed)))
     return row, float(miss[row])
 
 
-def require_on_surface(held: ConstraintSet, x: FloatArray) -> None:
+def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) -> None:
     """Refuse positions that are off the constraints.
 
     Raises
     ------
     InputError
     """
-    worst = worst_row(held, x)
+    worst = worst_row(held, x, time)
     if worst is not None:
         row, miss = worst
         raise InputError(
-            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target()[row]:.6g}); moving "
+            f"atoms are off row {held.row_name(row)} by {miss:.6g} (held at {held.target(time)[row]:.6g}); moving "
             "them from there would turn the correction into velocity. Use constrain(..., project=True) or "
             "Constraints.restore(atoms) first",
             item="positions",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -41,8 +41,13 @@ def from_ase_constraints(atoms: Atoms) -> list[Constraint]:
     UnsupportedError
         For any other ASE constraint, named.
     """
+    return translated(atoms, atoms.constraints)
+
+
+def translated(atoms: Atoms, items: Iterable[Any]) -> list[Constraint]:
+    """As `from_ase_constraints`, for some constraints of `atoms`."""
     result: list[Constraint] = []
-    for item in atoms.constraints:
+    for item in items:
         if isinstance(item, Constraints):
             result.extend(item.constraints)
             continue

@@ -1,0 +1,129 @@
+"""A calculator that gives the forces that are left on the constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
+from numpy.typing import NDArray
+
+from kcons.ase.constraint import Constraints
+from kcons.ase.virial import VOIGT, constraint_virial
+from kcons.constraints import Constraint
+from kcons.errors import InputError
+
+#: Residual, in units of what double precision can reach, up to which positions are taken as they are.
+_ON_SURFACE = 4.0
+
+
+class ConstrainedCalculator(Calculator):
+    """Energies and forces of another calculator on the constraints.
+
+    On the constraints, forces are f + z with b = 0 (no momenta enter: ASE caches by positions) and everything else
+    is the inner calculator's. Positions off the constraints are first brought onto them along the rows'
+    gradients there (in the mass metric), and energy and forces are those at that point: so the energy is a
+    function of the constrained motions alone, and finite differences of the forces (`Vibrations`, `Phonons`)
+    give the Hessian of the energy *on* the constraints, curvature of the constraints included, with
+    zeros along the held directions.
+
+    For optimisers, saddle searches and phonons. For dynamics attach the constraints to the atoms, or use
+    `ConstrainedDynamics`.
+
+    Parameters
+    ----------
+    inner : ase calculator
+    constraints : Constraints or sequence of Constraint
+        Targets that are open are taken from the positions at the first calculation. Rows must not depend on
+        time or velocities.
+    project : bool
+        Whether to move positions that are off the constraints. If False, f + z is formed at the positions as
+        they are, with the rows there, and energies are those of the inner calculator there.
+
+    Raises
+    ------
+    UnsupportedError
+        At the first use: rows that need time or velocities.
+    ConvergenceError
+        Positions from which the constraints cannot be reached.
+    InputError
+        The inner calculator returned forces of a wrong shape, or NaN.
+
+    Notes
+    -----
+    Stress is the inner one plus the static part of the constraints: the derivative of the energy under a
+    strain after which the constraints are restored. Per-atom properties are passed on.
+    """
+
+    def __init__(
+        self, inner: Any, constraints: Constraints | Constraint | Iterable[Constraint], *, project: bool = True
+    ) -> None:
+        super().__init__()
+        self.inner = inner
+        given = constraints if isinstance(constraints, Constraints) else Constraints(constraints)
+        self.constraints = given.copy()
+        self.project = project
+
+    @property
+    def implemented_properties(self) -> list[str]:  # type: ignore[override]
+        """Those of the inner calculator."""
+        return list(self.inner.implemented_properties)
+
+    def calculate(
+        self,
+        atoms: Atoms | None = None,
+        properties: Iterable[str] = ("energy", "forces"),
+        system_changes: Iterable[str] = all_changes,
+    ) -> None:
+        """Fill `results`; called by ASE where its cache does not hold the properties."""
+        super().calculate(atoms, list(properties), list(system_changes))
+        assert self.atoms is not None
+        work = self.atoms.copy()
+        work.set_constraint()
+        motion = self.constraints.engine(work)
+        held = motion.constraint_set
+        x = work.arrays["positions"]
+        if self.project and held.n_rows and not np.all(np.abs(held.value(x)) <= _ON_SURFACE * held.tolerance(x)):
+            motion.project_positions(x, x.copy(), out=x)
+        wanted = set(properties)
+        if "stress" in wanted:
+            wanted.add("forces")
+        results: dict[str, Any] = {}
+        for name in sorted(wanted):
+            results[name] = self.inner.get_property(name, work)
+        known = getattr(self.inner, "results", {})
+        for name in ("energy", "free_energy", "forces"):
+            if name not in results and name in known and not self.inner.calculation_required(work, [name]):
+                results[name] = self.inner.get_property(name, work)
+        if "forces" in results:
+            forces = _checked(results["forces"], len(work))
+            results["forces"] = motion.project_forces(x, forces)
+            if "stress" in results:
+                stress = np.array(results["stress"], dtype=np.float64)
+                if stress.shape == (3, 3):
+                    stress = stress[VOIGT]
+                virial = constraint_virial(motion, x, np.zeros_like(x), forces)
+                results["stress"] = stress - virial[VOIGT] / work.get_volume()
+        if any(value is None for value in results.values()):
+            missing = sorted(name for name, value in results.items() if value is None)
+            raise PropertyNotImplementedError(f"{type(self.inner).__name__} has no {', '.join(missing)}")
+        self.results = {**self.results, **results}
+
+    def restore(self, atoms: Atoms) -> None:
+        """Move `atoms` to the point on the constraints that energy and forces belong to."""
+        x = atoms.get_positions()
+        motion = self.constraints.engine(atoms)
+        atoms.set_positions(motion.project_positions(x, x.copy()), apply_constraint=False)
+
+
+def _checked(values: Any, n_atoms: int) -> NDArray[np.float64]:
+    forces = np.array(values, dtype=np.float64)
+    if forces.shape != (n_atoms, 3):
+        raise InputError(f"the calculator returned forces of shape {forces.shape}, not ({n_atoms}, 3)", item="forces")
+    bad = ~np.isfinite(forces).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise InputError(f"the calculator's force on atom {atom} is not finite: {forces[atom]}", item="forces")
+    return forces

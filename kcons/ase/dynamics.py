@@ -1,0 +1,232 @@
+"""Molecular dynamics of constrained atoms by the steppers of kcons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import numpy as np
+from ase import Atoms, units
+from ase.md.md import MolecularDynamics
+from numpy.typing import ArrayLike
+
+from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
+from kcons.ase.constraint import Constraints
+from kcons.ase.host import require_on_surface
+from kcons.ase.translation import translated
+from kcons.constraints import Constraint
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.steppers import Rattle, State, Stepper, System
+
+
+class ConstrainedDynamics(MolecularDynamics):
+    """Dynamics at constant energy on the constraints, by any stepper of `kcons.steppers`.
+
+    Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on
+    the atoms hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and
+    what `constraints` adds. Velocities come from the multipliers and never from differences of positions,
+    so that accuracy does not depend on the distance from the origin.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        With a calculator. Forces of Hookean and ExternalForce count as applied forces.
+    timestep : float
+        In ASE's unit of time; negative to go back, 0 to stand still. `set_timestep` changes it between steps.
+    stepper : Stepper, optional
+        `Rattle` by default; of order 4 or 6 where accuracy counts.
+    constraints : sequence of Constraint, optional
+        More to hold than what is on the atoms; here also targets that move with time and velocity
+        (nonholonomic) rows, for which ASE has no place. ASE's temperature does not know of these: use
+        `get_temperature` of this object.
+    time : float
+        Time at the start, for targets that move.
+    forces : array_like, shape (n_atoms, 3), optional
+        Applied forces at the start, if known (from a trajectory); saves one evaluation.
+    degenerate : {'convert', 'raise'}
+        See `Constraints`.
+    trajectory, logfile, loginterval, **kwargs
+        As for all dynamics of ASE.
+
+    Raises
+    ------
+    InputError
+        Time step not finite; atoms off their constraints (see `Constraints.restore`).
+    UnsupportedError
+        An ASE constraint on the atoms that kcons cannot hold.
+
+    Notes
+    -----
+    Where a step fails, atoms keep positions and momenta of the last good step, and the error names the step.
+    A run continued from the positions and momenta of a trajectory is the same to the last bit, if the
+    calculator gives the same forces; only far from the origin (more than 128 times the size of the system)
+    the object in memory knows more than the file.
+    """
+
+    def __init__(
+        self,
+        atoms: Atoms,
+        timestep: float,
+        stepper: Stepper | None = None,
+        *,
+        constraints: Constraint | Iterable[Constraint] = (),
+        time: float = 0.0,
+        forces: ArrayLike | None = None,
+        degenerate: Literal["convert", "raise"] = "convert",
+        **kwargs: Any,
+    ) -> None:
+        _check_timestep(timestep)
+        if not math.isfinite(time):
+            raise InputError(f"time is {time}", item="time")
+        self.stepper: Stepper = Rattle() if stepper is None else stepper
+        self.time = float(time)
+        self._degenerate = degenerate
+        self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        self._present: tuple[Any, ...] | None = None
+        self._bound: Binding | None = None
+        self._system: System | None = None
+        self._state: State | None = None
+        self._cell = b""
+        self._forces = None if forces is None else _array(forces, len(atoms), "forces")
+        super().__init__(atoms, timestep, **kwargs)
+        self._start()
+
+    # -- what a person asks for -----------------------------------------------------------------
+
+    def set_timestep(self, timestep: float) -> None:
+        """Use another time step from now on."""
+        _check_timestep(timestep)
+        self.dt = timestep
+
+    def get_time(self) -> float:
+        """The time reached, in ASE's unit; right also if the time step was changed."""
+        return self.time
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """3 N less the rank of everything that is held."""
+        return self._systems().motion.degrees_of_freedom
+
+    def get_temperature(self) -> float:
+        """Kinetic temperature in K by `degrees_of_freedom`, which counts all rows; 0 if there are none."""
+        freedom = self.degrees_of_freedom
+        return 2 * self.atoms.get_kinetic_energy() / (freedom * units.kB) if freedom else 0.0
+
+    def todict(self) -> dict[str, Any]:
+        """As ASE stores it in trajectories."""
+        return {**super().todict(), "stepper": repr(self.stepper)}
+
+    # -- steps ----------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """One step; on any error the atoms are as they were before it.
+
+        Raises
+        ------
+        NonFiniteError, InputError
+            The calculator returned NaN, or an array of the wrong shape; the step is named.
+        ConvergenceError
+            No solution: the time step is too large; carries `step`.
+        """
+        system = self._systems()
+        state = self._start()
+        positions, momenta = self.atoms.get_positions(), self.atoms.get_momenta()
+        try:
+            after = self.stepper.step(system, state, self.dt)
+        except BaseException as error:
+            self._put(positions, momenta)
+            if not getattr(error, "step", None):
+                error.add_note(f"in step {self.nsteps + 1}; the atoms are as they were before it")
+            raise
+        self._put(after.positions, after.velocities * system.masses[:, None])
+        self._state = after
+        self.time = after.time
+
+    def _refresh_properties(self) -> None:
+        # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
+        if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
+            self.atoms.get_forces()
+
+    def _put(self, positions: FloatArray, momenta: FloatArray) -> None:
+        self.atoms.set_positions(positions, apply_constraint=False)
+        self.atoms.set_momenta(momenta, apply_constraint=False)
+
+    def _start(self) -> State:
+        """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
+        system = self._systems()
+        x, p = self.atoms.arrays["positions"], self.atoms.get_momenta()
+        masses = system.masses[:, None]
+        v = np.zeros_like(x)
+        # Velocities always come from the momenta, as after a restart from a file.
+        np.divide(p, masses, out=v, where=system.inverse_masses > 0)
+        last = self._state
+        cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
+        same = last is not None and cell == self._cell and np.array_equal(last.positions, x)
+        if last is not None and same and np.array_equal(last.velocities * masses, p):
+            return State(last.positions, v, self.time, last.forces, self.nsteps, last.remainder)
+        held = system.motion.constraint_set
+        require_on_surface(held, x, self.time)
+        state = system.initial_state(x, v, time=self.time, project=True)
+        forces = last.forces if last is not None and same and not system.velocity_dependent else self._forces
+        self._forces = None
+        if not np.array_equal(state.positions, x):
+            forces = None
+        state = State(state.positions, state.velocities, self.time, forces, self.nsteps, state.remainder)
+        moved = not np.array_equal(state.velocities, v)
+        self._put(state.positions, state.velocities * masses if moved else p)
+        self._state, self._cell = state, cell
+        return state
+
+    # -- the system -----------------------------------------------------------------------------
+
+    def _systems(self) -> System:
+        """The system for the atoms as they are; built anew if masses, constraints or periodicity changed."""
+        atoms = self.atoms
+        present = tuple(atoms.constraints)
+        known = self._present
+        if known is None or len(present) != len(known) or any(a is not b for a, b in zip(present, known, strict=True)):
+            self._bound = None
+        bound = self._bound
+        if bound is None or not bound.fits(atoms):
+            rows = [*self._rows(present), *self._more]
+            bound = bind(rows, atoms, self._degenerate, self.time)
+            # Targets that were left open stay as found, also when the engine is built again.
+            self._more = bound.given[len(rows) - len(self._more) :]
+            self._bound, self._present, self._state = bound, present, None
+            self._system = System(bound.motion, self._force)
+        else:
+            bound.follow_cell(atoms, atoms.cell.array)
+        assert self._system is not None
+        return self._system
+
+    def _rows(self, present: Iterable[Any]) -> list[Constraint]:
+        rows: list[Constraint] = []
+        for item in present:
+            if isinstance(item, FORCES_ONLY):
+                continue
+            if isinstance(item, Constraints):
+                item.engine(self.atoms)  # settles targets that are open
+            rows.extend(translated(self.atoms, [item]))
+        return rows
+
+    def _force(self, x: FloatArray, time: float) -> ArrayLike:
+        self.atoms.set_positions(x, apply_constraint=False)
+        return applied_forces(self.atoms)
+
+
+def _check_timestep(timestep: float) -> None:
+    try:
+        good = math.isfinite(timestep)
+    except TypeError:
+        good = False
+    if not good:
+        raise InputError(f"the time step is {timestep!r}; give a finite number in ASE's unit of time", item="timestep")
+
+
+def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (n_atoms, 3) or not np.isfinite(array).all():
+        raise InputError(f"{item} must be finite, of shape ({n_atoms}, 3), not {array.shape}", item=item)
+    return array
