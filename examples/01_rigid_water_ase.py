@@ -31,7 +31,7 @@ def main(steps: int = 200) -> None:
 
     # One object holds everything. project=True moves the atoms onto the TIP3P geometry.
     held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    thermalize_momenta(atoms, 300 * units.kB, rng=np.random.default_rng(2))
+    thermalize_momenta(atoms, 300, rng=np.random.default_rng(2))
     print(held.report(atoms), "\n")
 
     dynamics = VelocityVerlet(atoms, 2 * units.fs)
