@@ -392,6 +392,33 @@ def test_new_cell_is_noticed_and_targets_stay():
     assert off(atoms, held) > 1
 
 
+def test_a_new_cell_does_not_rebuild_the_engine():
+    atoms = molecule("H2O")
+    atoms.set_cell([6, 6, 6])
+    atoms.pbc = True
+    held = constrain(atoms, rigid_water(atoms))
+    engine = held.engine(atoms)
+    peer = atoms.copy()
+    atoms.set_cell([6.1, 6, 5.9], scale_atoms=True)
+    assert held.engine(atoms) is engine
+    # A copy with another cell gets the engine with its own.
+    assert peer.constraints[0].engine(peer).constraint_set.half_width == pytest.approx(3)
+    assert held.engine(atoms).constraint_set.half_width == pytest.approx(2.95)
+
+
+def test_a_cell_too_small_is_refused_before_it_is_set():
+    atoms = molecule("H2O")
+    atoms.set_cell([6, 6, 6])
+    atoms.pbc = True
+    held = constrain(atoms, rigid_water(atoms))
+    x = atoms.get_positions()
+    with pytest.raises(InputError, match=r"Distance.*half the box"):
+        atoms.set_cell([6, 3, 6], scale_atoms=True)
+    assert atoms.cell.lengths().tolist() == [6, 6, 6]
+    assert np.array_equal(atoms.positions, x)
+    assert held.engine(atoms).constraint_set.half_width == pytest.approx(3)
+
+
 def test_appended_atoms_are_free():
     atoms, held = rigid(1)
     atoms.extend(Atoms("Ar", positions=[[5, 5, 5]]))
@@ -472,6 +499,15 @@ def test_round_trip_keeps_rows_and_targets(way, tmp_path):
     for a in (atoms, again):
         a.set_momenta(momenta)
     assert np.array_equal(atoms.get_momenta(), again.get_momenta())
+
+
+def test_extxyz_drops_the_constraints(tmp_path):
+    atoms = sample()
+    again = _through(atoms, tmp_path / "a.extxyz")
+    assert [type(c).__name__ for c in again.constraints] in ([], ["FixAtoms"])
+    # Targets that were explicit can be given again; positions have 8 digits there.
+    constrain(again, Distance([[0, 1], [1, 2]], [1.5, 1.4]), project=True)
+    assert again.get_distance(0, 1) == pytest.approx(1.5, abs=1e-14)
 
 
 def test_constraint_object_round_trip():

@@ -179,7 +179,7 @@ def test_velocity_verlet_has_no_energy_slope():
     thermalize_momenta(atoms, 50, rng=random())  # EMT knows no molecules; hotter, they fall apart
     kinetic = atoms.get_kinetic_energy()
     energies = {}
-    for dt, steps in ((0.5, 600), (0.25, 1200)):
+    for dt, steps in ((0.5, 300), (0.25, 600)):
         run = atoms.copy()
         run.calc = EMT()
         energies[dt] = follow(VelocityVerlet(run, dt * FS), run.get_total_energy, steps)
@@ -479,17 +479,17 @@ def test_minima_hopping(tmp_path, monkeypatch):
 @pytest.mark.parametrize("cls", [CellAwareBFGS, BFGS], ids=lambda c: c.__name__)
 def test_cell_relaxation(cls):
     atoms = bulk("Cu", cubic=True) * 2
-    atoms.set_cell(np.diag([7.15, 7.2, 7.3]), scale_atoms=True)
+    atoms.set_cell(np.diag([7.2, 7.22, 7.25]), scale_atoms=True)
     atoms.rattle(0.02, rng=random())
     atoms.calc = EMT()
     held = constrain(atoms, Distance([[0, 1], [4, 5]], [2.5, 2.5]), project=True)
     options = {"long_output": False} if cls is CellAwareBFGS else {}
     scale = {"exp_cell_factor": 1.0} if cls is CellAwareBFGS else {}
     optimiser = cls(FrechetCellFilter(atoms, **scale), logfile=None, **options)
-    run = {"fmax": 0.02, "smax": 0.001} if cls is CellAwareBFGS else {"fmax": 0.02}
+    run = {"fmax": 0.05, "smax": 0.001} if cls is CellAwareBFGS else {"fmax": 0.05}
     assert optimiser.run(**run, steps=200)
-    assert np.abs(atoms.get_forces()).max() <= 0.02
-    assert np.abs(atoms.get_stress()).max() <= 0.002
+    assert np.abs(atoms.get_forces()).max() <= 0.05
+    assert np.abs(atoms.get_stress()).max() <= 0.003
     assert off(atoms, held) <= 1e-12
 
 
@@ -665,3 +665,34 @@ def test_phonon_force_constants_are_those_of_the_constrained_motions(tmp_path, m
     size = np.abs(constants).max()
     assert np.abs(constants - constants.T).max() <= 1e-3 * size
     assert np.abs(constants @ forbidden.T).max() <= 1e-3 * size  # nothing resists what the rows forbid
+
+
+# -- long statistics --------------------------------------------------------------------------------
+
+
+@pytest.mark.validation
+def test_gas_of_rigid_water_under_langevin():
+    atoms = water_gas()
+    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
+    thermalize_momenta(atoms, TEMPERATURE, rng=random())
+    dyn = Langevin(atoms, FS, temperature_K=TEMPERATURE, friction=0.02 / FS, fixcm=False, rng=random(5))
+    seen = []
+    dyn.attach(lambda: seen.append((pressure(atoms), atoms.get_temperature())), 5)
+    dyn.run(60_000)
+    expected = 27 * units.kB * TEMPERATURE / atoms.get_volume()
+    for values, target in zip(np.array(seen)[100:].T, (expected, TEMPERATURE), strict=True):
+        mean, error = mean_and_error(values, blocks=20)
+        assert error < 0.01 * target
+        assert abs(mean - target) <= 3 * error
+    assert off(atoms, held) <= 1e-12
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("name", ["Langevin", "Bussi", "Andersen"])
+def test_temperature_long(name):
+    atoms, held = dumbbells()
+    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 40_000)
+    mean, error = mean_and_error(seen[400:], blocks=20)
+    assert error < 1.5
+    assert abs(mean - TEMPERATURE) <= 3 * error
+    assert off(atoms, held) <= 1e-12

@@ -1,0 +1,196 @@
+"""The calculator on the constraints: forces, energies, caching, stress, optimisers without a constraint object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk, molecule
+from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
+from ase.calculators.emt import EMT
+from ase.optimize import BFGS, FIRE
+
+from kcons.ase import ConstrainedCalculator, Constraints, constrain
+from kcons.constraints import Angle, Distance, LinearVelocity
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+
+ROWS = [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2], [1, 0, 3]])]
+
+
+class Counting(EMT):
+    calls = 0
+
+    def calculate(self, *args, **kwargs):
+        self.calls += 1
+        super().calculate(*args, **kwargs)
+
+
+def ethanol(inner=None, **options) -> tuple[Atoms, ConstrainedCalculator]:
+    atoms = molecule("CH3CH2OH")
+    calculator = ConstrainedCalculator(Counting() if inner is None else inner, ROWS, **options)
+    atoms.calc = calculator
+    return atoms, calculator
+
+
+def test_on_the_constraints_forces_are_f_plus_z():
+    atoms, _ = ethanol()
+    peer = molecule("CH3CH2OH")
+    peer.calc = EMT()
+    energy, forces = peer.get_potential_energy(), peer.get_forces()
+    held = constrain(peer, ROWS)
+    assert atoms.get_potential_energy() == energy
+    assert np.array_equal(atoms.get_forces(), held.engine(peer).project_forces(peer.positions, forces))
+    assert np.abs(atoms.get_forces() - peer.get_forces()).max() <= 1e-14
+    rows = held.engine(peer).constraint_set.jacobian(peer.positions)
+    assert np.abs(rows @ (atoms.get_forces() / atoms.get_masses()[:, None]).ravel()).max() <= 1e-13
+
+
+def test_with_the_constraint_object_as_well():
+    atoms, calculator = ethanol()
+    forces = atoms.get_forces()
+    atoms.set_constraint(calculator.constraints.copy())
+    assert np.abs(atoms.get_forces() - forces).max() <= 1e-14
+
+
+def test_momenta_do_not_matter():
+    atoms, _ = ethanol()
+    forces = atoms.get_forces()
+    atoms.set_momenta(np.random.default_rng(0).normal(size=(9, 3)))
+    assert np.array_equal(atoms.get_forces(), forces)
+
+
+def test_caching():
+    atoms, calculator = ethanol()
+    atoms.get_potential_energy()
+    atoms.get_forces()
+    atoms.get_forces()
+    assert calculator.inner.calls == 1
+    atoms.rattle(0.001, rng=np.random.default_rng(0))
+    atoms.get_forces()
+    energy = atoms.get_potential_energy()
+    assert calculator.inner.calls == 2
+    forces = atoms.get_forces()
+    forces += 1.0  # a copy
+    assert atoms.get_potential_energy() == energy
+    assert np.abs(atoms.get_forces() - forces).min() == pytest.approx(1.0)
+    assert calculator.inner.calls == 2
+
+
+def test_off_the_constraints_energy_and_forces_belong_to_one_function():
+    atoms, _ = ethanol()
+    atoms.get_forces()
+    x = atoms.get_positions()
+    direction = np.random.default_rng(1).normal(size=(9, 3))
+    for distance in (0.0, 1e-4):
+        atoms.positions = x + distance * direction
+        forces = atoms.get_forces()
+        energies = []
+        for h in (1e-5, -1e-5):
+            atoms.positions = x + (distance + h) * direction
+            energies.append(atoms.get_potential_energy())
+        # Exact on the constraints; of first order in the distance off them.
+        slope = (energies[0] - energies[1]) / 2e-5
+        assert -float(np.vdot(forces, direction)) == pytest.approx(slope, abs=1e-6 + 100 * distance)
+
+
+def test_stays_where_the_positions_are_if_asked():
+    atoms, calculator = ethanol(project=False)
+    atoms.get_forces()
+    atoms.rattle(0.02, rng=np.random.default_rng(0))
+    plain = atoms.copy()
+    plain.calc = EMT()
+    assert atoms.get_potential_energy() == plain.get_potential_energy()
+    expected = calculator.constraints.engine(atoms).project_forces(atoms.positions, plain.get_forces())
+    assert np.array_equal(atoms.get_forces(), expected)
+
+
+@pytest.mark.parametrize("optimiser", [BFGS, FIRE])
+def test_optimiser_without_a_constraint_object(optimiser):
+    peer = molecule("CH3CH2OH")
+    peer.calc = EMT()
+    held = constrain(peer, ROWS)
+    optimiser(peer, logfile=None).run(fmax=0.01, steps=300)
+
+    atoms, calculator = ethanol()
+    assert optimiser(atoms, logfile=None).run(fmax=0.01, steps=300)
+    assert atoms.get_potential_energy() == pytest.approx(peer.get_potential_energy(), abs=1e-3)
+    energy = atoms.get_potential_energy()
+    calculator.restore(atoms)
+    assert np.abs(held.engine(peer).constraint_set.value(atoms.positions)).max() <= 1e-12
+    assert atoms.get_potential_energy() == pytest.approx(energy, abs=1e-10)
+
+
+def test_stress_is_that_of_the_constraint_object():
+    atoms = bulk("Cu", cubic=True) * 2
+    atoms.rattle(0.05, rng=np.random.default_rng(0))
+    atoms.calc = EMT()
+    held = constrain(atoms, Distance([[0, 1], [2, 3]]))
+    stress = atoms.get_stress()
+    plain = atoms.get_stress(apply_constraint=False)
+    assert np.abs(stress - plain).max() > 1e-5
+    atoms.calc = ConstrainedCalculator(EMT(), held)
+    assert np.abs(atoms.get_stress() - stress).max() <= 1e-12  # not counted twice
+    atoms.set_constraint()
+    assert np.abs(atoms.get_stress() - stress).max() <= 1e-12
+
+
+def test_other_properties_are_passed_on():
+    atoms, calculator = ethanol()
+    assert calculator.implemented_properties == EMT.implemented_properties
+    assert atoms.get_potential_energies().shape == (9,)
+    with pytest.raises(PropertyNotImplementedError):
+        atoms.get_dipole_moment()
+
+
+def test_open_targets_are_those_of_the_first_calculation():
+    atoms, calculator = ethanol()
+    atoms.get_forces()
+    length = atoms.get_distance(0, 1)
+    atoms.positions[0] += 0.02
+    atoms.get_forces()
+    calculator.restore(atoms)
+    assert atoms.get_distance(0, 1) == pytest.approx(length, abs=1e-14)
+
+
+def test_a_constraint_object_that_is_given_is_not_changed():
+    held = Constraints(ROWS)
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = ConstrainedCalculator(EMT(), held)
+    atoms.get_forces()
+    assert all(item.target is None for item in held.constraints)
+
+
+def test_rows_that_need_time_or_velocities():
+    atoms = molecule("H2O")
+    atoms.calc = ConstrainedCalculator(EMT(), LinearVelocity(0, [[1, 0, 0]]))
+    with pytest.raises(UnsupportedError, match="constrains velocities"):
+        atoms.get_forces()
+
+
+class Bad(Calculator):
+    implemented_properties = ("energy", "forces")
+
+    def __init__(self, forces):
+        super().__init__()
+        self.forces = forces
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        self.results = {"energy": 0.0, "forces": self.forces}
+
+
+@pytest.mark.parametrize(
+    ("forces", "message"), [(np.zeros((2, 3)), r"shape \(2, 3\)"), (np.full((9, 3), np.nan), "atom 0 is not finite")]
+)
+def test_bad_inner_calculator(forces, message):
+    atoms, _ = ethanol(Bad(forces))
+    with pytest.raises(InputError, match=message):
+        atoms.get_forces()
+
+
+def test_too_far_off():
+    atoms, _ = ethanol()
+    atoms.get_forces()
+    atoms.positions[1] += [3.0, 0, 0]
+    with pytest.raises(ConvergenceError):
+        atoms.get_forces()

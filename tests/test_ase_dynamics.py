@@ -1,0 +1,512 @@
+"""Our dynamics class in ASE: right, restartable, and with every failure named and rolled back."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.build import molecule
+from ase.calculators.calculator import Calculator, all_changes
+from ase.calculators.emt import EMT
+from ase.calculators.tip3p import TIP3P
+from ase.constraints import FixAtoms, FixBondLengths, Hookean
+from ase.io import read
+from ase.io.trajectory import Trajectory
+from ase.md.velocitydistribution import thermalize_momenta
+from ase.md.verlet import VelocityVerlet
+
+from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
+from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity
+from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.steppers import Rattle
+
+FS = units.fs
+
+
+class Field(Calculator):
+    """A smooth field on every atom; from step `bad` on what `how` says."""
+
+    implemented_properties = ("energy", "forces")
+
+    def __init__(self, stiffness=0.05, bad=None, how=None):
+        super().__init__()
+        self.stiffness, self.bad, self.how, self.calls = stiffness, bad, how, 0
+
+    def calculate(self, atoms=None, properties=("energy",), system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        x = atoms.positions
+        forces = -self.stiffness * x
+        if self.bad is not None and self.calls >= self.bad:
+            forces = self.how(forces)
+        self.calls += 1
+        self.results = {"energy": 0.5 * self.stiffness * float((x**2).sum()), "forces": forces}
+
+
+def waters(n=2, temperature=300.0, seed=0) -> tuple[Atoms, Constraints]:
+    rng = np.random.default_rng(seed)
+    atoms = Atoms()
+    for k in range(n):
+        one = molecule("H2O")
+        one.rotate(rng.uniform(0, 360), rng.normal(size=3))
+        one.translate(3.1 * np.array(np.unravel_index(k, (2, 2, -(-n // 4)))))
+        atoms += one
+    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
+    thermalize_momenta(atoms, temperature, rng=rng)
+    atoms.calc = TIP3P(rc=6.0)
+    return atoms, held
+
+
+def water(calc=None, temperature=300.0, at=0.0) -> tuple[Atoms, Constraints]:
+    atoms = molecule("H2O")
+    atoms.positions += at
+    atoms.calc = Field() if calc is None else calc
+    held = constrain(atoms, rigid_water(atoms))
+    thermalize_momenta(atoms, temperature, rng=np.random.default_rng(3))
+    return atoms, held
+
+
+def off(atoms, held) -> float:
+    return float(np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max())
+
+
+def state(atoms):
+    return atoms.get_positions(), atoms.get_momenta()
+
+
+def equal(a, b) -> bool:
+    return all(np.array_equal(p, q) for p, q in zip(a, b, strict=True))
+
+
+# -- right ------------------------------------------------------------------------------------------
+
+
+def test_follows_velocity_verlet():
+    ours, held = waters()
+    theirs = ours.copy()
+    theirs.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(ours, FS).run(50)
+    VelocityVerlet(theirs, FS).run(50)
+    assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
+    assert np.abs(ours.get_velocities() - theirs.get_velocities()).max() <= 1e-9
+    assert off(ours, held) <= 1e-13
+
+
+def test_order_two():
+    reference, _ = water(temperature=600)
+    start = state(reference)
+    errors, final = [], None
+    for dt in (1 / 16, 1.0, 0.5):
+        atoms, _ = water()
+        atoms.positions, _ = start
+        atoms.set_momenta(start[1], apply_constraint=False)
+        ConstrainedDynamics(atoms, dt * FS).run(round(20 / dt))
+        if final is None:
+            final = atoms.get_positions()
+        else:
+            errors.append(np.abs(atoms.positions - final).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e6])
+def test_far_from_the_origin(distance):
+    atoms, held = water(Field(0.0), at=distance)
+    dyn = ConstrainedDynamics(atoms, FS)
+    kinetic = atoms.get_kinetic_energy()
+    dyn.run(1000)
+    assert abs(atoms.get_kinetic_energy() / kinetic - 1) <= 1e-10
+    assert off(atoms, held) <= 4 * np.spacing(max(distance, 1.0))
+
+
+def test_velocity_verlet_far_from_the_origin_is_why():
+    atoms, _ = water(Field(0.0), at=1e6)
+    kinetic = atoms.get_kinetic_energy()
+    VelocityVerlet(atoms, FS).run(200)
+    assert abs(atoms.get_kinetic_energy() / kinetic - 1) > 1e-9
+
+
+def test_target_that_moves():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Field(0.0))
+    rate = 0.01 / FS
+    row = Distance([0, 1], lambda t: 1.1 + rate * t)
+    dyn = ConstrainedDynamics(atoms, FS, constraints=row, time=0.0)
+    dyn.run(20)
+    assert dyn.get_time() == pytest.approx(20 * FS)
+    assert atoms.get_distance(0, 1) == pytest.approx(1.3, abs=1e-13)
+    # The rate came into the velocities at the start already.
+    assert atoms.get_velocities()[1, 0] - atoms.get_velocities()[0, 0] == pytest.approx(rate, rel=1e-10)
+    assert dyn.degrees_of_freedom == 5
+
+
+def test_time_can_start_elsewhere():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.2, 0, 0]], calculator=Field(0.0))
+    row = Distance([0, 1], lambda t: 1.1 + 0.01 * t / FS)
+    ConstrainedDynamics(atoms, FS, constraints=[row], time=10 * FS).run(10)
+    assert atoms.get_distance(0, 1) == pytest.approx(1.3, abs=1e-13)
+    with pytest.raises(InputError, match="off row"):
+        ConstrainedDynamics(atoms, FS, constraints=[row], time=0.0)
+
+
+def test_velocity_constraint():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Field(0.0))
+    edge = KnifeEdge(0, 1, [0, 0, 1])
+    atoms.set_momenta([[3.0, 1.0, 0], [1.0, -2.0, 0]])
+    held = constrain(atoms, Distance([0, 1]))
+    dyn = ConstrainedDynamics(atoms, 0.5 * FS, constraints=edge)
+    kinetic = atoms.get_kinetic_energy()
+    for _ in dyn.irun(200):
+        miss = dyn._systems().motion.constraint_set.jacobian(atoms.positions) @ atoms.get_velocities().ravel()
+        assert np.abs(miss).max() <= 1e-13
+    assert off(atoms, held) <= 1e-13
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-6)
+    assert dyn.degrees_of_freedom == 4
+
+
+def test_open_velocity_row_on_the_atoms_is_sent_here():
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    with pytest.raises(UnsupportedError, match=r"ConstrainedDynamics\(atoms, timestep, constraints"):
+        constrain(atoms, LinearVelocity(0, [[1, 0, 0]]))
+
+
+def test_ase_constraints_are_absorbed():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_constraint([FixAtoms([8]), FixBondLengths([[0, 1], [1, 2]])])
+    thermalize_momenta(atoms, 50, rng=np.random.default_rng(0))
+    atoms.arrays["momenta"][8] = 0
+    lengths, fixed = (atoms.get_distance(0, 1), atoms.get_distance(1, 2)), atoms.positions[8].copy()
+    dyn = ConstrainedDynamics(atoms, 0.5 * FS)
+    dyn.run(20)
+    assert (atoms.get_distance(0, 1), atoms.get_distance(1, 2)) == pytest.approx(lengths, abs=1e-13)
+    assert np.array_equal(atoms.positions[8], fixed)
+    assert dyn.degrees_of_freedom == 27 - 3 - 2
+    assert dyn.get_temperature() == pytest.approx(atoms.get_temperature())
+
+
+def test_fixed_atoms_of_ase_beside_ours():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_constraint(FixAtoms([8]))
+    held = constrain(atoms, Distance([[0, 1]]))
+    fixed = atoms.positions[8].copy()
+    ConstrainedDynamics(atoms, 0.5 * FS).run(10)
+    assert np.array_equal(atoms.positions[8], fixed) and off(atoms, held) <= 1e-14
+
+
+def test_unknown_ase_constraint_is_refused():
+    from ase.constraints import FixedMode
+
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    atoms.set_constraint(FixedMode(np.ones((3, 3))))
+    with pytest.raises(UnsupportedError, match="FixedMode has no counterpart"):
+        ConstrainedDynamics(atoms, FS)
+
+
+def test_hookean_counts_as_a_force():
+    ours, held = waters()
+    spring = Hookean(a1=0, a2=3, rt=2.0, k=1.0)
+    ours.set_constraint([held, spring])
+    theirs = ours.copy()
+    theirs.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(ours, FS).run(30)
+    VelocityVerlet(theirs, FS).run(30)
+    assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
+
+
+def test_without_constraints_it_is_velocity_verlet():
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    thermalize_momenta(atoms, 300, rng=np.random.default_rng(0))
+    peer = atoms.copy()
+    peer.calc = Field()
+    ConstrainedDynamics(atoms, FS).run(100)
+    VelocityVerlet(peer, FS).run(100)
+    assert np.abs(atoms.positions - peer.positions).max() <= 1e-13
+
+
+def boxed() -> tuple[Atoms, Constraints]:
+    atoms, held = water(Field(0.0))
+    atoms.set_cell([6.0, 6.5, 7.0])
+    atoms.pbc = True
+    return atoms, held
+
+
+def test_periodic_box_with_wrapping():
+    atoms, held = boxed()
+    other, _ = boxed()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.attach(atoms.wrap, 3)
+    dyn.run(60)
+    ConstrainedDynamics(other, FS).run(60)
+    turns = (atoms.positions - other.positions) / atoms.cell.lengths()
+    assert np.abs(turns - np.round(turns)).max() <= 1e-11 and np.abs(turns).max() > 0.5
+    assert off(atoms, held) <= 1e-13
+
+
+def test_periodic_box_that_changes():
+    atoms, _ = boxed()
+    other, _ = boxed()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(30)
+    engine = dyn._systems().motion
+    atoms.set_cell([6.5, 6.5, 7.0])  # no molecule is cut by the boundary
+    dyn.run(30)
+    assert dyn._systems().motion is engine
+    assert engine.constraint_set.half_width == pytest.approx(3.25)
+    ConstrainedDynamics(other, FS).run(60)
+    assert np.abs(atoms.positions - other.positions).max() <= 1e-13
+
+
+# -- ASE's conventions ------------------------------------------------------------------------------
+
+
+def test_trajectory_log_and_observers(tmp_path):
+    atoms, _ = waters()
+    seen = []
+    log = io.StringIO()
+    path = tmp_path / "md.traj"
+    with ConstrainedDynamics(atoms, FS, Rattle(), trajectory=str(path), logfile=log, loginterval=2) as dyn:
+        dyn.attach(lambda: seen.append(dyn.nsteps), interval=3)
+        assert [done for done in dyn.irun(6)] == [False] * 6 + [True]
+        assert dyn.run(4) is True
+    frames = read(path, index=":")
+    assert len(frames) == 6
+    assert seen == [0, 3, 6, 9]
+    assert len(log.getvalue().splitlines()) == 7
+    assert np.array_equal(frames[-1].positions, atoms.positions)
+    assert isinstance(frames[-1].constraints[0], Constraints)
+    with Trajectory(path) as file:
+        description = file.description
+    assert description["md-type"] == "ConstrainedDynamics"
+    assert description["stepper"] == "Rattle()"
+
+
+def test_one_force_evaluation_a_step():
+    atoms, _ = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.attach(atoms.get_potential_energy)
+    dyn.run(10)
+    assert atoms.calc.calls == 11
+
+
+def test_forces_are_not_computed_for_nobody():
+    class Lazy:
+        """Ends without forces, as some compositions do."""
+
+        order, reversible, force_evaluations = 1, False, 0
+
+        def step(self, system, state, dt):
+            from dataclasses import replace
+
+            return replace(state, positions=state.positions + dt * state.velocities, forces=None, step=state.step + 1)
+
+    atoms, _ = water()
+    atoms.set_constraint()
+    ConstrainedDynamics(atoms, FS, Lazy()).run(10)
+    assert atoms.calc.calls == 0
+    dyn = ConstrainedDynamics(atoms, FS, Lazy())
+    dyn.attach(atoms.get_potential_energy, 5)
+    dyn.run(10)
+    assert atoms.calc.calls == 3
+
+
+def test_restart_is_identical_to_the_last_bit(tmp_path):
+    path = tmp_path / "md.traj"
+    whole, _ = waters(4)
+    with ConstrainedDynamics(whole, FS, trajectory=str(path)) as dyn:
+        dyn.run(40)
+    frame = read(path, index=17)
+    forces = frame.get_forces(apply_constraint=False)
+    frame.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(frame, FS).run(23)
+    assert equal(state(frame), state(whole))
+    assert np.array_equal(frame.get_forces(), whole.get_forces())
+    again = read(path, index=17)
+    again.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(again, FS, forces=forces).run(23)
+    assert equal(state(again), state(whole))
+
+
+def test_run_in_pieces_is_identical_to_the_last_bit():
+    whole, _ = waters()
+    pieces, _ = waters()
+    ConstrainedDynamics(whole, FS).run(30)
+    dyn = ConstrainedDynamics(pieces, FS)
+    dyn.run(10)
+    dyn.run(20)
+    assert equal(state(whole), state(pieces))
+    assert dyn.nsteps == 30
+
+
+def test_velocities_changed_between_steps_are_taken():
+    atoms, held = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(3)
+    atoms.set_momenta(np.zeros((3, 3)))
+    atoms.arrays["momenta"] += 0.1  # past the constraints
+    dyn.run(1)
+    rows = held.engine(atoms).constraint_set.jacobian(atoms.positions)
+    assert np.abs(rows @ atoms.get_velocities().ravel()).max() <= 1e-14
+
+
+def test_positions_changed_between_steps_are_checked():
+    atoms, held = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(3)
+    atoms.positions[1] += 0.05
+    with pytest.raises(InputError, match=r"off row.*restore"):
+        dyn.run(1)
+    held.restore(atoms)
+    dyn.run(3)
+    assert off(atoms, held) <= 1e-13
+
+
+def test_constraints_changed_between_steps_are_taken():
+    atoms, _ = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(2)
+    atoms.set_constraint()
+    constrain(atoms, FixedAtoms([0]))
+    fixed = atoms.positions[0].copy()
+    dyn.run(5)
+    assert np.array_equal(atoms.positions[0], fixed)
+    assert dyn.degrees_of_freedom == 6
+
+
+def test_masses_changed_between_steps_are_taken():
+    atoms, held = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(2)
+    atoms.set_masses([16, 2, 2])
+    atoms.set_momenta(atoms.get_momenta())
+    dyn.run(5)
+    assert off(atoms, held) <= 1e-13
+
+
+# -- time steps -------------------------------------------------------------------------------------
+
+
+def test_zero_step_changes_nothing():
+    atoms, _ = water()
+    dyn = ConstrainedDynamics(atoms, 0.0)
+    before = state(atoms)
+    dyn.run(3)
+    assert equal(before, state(atoms))
+    assert dyn.get_time() == 0
+
+
+def test_negative_step_goes_back():
+    atoms, _ = waters()
+    dyn = ConstrainedDynamics(atoms, FS)
+    before = state(atoms)
+    dyn.run(50)
+    dyn.set_timestep(-FS)
+    dyn.run(50)
+    assert all(np.abs(a - b).max() <= 1e-11 for a, b in zip(before, state(atoms), strict=True))
+    assert dyn.get_time() == pytest.approx(0, abs=1e-12)
+
+
+def test_step_changed_on_the_fly():
+    atoms, held = water()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(5)
+    dyn.set_timestep(0.5 * FS)
+    dyn.run(4)
+    assert dyn.get_time() == pytest.approx(7 * FS)
+    assert off(atoms, held) <= 1e-14
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, None, "fast"])
+def test_bad_time_step(bad):
+    atoms, _ = water()
+    with pytest.raises(InputError, match="time step"):
+        ConstrainedDynamics(atoms, bad)
+    dyn = ConstrainedDynamics(atoms, FS)
+    with pytest.raises(InputError, match="time step"):
+        dyn.set_timestep(bad)
+
+
+def test_bad_time_and_forces():
+    atoms, _ = water()
+    with pytest.raises(InputError, match="time is nan"):
+        ConstrainedDynamics(atoms, FS, time=np.nan)
+    for forces in (np.zeros((2, 3)), np.full((3, 3), np.nan)):
+        with pytest.raises(InputError, match="forces"):
+            ConstrainedDynamics(atoms, FS, forces=forces)
+
+
+# -- failures ---------------------------------------------------------------------------------------
+
+
+def spoiled(forces):
+    forces[1, 2] = np.nan
+    return forces
+
+
+FAILURES = {
+    "nan": (spoiled, NonFiniteError, "non-finite force at step 7 on atom 1"),
+    "inf": (lambda f: f + np.inf, NonFiniteError, "non-finite force at step 7"),
+    "shape": (lambda f: f[:2], InputError, r"shape \(2, 3\) at step 7"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_bad_calculator_at_a_step(case, tmp_path):
+    how, error, message = FAILURES[case]
+    good, _ = water()
+    ConstrainedDynamics(good, FS).run(6)
+    path = tmp_path / "md.traj"
+    atoms, _ = water(Field(bad=7, how=how))  # one evaluation at the start, one a step
+    with ConstrainedDynamics(atoms, FS, trajectory=str(path)) as dyn:
+        with pytest.raises(error, match=message):
+            dyn.run(20)
+        assert dyn.nsteps == 6
+    assert equal(state(atoms), state(good))
+    frames = read(path, index=":")
+    assert len(frames) == 7
+    assert equal(state(frames[-1]), state(good))
+    # With a calculator that works, the run goes on from there as if nothing had happened.
+    atoms.calc = Field()
+    dyn.run(3)
+    ConstrainedDynamics(good, FS).run(3)
+    assert equal(state(atoms), state(good))
+
+
+def test_calculator_that_raises():
+    def fail(forces):
+        raise RuntimeError("no convergence")
+
+    good, _ = water()
+    ConstrainedDynamics(good, FS).run(6)
+    atoms, _ = water(Field(bad=7, how=fail))
+    with pytest.raises(RuntimeError, match="no convergence") as caught:
+        ConstrainedDynamics(atoms, FS).run(20)
+    assert any("in step 7" in note for note in caught.value.__notes__)
+    assert equal(state(atoms), state(good))
+
+
+def test_time_step_too_large():
+    atoms, _ = water(Field(0.0), temperature=3000)
+    dyn = ConstrainedDynamics(atoms, 60 * FS)
+    before = state(atoms)
+    with pytest.raises(ConvergenceError, match="step 1: time step too large") as caught:
+        dyn.run(5)
+    assert caught.value.step == 1
+    assert equal(state(atoms), before)
+
+
+def test_atoms_off_their_rows_are_refused_at_the_start():
+    atoms, _ = water()
+    atoms.positions[0] += 0.1
+    with pytest.raises(InputError, match="off row"):
+        ConstrainedDynamics(atoms, FS)
+
+
+def test_nan_positions_are_refused_at_the_start():
+    atoms, _ = water()
+    atoms.positions[0, 0] = np.nan
+    with pytest.raises(KconsError):
+        ConstrainedDynamics(atoms, FS)
