@@ -841,7 +841,7 @@ def test_nan_force_in_dynamics_is_an_error():
 def test_documentation_runs(capsys):
     text = (ROOT / "docs" / "ase.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 7
     exec(compile("\n".join(blocks), "docs/ase.md", "exec"), {})
     assert "degrees of freedom" in capsys.readouterr().out
 
