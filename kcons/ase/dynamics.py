@@ -89,6 +89,8 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
+        self._momenta = np.zeros((0, 3))  # as written last
+        self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
         super().__init__(atoms, timestep, **kwargs)
         self._start()
@@ -132,7 +134,7 @@ class ConstrainedDynamics(MolecularDynamics):
         """
         system = self._systems()
         state = self._start()
-        positions, momenta = self.atoms.get_positions(), self.atoms.get_momenta()
+        positions, momenta = state.positions, self.atoms.arrays["momenta"].copy()
         try:
             after = self.stepper.step(system, state, self.dt)
         except BaseException as error:
@@ -140,7 +142,8 @@ class ConstrainedDynamics(MolecularDynamics):
             if not getattr(error, "step", None):
                 error.add_note(f"in step {self.nsteps + 1}; the atoms are as they were before it")
             raise
-        self._put(after.positions, after.velocities * system.masses[:, None])
+        self._momenta = after.velocities * self._weights[0]
+        self._put(after.positions, self._momenta)
         self._state = after
         self.time = after.time
 
@@ -156,15 +159,13 @@ class ConstrainedDynamics(MolecularDynamics):
     def _start(self) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
         system = self._systems()
-        x, p = self.atoms.arrays["positions"], self.atoms.get_momenta()
-        masses = system.masses[:, None]
-        v = np.zeros_like(x)
-        # Velocities always come from the momenta, as after a restart from a file.
-        np.divide(p, masses, out=v, where=system.inverse_masses > 0)
+        x, p = self.atoms.arrays["positions"], self.atoms.arrays["momenta"]
+        masses, divisors = self._weights
+        v = p / divisors  # always from the momenta, as after a restart from a file
         last = self._state
         cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
         same = last is not None and cell == self._cell and np.array_equal(last.positions, x)
-        if last is not None and same and np.array_equal(last.velocities * masses, p):
+        if last is not None and same and np.array_equal(self._momenta, p):
             return State(last.positions, v, self.time, last.forces, self.nsteps, last.remainder)
         held = system.motion.constraint_set
         require_on_surface(held, x, self.time)
@@ -175,7 +176,8 @@ class ConstrainedDynamics(MolecularDynamics):
             forces = None
         state = State(state.positions, state.velocities, self.time, forces, self.nsteps, state.remainder)
         moved = not np.array_equal(state.velocities, v)
-        self._put(state.positions, state.velocities * masses if moved else p)
+        self._momenta = state.velocities * masses if moved else p.copy()
+        self._put(state.positions, self._momenta)
         self._state, self._cell = state, cell
         return state
 
@@ -196,6 +198,12 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._system = System(bound.motion, self._force)
+            moving = self._system.inverse_masses > 0
+            shape = (len(atoms), 3)
+            self._weights = (
+                np.where(moving, bound.motion.masses[:, None], np.zeros(shape)),
+                np.where(moving, bound.motion.masses[:, None], np.full(shape, np.inf)),
+            )
         else:
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
