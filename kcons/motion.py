@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons import diagnosis
+from kcons.arrays import as_array, check_out
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -23,9 +24,6 @@ from kcons.errors import ContradictionError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
 from kcons.plan import Plan, make_plan
 
-_FLOAT = np.dtype(np.float64)
-#: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
-DENSE_ROWS = 1500
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
 
@@ -77,7 +75,7 @@ class Motion:
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         self._shape = (constraint_set.n_atoms, 3)
-        x = _positions(positions, self._shape, "positions")
+        x = as_array(positions, self._shape, "positions")
         self._given = constraint_set
         self.constraint_set = without_second_order_rows(constraint_set, x, time, convert=degenerate == "convert")
         self.n_atoms = constraint_set.n_atoms
@@ -134,7 +132,7 @@ class Motion:
         before = held.lattice
         try:
             held.with_cell(cell, pbc)
-            held.check_half_box(None if positions is None else _positions(positions, self.n_atoms, "positions"))
+            held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"))
         except InputError:
             held.lattice = before
             raise
@@ -187,13 +185,13 @@ class Motion:
         InputError
             Wrong shapes, or a NaN or infinity in the positions of a constrained atom.
         """
-        x = _positions(x_new, self._shape, "x_new")
-        ref = _positions(x_ref, self._shape, "x_ref")
+        x = as_array(x_new, self._shape, "x_new")
+        ref = as_array(x_ref, self._shape, "x_ref")
         if out is not None:
-            _check_out(out, self._shape)
+            check_out(out, self._shape)
         inv_dt = 0.0
         if velocities is not None:
-            _check_out(velocities, self._shape, "velocities")
+            check_out(velocities, self._shape, "velocities")
             if not dt or not isfinite(dt):
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / dt
@@ -307,9 +305,9 @@ class Motion:
             The residual cannot be made smaller; nothing was changed.
         """
         if out is not None:
-            _check_out(out, self._shape)
+            check_out(out, self._shape)
         self._cell()
-        result = _positions(x, self._shape, "positions").copy()
+        result = as_array(x, self._shape, "positions").copy()
         local = result if self._atoms is None else result[self._atoms]
         targets = self._local.target(time) if self._moving else None
         if len(self.plan.pinned):
@@ -352,10 +350,10 @@ class Motion:
         ConvergenceError, InputError
             As `project_positions`; nothing was changed.
         """
-        y = _positions(v, self._shape, "velocities")
-        here = _positions(x, self._shape, "positions")
+        y = as_array(v, self._shape, "velocities")
+        here = as_array(x, self._shape, "positions")
         if out is not None:
-            _check_out(out, self._shape)
+            check_out(out, self._shape)
         if multipliers is not None:
             self._check_multipliers(multipliers)
         atoms = self._atoms
@@ -424,14 +422,14 @@ class Motion:
     def constraint_force(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """z = M a - f, the constraint force, shape (n_atoms, 3) (notes eq. 101)."""
         lam = self._accelerate(x, v, f, time)[1]
-        here = _positions(x, self._shape, "positions")
+        here = as_array(x, self._shape, "positions")
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
     def _accelerate(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> tuple[FloatArray, FloatArray]:
-        here = _positions(x, self._shape, "positions")
-        speed = _positions(v, self._shape, "velocities")
-        force = _positions(f, self._shape, "forces")
+        here = as_array(x, self._shape, "positions")
+        speed = as_array(v, self._shape, "velocities")
+        force = as_array(f, self._shape, "forces")
         with np.errstate(divide="ignore", invalid="ignore"):
             a = force / self.masses[:, None]
         local_x, local_v = (here, speed) if self._atoms is None else (here[self._atoms], speed[self._atoms])
@@ -445,7 +443,7 @@ class Motion:
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
             a[self._atoms] = local_a
-        lam = self._least_norm(local_x, -mu, time)
+        lam = self.plan.least_norm(local_x, -mu, time)
         if len(self.plan.pinned):
             # What the fixed atoms' rows supply: M a - f less the other rows' forces.
             lam[self.plan.pinned_rows] = 0.0
@@ -456,34 +454,14 @@ class Motion:
             lam[self.plan.pinned_rows] = reaction.ravel()
         return a, lam
 
-    def _least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
-        """Multipliers of least norm with the same constraint force, where rows depend on each other."""
-        if not self.plan.dependent:
-            return lam
-        jacobian = self._local.jacobian(x, time)
-        movable = np.repeat(self.plan.inverse_masses > 0, 3)
-        for rows in self.plan.dependent:
-            part = jacobian[rows]
-            transposed = part.T.tocsr()
-            used = np.flatnonzero((np.diff(transposed.indptr) > 0) & movable)
-            transposed = transposed[used]
-            force = transposed @ lam[rows]
-            if len(rows) <= DENSE_ROWS:
-                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
-            else:
-                from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
-
-                lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
-        return lam
-
     def project_forces(
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None
     ) -> FloatArray:
         """f + z with b = 0: what is left of the force on the surface, for optimisers, shape (n_atoms, 3)."""
-        force = _positions(f, self._shape, "forces")
-        here = _positions(x, self._shape, "positions")
+        force = as_array(f, self._shape, "forces")
+        here = as_array(x, self._shape, "positions")
         if out is not None:
-            _check_out(out, self._shape)
+            check_out(out, self._shape)
         touched, masses = self._touched, self._local.masses[:, None]
         local = force if self._atoms is None else force.take(touched, 0)
         y = local * self.plan.inverse_masses[:, None]
@@ -506,8 +484,8 @@ class Motion:
 
         ``condition=False`` leaves out the condition numbers, which take longer than all else in the report.
         """
-        here = _positions(x, self._shape, "positions")
-        speed = None if v is None else _positions(v, self._shape, "velocities")
+        here = as_array(x, self._shape, "positions")
+        speed = None if v is None else as_array(v, self._shape, "velocities")
         self._cell()
         return diagnosis.make_report(
             self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition
@@ -515,20 +493,3 @@ class Motion:
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"
-
-
-def _positions(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
-    if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.c_contiguous:
-        return values
-    try:
-        array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
-    if array.shape != shape:
-        raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
-    return array
-
-
-def _check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
-    if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
-        raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)

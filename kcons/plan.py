@@ -22,6 +22,8 @@ from kcons.solvers.water import RigidTriangles
 
 #: Rounds of Newton that a chain may take until its stored positions show the lengths.
 MAX_ROUNDS = 4
+#: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
+DENSE_ROWS = 1500
 
 
 class ClusterSolver(Protocol):
@@ -170,6 +172,26 @@ class Plan:
                 "to the constraints (minimise with harmonic bonds first), or hold fewer rows"
             )
         return GeneralClusters(self.constraint_set, rows, self.labels[rows], self.inverse_masses)
+
+    def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
+        """Multipliers of least norm with the same constraint force, where rows depend on each other."""
+        if not self.dependent:
+            return lam
+        jacobian = self.constraint_set.jacobian(x, time)
+        movable = np.repeat(self.inverse_masses > 0, 3)
+        for rows in self.dependent:
+            part = jacobian[rows]
+            transposed = part.T.tocsr()
+            used = np.flatnonzero((np.diff(transposed.indptr) > 0) & movable)
+            transposed = transposed[used]
+            force = transposed @ lam[rows]
+            if len(rows) <= DENSE_ROWS:
+                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
+            else:
+                from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
+
+                lam[rows] = lsqr(transposed, force, atol=1e-15, btol=1e-15, iter_lim=20 * len(rows))[0]
+        return lam
 
 
 def make_plan(

@@ -1,0 +1,30 @@
+"""Arrays from outside, as the compiled kernels need them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+
+_FLOAT = np.dtype(np.float64)
+
+
+def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
+    """`values` themselves if the kernels can take them, or a float64 copy of that shape."""
+    if type(values) is np.ndarray and values.dtype is _FLOAT and values.shape == shape and values.flags.c_contiguous:
+        return values
+    try:
+        array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+    if array.shape != shape:
+        raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
+    return array
+
+
+def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
+    """Refuse arrays that results cannot be written into."""
+    if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
+        raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
