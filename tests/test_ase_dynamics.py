@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,20 +94,42 @@ def test_follows_velocity_verlet():
     assert off(ours, held) <= 1e-13
 
 
-def test_order_two():
-    reference, _ = water(temperature=600)
-    start = state(reference)
+class Suzuki:
+    """Order 4 by five steps of RATTLE, as any stepper may be given."""
+
+    order, reversible, force_evaluations = 4, True, 5
+
+    def step(self, system, state, dt):
+        share = 1 / (4 - 4 ** (1 / 3))
+        number = state.step + 1
+        for weight in (share, share, 1 - 4 * share, share, share):
+            state = Rattle().step(system, state, weight * dt)
+        return replace(state, step=number)
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki()], ids=lambda s: type(s).__name__)
+def test_order_of_the_stepper(stepper):
     errors, final = [], None
     for dt in (1 / 16, 1.0, 0.5):
-        atoms, _ = water()
-        atoms.positions, _ = start
-        atoms.set_momenta(start[1], apply_constraint=False)
-        ConstrainedDynamics(atoms, dt * FS).run(round(20 / dt))
+        atoms, _ = water(temperature=600)
+        ConstrainedDynamics(atoms, dt * FS, stepper).run(round(20 / dt))
         if final is None:
             final = atoms.get_positions()
         else:
             errors.append(np.abs(atoms.positions - final).max())
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
+    # The reference itself is 1/16 and 1/8 of the steps away.
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(stepper.order, abs=0.15)
+
+
+def test_free_flight_of_a_rigid_body():
+    atoms, held = water(Field(0.0))
+    dyn = ConstrainedDynamics(atoms, FS)
+    before = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    dyn.run(5000)
+    after = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    for a, b in zip(before, after, strict=True):
+        assert np.abs(np.subtract(a, b)).max() <= 1e-12 * np.abs(a).max()
+    assert off(atoms, held) <= 1e-13
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e6])
@@ -299,8 +322,6 @@ def test_forces_are_not_computed_for_nobody():
         order, reversible, force_evaluations = 1, False, 0
 
         def step(self, system, state, dt):
-            from dataclasses import replace
-
             return replace(state, positions=state.positions + dt * state.velocities, forces=None, step=state.step + 1)
 
     atoms, _ = water()
