@@ -136,11 +136,8 @@ class Motion:
         except InputError:
             held.lattice = before
             raise
-        self._local.lattice = held.lattice
-        # All other solvers take the lattice at each call.
-        for solver in (*self.plan.solvers, *self._rescuers.values()):
-            if isinstance(solver, GeneralClusters):
-                solver.subset.lattice = held.lattice
+        # The solvers take the lattice at each call.
+        self._given.lattice = self._local.lattice = self._lattice = held.lattice
 
     # -- positions ------------------------------------------------------------------------------
 
