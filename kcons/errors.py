@@ -104,6 +104,10 @@ class InfeasibleError(ConvergenceError):
     """No positions satisfy the constraints: the residual cannot be made smaller."""
 
 
+class ReversibilityError(ConvergenceError):
+    """A step that was taken back did not end where it began."""
+
+
 class NonFiniteError(KconsError, FloatingPointError):
     """A NaN or infinity appeared during a run.
 

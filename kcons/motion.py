@@ -404,9 +404,14 @@ class Motion:
         if multipliers is not None:
             self._collect(found, multipliers)
 
-    def acceleration(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
-        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected)."""
-        return self._accelerate(x, v, f, time)[0]
+    def acceleration(
+        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
+    ) -> FloatArray:
+        """a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^+ b, shape (n_atoms, 3) (notes eq. 105, corrected).
+
+        `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilisation).
+        """
+        return self._accelerate(x, v, f, time, feedback)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -423,7 +428,9 @@ class Motion:
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
-    def _accelerate(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float) -> tuple[FloatArray, FloatArray]:
+    def _accelerate(
+        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float, feedback: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
         force = as_array(f, self._shape, "forces")
@@ -433,6 +440,8 @@ class Motion:
         local_a = a if self._atoms is None else a[self._atoms]
         with np.errstate(all="ignore"):
             b = self._local.acceleration_target(local_x, local_v, time)
+            if feedback is not None:
+                b = b + feedback
         if not np.all(np.isfinite(b)):
             arrays = {"velocity": local_v, "position": local_x}
             raise diagnosis.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))

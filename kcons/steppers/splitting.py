@@ -1,0 +1,245 @@
+"""Kicks and drifts in turn: the loop that RATTLE, its compositions and the Runge-Kutta-Nystrom splittings share.
+
+A kick changes velocities by h M^-1 f(x, t), a drift flies h along the constraints (`kcons.steppers.drifts`).
+Time passes in the drifts, so that forces and constraints that depend on it are taken at the time of each stage,
+also where a stage goes back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError
+from kcons.steppers.drifts import Drift
+from kcons.steppers.state import State, System, check_finite
+from kcons.steppers.stepper import explained, stays
+
+_MAX_ITERATIONS = 50
+_EPS = float(np.finfo(float).eps)
+
+
+class Splitting:
+    """Base of the steppers made of kicks and drifts.
+
+    Parameters
+    ----------
+    kicks, drifts : sequence of float
+        Palindromes of fractions of the step. One kick more than drifts: the step begins and ends with a kick, and
+        the last force is the first of the next step. One drift more than kicks: it begins and ends with a drift.
+    flight : sequence of float
+        Each drift is this symmetric composition of RATTLE drifts.
+    exact_flight : bool
+        Whether to fly along great circles instead where every row allows it.
+    """
+
+    order: int = 2
+    reversible = True
+    symplectic = True
+
+    def __init__(
+        self,
+        kicks: Sequence[float],
+        drifts: Sequence[float],
+        flight: Sequence[float] = (1.0,),
+        exact_flight: bool = False,
+    ) -> None:
+        self.kicks = tuple(kicks)
+        self.drifts = tuple(drifts)
+        self.flight = tuple(flight)
+        self.exact_flight = exact_flight
+        self.kick_first = len(self.kicks) > len(self.drifts)
+        self._pieces = _pieces(self.drifts, self.flight)
+        self._whole_pieces = _pieces(self.drifts, (1.0,))
+
+    @property
+    def force_evaluations(self) -> int:
+        return min(len(self.kicks), len(self.drifts))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` where the stepper may not be used: here, nowhere."""
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`; negative steps go back, 0 changes nothing.
+
+        Raises
+        ------
+        ConvergenceError
+            No solution (the step is too large); carries `step`.
+        NonFiniteError
+            A force, position or velocity became NaN or infinite; carries `step`.
+        InputError
+            `dt` is not finite; the force function returned a wrong shape.
+        UnsupportedError
+            The stepper may not be used with this system.
+        """
+        self.check(system)
+        still = stays(state, dt)
+        if still is not None:
+            return still
+        start = system.with_forces(state) if self.kick_first else state
+        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
+            step = _Step(system, start, dt, self.exact_flight)
+            pieces = self._whole_pieces if step.exact else self._pieces
+            try:
+                if system.velocity_dependent:
+                    step.with_friction(self.drifts, pieces)
+                elif self.kick_first:
+                    step.kick_first(self.kicks, pieces)
+                else:
+                    step.drift_first(self.kicks, pieces)
+            except ConvergenceError as error:
+                raise explained(error, system, state, dt, step.number) from error
+            except InputError:
+                step.refuse_overflow()
+                raise
+            return step.end()
+
+
+#: One RATTLE drift: its fraction of the step, and the fraction of the step at which it ends.
+Piece = tuple[float, float]
+
+
+def _pieces(drifts: Sequence[float], flight: Sequence[float]) -> list[list[Piece]]:
+    """For each drift, the RATTLE drifts it consists of."""
+    flat = [a * w for a in drifts for w in flight]
+    nodes = [math.fsum(flat[:k]) for k in range(1, len(flat))] + [1.0]
+    flown = list(zip(flat, nodes, strict=True))
+    return [flown[k : k + len(flight)] for k in range(0, len(flat), len(flight))]
+
+
+class _Step:
+    """The arrays of one step on its way."""
+
+    def __init__(self, system: System, start: State, dt: float, exact_flight: bool) -> None:
+        self.system, self.start, self.dt = system, start, dt
+        self.number = start.step + 1
+        self.time, self.time_remainder = start.later(dt)
+        circles = system.great_circles if exact_flight else None
+        self.exact = circles is not None
+        self.flight: Drift = system.drift if circles is None else circles
+        #: Where positions are far from the origin they are taken relative to one atom.
+        self.shift: FloatArray | None = None
+        if start.remainder is None:
+            self.x = start.positions
+        else:
+            self.shift = start.positions[system.anchor]
+            self.x = (start.positions - self.shift) + start.remainder
+        self.v = start.velocities.copy()
+        self.out = self.x
+        self.forces = start.forces
+        self.now = start.time
+
+    # -- stages ---------------------------------------------------------------------------------
+
+    def kick_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
+        """K D K ... D K."""
+        self.kick(kicks[0])
+        for fraction, stage in zip(kicks[1:], pieces, strict=True):
+            self.drift(stage)
+            self.evaluate()
+            self.kick(fraction)
+        self.project()
+
+    def drift_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
+        """D K D ... K D; the forces of the last kick are not those of the end."""
+        self.drift(pieces[0])
+        for fraction, stage in zip(kicks, pieces[1:], strict=True):
+            self.evaluate()
+            self.kick(fraction)
+            self.drift(stage)
+        self.forces = None
+        self.project()
+
+    def with_friction(self, weights: Sequence[float], pieces: list[list[Piece]]) -> None:
+        """Forces depend on v: half a kick with f(x0, v0), and half a one with f(x1, v1), solved for v1.
+
+        Step and adjoint in one: symmetric, so that compositions keep their order.
+        """
+        for weight, stage in zip(weights, pieces, strict=True):
+            self.kick(0.5 * weight)
+            self.drift(stage)
+            self.settle(0.5 * weight)
+
+    def kick(self, fraction: float) -> None:
+        if self.system.force is None:
+            return
+        assert self.forces is not None
+        change = self.forces * self.system.inverse_masses
+        change *= fraction * self.dt
+        change += self.v
+        self.v = change
+
+    def drift(self, stage: list[Piece]) -> None:
+        start, dt = self.start, self.dt
+        first, spare = self.x, None
+        for fraction, end in stage:
+            # Positions that the force function has seen are never written to again.
+            before, self.out = self.x, np.empty_like(first) if spare is None else spare
+            then = self.now
+            self.now = self.time if end == 1.0 else start.time + (end * dt + start.time_remainder)
+            self.flight.move(before, self.v, self.out, then, self.now, fraction * dt)
+            spare = None if before is first else before
+            self.x = self.out
+
+    def evaluate(self) -> None:
+        """Forces where the step is now."""
+        if self.system.force is None:
+            return
+        check_finite(self.x, "position", self.number)
+        self.forces = self.system.forces(self.positions, self.v, self.now, self.number)
+
+    def settle(self, fraction: float) -> None:
+        """v = projected(v + h M^-1 f(x, v)), by iteration."""
+        system, positions, now = self.system, self.positions, self.now
+        check_finite(positions, "position", self.number)
+        half_kick = (fraction * self.dt) * system.inverse_masses
+        project = system.motion.project_velocities
+        v = project(self.x, self.v + half_kick * system.forces(positions, self.v, now, self.number), time=now)
+        change = math.inf
+        for _ in range(_MAX_ITERATIONS):
+            forces = system.forces(positions, v, now, self.number)
+            following = project(self.x, self.v + half_kick * forces, time=now)
+            last, change = change, float(np.abs(following - v).max(initial=0.0))
+            speed = float(np.abs(following).max(initial=0.0))
+            v = following
+            if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
+                self.v, self.forces = v, system.forces(positions, v, now, self.number)
+                return
+        raise ConvergenceError(
+            f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
+            f"after {_MAX_ITERATIONS} iterations; time step too large",
+            residual=change / max(speed, float(np.finfo(float).tiny)),
+            tolerance=2 * _EPS,
+            iterations=_MAX_ITERATIONS,
+        )
+
+    def project(self) -> None:
+        check_finite(self.x, "position", self.number)
+        self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+
+    # -- the end --------------------------------------------------------------------------------
+
+    @property
+    def positions(self) -> FloatArray:
+        """Where the atoms are, for the force function."""
+        return self.x if self.shift is None else self.x + self.shift
+
+    def end(self) -> State:
+        check_finite(self.v, "velocity", self.number)
+        positions, remainder = self.x, None
+        if self.shift is not None:
+            positions = self.x + self.shift
+            remainder = self.x - (positions - self.shift)
+        return State(positions, self.v, self.time, self.forces, self.number, remainder, self.time_remainder)
+
+    def refuse_overflow(self) -> None:
+        """Name overflow as what it is, where the engine met it first."""
+        for array, item in ((self.v, "velocity"), (self.x, "position"), (self.out, "position")):
+            check_finite(array, item, self.number)

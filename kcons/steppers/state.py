@@ -1,0 +1,303 @@
+"""Where a system is (`State`), and what acts on it (`System`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, NonFiniteError, OverdeterminedError
+from kcons.motion import Motion
+from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
+
+#: Positions farther from the origin than this many times the size of the system carry their remainder.
+FAR = 128.0
+
+#: Residual of initial positions (relative to the row's scale) and of initial velocities (relative to the
+#: speed) that is still taken for rounding; the first step removes it.
+START_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where a system is.
+
+    Attributes
+    ----------
+    positions, velocities : ndarray, shape (n_atoms, 3)
+        In the caller's units. Treat them as read-only: states share arrays where nothing changed.
+    time : float
+    forces : ndarray, shape (n_atoms, 3), or None
+        Applied forces at this state, None before they are known. With them in hand a step evaluates the
+        forces once, and a run that is continued from a saved state continues bit for bit.
+    step : int
+        Steps done since the start.
+    remainder : ndarray, shape (n_atoms, 3), or None
+        What rounding took from the positions, kept where they are far from the origin compared with the
+        size of what is held (see `System.initial_state`).
+    time_remainder : float
+        What rounding took from the time, so that a million steps of dt are a million dt.
+    """
+
+    positions: FloatArray
+    velocities: FloatArray
+    time: float = 0.0
+    forces: FloatArray | None = None
+    step: int = 0
+    remainder: FloatArray | None = None
+    time_remainder: float = 0.0
+
+    def later(self, dt: float) -> tuple[float, float]:
+        """Time after `dt`, and what its rounding leaves over (Knuth's exact sum)."""
+        step = dt + self.time_remainder
+        time = self.time + step
+        part = time - self.time
+        return time, (self.time - (time - part)) + (step - part)
+
+    def reversed(self) -> State:
+        """The same point with opposite velocities."""
+        # Forces are dropped since they may depend on the velocities.
+        return replace(self, velocities=-self.velocities, forces=None)
+
+
+class System:
+    """Constraints, masses and applied forces.
+
+    Parameters
+    ----------
+    motion : Motion
+        The engine of the constraint set; also the source of the masses. A set without rows gives plain
+        unconstrained dynamics.
+    force : callable, optional
+        Applied forces, shape (n_atoms, 3): ``force(x, t)``, or ``force(x, v, t)`` if `velocity_dependent`.
+        None means no forces.
+    potential : callable, optional
+        Potential energy ``potential(x, t)``, for `total_energy`.
+    velocity_dependent : bool
+        Whether `force` takes the velocities too (friction, magnetic fields).
+
+    Raises
+    ------
+    InputError
+        An atom that is not held by FixedAtoms has a mass that is not positive.
+    """
+
+    def __init__(
+        self,
+        motion: Motion,
+        force: Callable[..., ArrayLike] | None = None,
+        *,
+        potential: Callable[[FloatArray, float], float] | None = None,
+        velocity_dependent: bool = False,
+    ) -> None:
+        self.motion = motion
+        self.force = force
+        self.potential = potential
+        self.velocity_dependent = velocity_dependent and force is not None
+        self.n_atoms = motion.n_atoms
+        self.masses: FloatArray = motion.masses
+        fixed = _fixed_atoms(motion)
+        bad = ~(np.isfinite(self.masses) & (self.masses > 0))
+        bad[fixed] = False
+        if bad.any():
+            atom = int(np.argmax(bad))
+            raise InputError(
+                f"atom {atom} has mass {self.masses[atom]:g}; atoms that move need positive mass "
+                "(hold it with FixedAtoms, or leave it out)",
+                item="masses",
+                atoms=[atom],
+            )
+        with np.errstate(divide="ignore"):
+            #: 1/m, shape (n_atoms, 1); 0 for fixed atoms.
+            self.inverse_masses: FloatArray = (1.0 / self.masses)[:, None]
+        self.inverse_masses[fixed] = 0.0
+
+    # -- states ---------------------------------------------------------------------------------
+
+    def initial_state(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike | None = None,
+        *,
+        time: float = 0.0,
+        project: bool = False,
+    ) -> State:
+        """Checked state to start from.
+
+        Parameters
+        ----------
+        positions, velocities : array_like, shape (n_atoms, 3)
+            Copied and cast to float64. Without velocities the slowest admissible ones are taken: zero
+            unless a constraint moves by itself.
+        time : float
+        project : bool
+            Whether to bring positions and velocities that violate the constraints onto them (nearest point
+            in the mass metric) instead of raising.
+
+        Notes
+        -----
+        At 1e6 from the origin a position is rounded to 1e-10; a step that puts this right again turns it into
+        velocity, 2e-9 of the energy in 1000 steps. Where all rows are independent of the origin, such states
+        therefore carry the remainder of their positions, and steps are made relative to one of the atoms.
+
+        Raises
+        ------
+        InputError
+            Wrong shapes, NaN or infinity; positions or velocities off the constraints while `project` is
+            False.
+        InfeasibleError
+            With `project`, if no solution can be reached.
+        OverdeterminedError
+            The rows leave no degree of freedom, and the velocities are not what they prescribe.
+        """
+        if not math.isfinite(time):
+            raise InputError(f"time is {time}", item="time")
+        x = self._array(positions, "positions")
+        given = velocities is not None
+        v = self._array(velocities, "velocities") if given else np.zeros_like(x)
+        motion, held = self.motion, self.motion.constraint_set
+        if held.n_rows == 0:
+            return State(x, v, time)
+        miss = np.abs(held.value(x, time))
+        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
+        if not np.all(miss <= allowed):
+            if not project:
+                row = int(np.argmax(miss / allowed))
+                raise InputError(
+                    f"initial positions are off row {held.row_name(row)} by {miss[row]:.6g}; "
+                    "pass project=True to bring them onto the constraints, or correct them",
+                    item="positions",
+                    atoms=held.row_atoms(row),
+                )
+            x = motion.restore_positions(x, time=time)
+        remainder = None
+        local = x
+        if self._is_far(x):
+            shift = x[self.anchor].copy()
+            local = motion.restore_positions(x - shift, time=time)
+            remainder = local - (x - shift)
+        tangent = motion.project_velocities(local, v, time=time)
+        away = np.abs(tangent - v)
+        if given and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+            if motion.degrees_of_freedom == 0:
+                raise OverdeterminedError(
+                    f"rank {motion.rank} leaves no degree of freedom, yet atoms move: hold fewer rows, "
+                    "or start without velocities",
+                    rows=range(held.n_rows),
+                )
+            if not project:
+                atom = int(np.argmax(away.max(axis=1)))
+                raise InputError(
+                    f"initial velocities violate the constraints: atom {atom} moves off them with "
+                    f"{away[atom].max():.6g}; pass project=True to remove that part (the nearest admissible "
+                    "velocities in the mass metric)",
+                    item="velocities",
+                    atoms=[atom],
+                )
+            v = tangent
+        elif not given:
+            v = tangent
+        return State(x, v, time, remainder=remainder)
+
+    def forces(self, x: FloatArray, v: FloatArray, time: float, step: int) -> FloatArray:
+        """Applied forces, checked, shape (n_atoms, 3); `step` is named if they are not finite."""
+        if self.force is None:
+            return np.zeros((self.n_atoms, 3))
+        raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
+        f = np.array(raw, dtype=np.float64, order="C")  # a copy: calculators like to reuse their array
+        if f.shape != (self.n_atoms, 3):
+            raise InputError(
+                f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
+                item="forces",
+            )
+        check_finite(f, "force", step)
+        return f
+
+    def with_forces(self, state: State) -> State:
+        """The state with its forces filled in."""
+        if state.forces is not None:
+            return state
+        return replace(state, forces=self.forces(state.positions, state.velocities, state.time, state.step))
+
+    # -- energies -------------------------------------------------------------------------------
+
+    def kinetic_energy(self, velocities: FloatArray) -> float:
+        """sum m v^2/2; fixed atoms do not count."""
+        moving = self.inverse_masses[:, 0] > 0
+        return 0.5 * float(np.dot(self.masses[moving], np.einsum("ij,ij->i", velocities, velocities)[moving]))
+
+    def total_energy(self, state: State) -> float:
+        """Kinetic plus potential energy; needs `potential` unless there are no forces."""
+        if self.potential is None and self.force is not None:
+            raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
+        energy = self.kinetic_energy(state.velocities)
+        if self.potential is not None:
+            energy += float(self.potential(state.positions, state.time))
+        return energy
+
+    # -- inner ----------------------------------------------------------------------------------
+
+    @cached_property
+    def drift(self) -> Drift:
+        """Constrained flight by one RATTLE step."""
+        return rattle_drift(self.motion, self.inverse_masses)
+
+    @cached_property
+    def great_circles(self) -> GreatCircles | None:
+        """Exact constrained flight; None unless every row keeps one atom on a resting sphere (or at rest)."""
+        return GreatCircles.of(self.motion)
+
+    @cached_property
+    def anchor(self) -> int:
+        """The atom that positions are taken relative to where they are far away."""
+        return int(self.motion.constraint_set.incidence.indices[0])
+
+    def _is_far(self, x: FloatArray) -> bool:
+        held = self.motion.constraint_set
+        if held.n_rows == 0 or not all(c.translation_invariant for c in held.constraints):
+            return False
+        near = x[np.unique(held.incidence.indices)]
+        return bool(np.abs(near).max() > FAR * np.abs(near - x[self.anchor]).max())
+
+    def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
+        try:
+            array = np.array(values, dtype=np.float64, order="C")
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+        if array.shape != (self.n_atoms, 3):
+            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
+        bad = ~np.isfinite(array).all(axis=1)
+        if bad.any():
+            atom = int(np.argmax(bad))
+            raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
+        return array
+
+
+def _fixed_atoms(motion: Motion) -> IntArray:
+    held = [c.atoms.ravel() for c in motion.constraint_set.constraints if c.family == "FixedAtoms"]
+    return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
+
+
+def check_finite(values: FloatArray, item: str, step: int) -> None:
+    """Raise `NonFiniteError` unless every number is finite."""
+    flat = values.ravel()
+    # The sum of squares is finite unless something is wrong or enormous; only then look at each number.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if math.isfinite(np.dot(flat, flat)):
+            return
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise NonFiniteError(
+            f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
+            "check the geometry and the force function there, or use a smaller time step",
+            item=item,
+            atom=atom,
+            step=step,
+        )
