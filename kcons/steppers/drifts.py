@@ -19,6 +19,7 @@ from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
+from kcons.steppers.summation import Point, fly
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
@@ -27,10 +28,10 @@ _EPS = float(np.finfo(float).eps)
 class Drift(Protocol):
     """Constrained flight over one interval."""
 
-    def move(self, x: FloatArray, v: FloatArray, out: FloatArray, start: float, end: float, h: float) -> None:
-        """Fly from `x` at time `start` to `out` at time `end` = start + h.
+    def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
+        """Fly from time `start` to `end` = start + h; the new positions are put into `out`, which becomes point.x.
 
-        `v` is changed in place, `x` is not. After an error the contents of `v` and `out` mean nothing.
+        After an error the contents of `point` and `out` mean nothing, but for point.x.
         """
         ...
 
@@ -41,10 +42,12 @@ class FreeFlight:
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
 
-    def move(self, x: FloatArray, v: FloatArray, out: FloatArray, start: float, end: float, h: float) -> None:
-        np.multiply(v, h, out=out)
-        out += x
-        self.motion.project_positions(out, x, time=end, reference_time=start, velocities=v, dt=h, out=out)
+    def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
+        fly(point.x, point.x_low, point.v, point.v_low, point.push, h, out)
+        self.motion.project_positions(
+            out, point.x, time=end, reference_time=start, velocities=point.push, dt=h, out=out
+        )
+        point.x = out
 
 
 class NonholonomicFlight:
@@ -60,7 +63,7 @@ class NonholonomicFlight:
     """
 
     def __init__(self, motion: Motion, inverse_masses: FloatArray) -> None:
-        self.flight = FreeFlight(motion)
+        self.motion = motion
         whole = self.whole = motion.constraint_set
         links = whole.incidence @ whole.incidence.T
         labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
@@ -70,7 +73,9 @@ class NonholonomicFlight:
         self.is_velocity: NDArray[np.bool_] = ~self.held.holonomic
         self.weights: FloatArray = np.repeat(inverse_masses[self.atoms, 0], 3)
 
-    def move(self, x: FloatArray, v: FloatArray, out: FloatArray, start: float, end: float, h: float) -> None:
+    def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
+        point.settle()
+        x, v = point.x, point.v
         x0, middle = x[self.atoms], start + 0.5 * h
         coefficients = self.held.jacobian(x0, start).toarray()
         spread = coefficients * self.weights
@@ -85,7 +90,9 @@ class NonholonomicFlight:
         for _ in range(_MAX_ITERATIONS):
             np.copyto(v, kicked)
             v[self.atoms] += (impulses @ push).reshape(-1, 3)
-            self.flight.move(x, v, out, start, end, h)
+            np.multiply(v, h, out=out)
+            out += x
+            self.motion.project_positions(out, x, time=end, reference_time=start, velocities=v, dt=h, out=out)
             between = 0.5 * (x0 + out[self.atoms])
             rows = self.held.jacobian(between, middle).toarray()[self.is_velocity]
             wanted = self.held.velocity_target(between, middle)[self.is_velocity]
@@ -94,6 +101,7 @@ class NonholonomicFlight:
             speed = max(float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
             last, error = error, float(np.abs(miss).max())
             if error <= 4 * _EPS * speed or (error >= last and error <= 1e-13 * speed):
+                point.x = out
                 return
             impulses -= respond @ miss
         worst = int(self.rows[self.is_velocity][np.argmax(np.abs(miss))])
@@ -152,19 +160,28 @@ class GreatCircles:
             return None
         return cls(held, np.concatenate(centers), np.concatenate(radii), still)
 
-    def move(self, x: FloatArray, v: FloatArray, out: FloatArray, start: float, end: float, h: float) -> None:
-        np.multiply(v, h, out=out)
-        out += x
+    def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
+        x, low, atoms = point.x, point.x_low[self.atoms], self.atoms
+        fly(x, point.x_low, point.v, point.v_low, point.push, h, out)
         out[self.resting] = x[self.resting]
-        n = x[self.atoms] - self.centers
-        n /= np.sqrt(np.einsum("ij,ij->i", n, n))[:, None]
-        u = v[self.atoms]
-        u -= np.einsum("ij,ij->i", n, u)[:, None] * n
-        angle = np.sqrt(np.einsum("ij,ij->i", u, u))[:, None] * (h / self.radii)
-        cosine = np.cos(angle)
-        # sin(w h)/w, also for atoms at rest
+        point.x_low[self.resting] = 0.0
+        d = (x[atoms] - self.centers) + low
+        n = d / _length(d)
+        u = point.v[atoms]
+        outward = np.einsum("ij,ij->i", n, u)[:, None] * n
+        u -= outward
+        speed = _length(u)
+        angle = speed * (h / self.radii)
+        # sin(angle)/speed and cos(angle) - 1, also for atoms at rest.
         sine = (h / self.radii) * np.sinc(angle / np.pi)
-        turned = n * cosine + u * sine
-        out[self.atoms] = self.centers + self.radii * turned
-        speed2 = np.einsum("ij,ij->i", u, u)[:, None]
-        v[self.atoms] = u * cosine - n * (speed2 * sine)
+        half = (0.5 * h / self.radii) * np.sinc(angle / (2 * np.pi))
+        less = -2 * (speed * half) ** 2
+        change = low + ((self.radii * n - d) + self.radii * (n * less + u * sine))
+        out[atoms] = there = x[atoms] + change
+        point.x_low[atoms] = (x[atoms] - there) + change
+        point.push[atoms] = u * less - n * (speed**2 * sine) - outward
+        point.x = out
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))[:, None]

@@ -17,6 +17,7 @@ from kcons.errors import ConvergenceError, InputError
 from kcons.steppers.drifts import Drift
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
+from kcons.steppers.summation import Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
@@ -126,13 +127,12 @@ class _Step:
         self.flight: Drift = system.drift if circles is None else circles
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
-        if start.remainder is None:
-            self.x = start.positions
-        else:
-            self.shift = start.positions[system.anchor]
-            self.x = (start.positions - self.shift) + start.remainder
-        self.v = start.velocities.copy()
-        self.out = self.x
+        x = start.positions
+        if start.remainder is not None:
+            self.shift = x[system.anchor]
+            x = (x - self.shift) + start.remainder
+        self.point = Point.at(x, start.velocities)
+        self.out = x
         self.forces = start.forces
         self.now = start.time
 
@@ -173,44 +173,43 @@ class _Step:
         assert self.forces is not None
         change = self.forces * self.system.inverse_masses
         change *= fraction * self.dt
-        change += self.v
-        self.v = change
+        self.point.push += change
 
     def drift(self, stage: list[Piece]) -> None:
-        start, dt = self.start, self.dt
-        first, spare = self.x, None
+        start, dt, point = self.start, self.dt, self.point
+        first, spare = point.x, None
         for fraction, end in stage:
             # Positions that the force function has seen are never written to again.
-            before, self.out = self.x, np.empty_like(first) if spare is None else spare
+            before, self.out = point.x, np.empty_like(first) if spare is None else spare
             then = self.now
             self.now = self.time if end == 1.0 else start.time + (end * dt + start.time_remainder)
-            self.flight.move(before, self.v, self.out, then, self.now, fraction * dt)
+            self.flight.move(point, self.out, then, self.now, fraction * dt)
             spare = None if before is first else before
-            self.x = self.out
 
     def evaluate(self) -> None:
         """Forces where the step is now."""
         if self.system.force is None:
             return
-        check_finite(self.x, "position", self.number)
-        self.forces = self.system.forces(self.positions, self.v, self.now, self.number)
+        check_finite(self.point.x, "position", self.number)
+        self.forces = self.system.forces(self.positions, self.point.v, self.now, self.number)
 
     def settle(self, fraction: float) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""
-        system, positions, now = self.system, self.positions, self.now
+        system, positions, now, point = self.system, self.positions, self.now, self.point
         check_finite(positions, "position", self.number)
         half_kick = (fraction * self.dt) * system.inverse_masses
-        project = system.motion.project_velocities
-        v = project(self.x, self.v + half_kick * system.forces(positions, self.v, now, self.number), time=now)
-        change = math.inf
+        point.settle()
+        drifted = point.v
+        v, change = drifted, math.inf
         for _ in range(_MAX_ITERATIONS):
             forces = system.forces(positions, v, now, self.number)
-            following = project(self.x, self.v + half_kick * forces, time=now)
+            following = system.motion.project_velocities(point.x, drifted + half_kick * forces, time=now)
             last, change = change, float(np.abs(following - v).max(initial=0.0))
             speed = float(np.abs(following).max(initial=0.0))
             v = following
             if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
-                self.v, self.forces = v, system.forces(positions, v, now, self.number)
+                # A copy: the force function may keep the velocities it was given.
+                point.v, self.forces = v.copy(), system.forces(positions, v, now, self.number)
                 return
         raise ConvergenceError(
             f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
@@ -221,25 +220,29 @@ class _Step:
         )
 
     def project(self) -> None:
-        check_finite(self.x, "position", self.number)
-        self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        point = self.point
+        point.settle()
+        check_finite(point.x, "position", self.number)
+        self.system.motion.project_velocities(point.x, point.v, time=self.now, out=point.v)
 
     # -- the end --------------------------------------------------------------------------------
 
     @property
     def positions(self) -> FloatArray:
         """Where the atoms are, for the force function."""
-        return self.x if self.shift is None else self.x + self.shift
+        return self.point.x if self.shift is None else self.point.x + self.shift
 
     def end(self) -> State:
-        check_finite(self.v, "velocity", self.number)
-        positions, remainder = self.x, None
+        x, v = self.point.x, self.point.v
+        check_finite(v, "velocity", self.number)
+        positions, remainder = x, None
         if self.shift is not None:
-            positions = self.x + self.shift
-            remainder = self.x - (positions - self.shift)
-        return State(positions, self.v, self.time, self.forces, self.number, remainder, self.time_remainder)
+            positions = x + self.shift
+            remainder = x - (positions - self.shift)
+        return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
 
     def refuse_overflow(self) -> None:
         """Name overflow as what it is, where the engine met it first."""
-        for array, item in ((self.v, "velocity"), (self.x, "position"), (self.out, "position")):
+        point = self.point
+        for array, item in ((point.v, "velocity"), (point.push, "velocity"), (self.out, "position")):
             check_finite(array, item, self.number)
