@@ -19,7 +19,7 @@ from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
-from kcons.steppers.summation import Point, fly
+from kcons.steppers.summation import Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
@@ -43,10 +43,8 @@ class FreeFlight:
         self.motion = motion
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        fly(point.x, point.x_low, point.v, point.v_low, point.push, h, out)
-        self.motion.project_positions(
-            out, point.x, time=end, reference_time=start, velocities=point.push, dt=h, out=out
-        )
+        v = point.fly(h, out)
+        self.motion.project_positions(out, point.x, time=end, reference_time=start, velocities=v, dt=h, out=out)
         point.x = out
 
 
@@ -74,7 +72,7 @@ class NonholonomicFlight:
         self.weights: FloatArray = np.repeat(inverse_masses[self.atoms, 0], 3)
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        point.settle()
+        point.land()
         x, v = point.x, point.v
         x0, middle = x[self.atoms], start + 0.5 * h
         coefficients = self.held.jacobian(x0, start).toarray()
@@ -161,10 +159,12 @@ class GreatCircles:
         return cls(held, np.concatenate(centers), np.concatenate(radii), still)
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        x, low, atoms = point.x, point.x_low[self.atoms], self.atoms
-        fly(x, point.x_low, point.v, point.v_low, point.push, h, out)
+        x, atoms, x_low = point.x, self.atoms, point.x_low
+        assert x_low is not None
+        low = x_low[atoms]
+        push = point.fly(h, out)
         out[self.resting] = x[self.resting]
-        point.x_low[self.resting] = 0.0
+        x_low[self.resting] = 0.0
         d = (x[atoms] - self.centers) + low
         n = d / _length(d)
         u = point.v[atoms]
@@ -178,8 +178,8 @@ class GreatCircles:
         less = -2 * (speed * half) ** 2
         change = low + ((self.radii * n - d) + self.radii * (n * less + u * sine))
         out[atoms] = there = x[atoms] + change
-        point.x_low[atoms] = (x[atoms] - there) + change
-        point.push[atoms] = u * less - n * (speed**2 * sine) - outward
+        x_low[atoms] = (x[atoms] - there) + change
+        push[atoms] = u * less - n * (speed**2 * sine) - outward
         point.x = out
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.steppers.drifts import Drift
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
@@ -86,7 +86,7 @@ class Splitting:
             return still
         start = system.with_forces(state) if self.kick_first else state
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            step = _Step(system, start, dt, self.exact_flight)
+            step = _Step(system, start, dt, len(self._pieces) * len(self.flight) > 1, self.exact_flight)
             pieces = self._whole_pieces if step.exact else self._pieces
             try:
                 if system.velocity_dependent:
@@ -97,7 +97,7 @@ class Splitting:
                     step.drift_first(self.kicks, pieces)
             except ConvergenceError as error:
                 raise explained(error, system, state, dt, step.number) from error
-            except InputError:
+            except (InputError, NonFiniteError):
                 step.refuse_overflow()
                 raise
             return step.end()
@@ -118,7 +118,7 @@ def _pieces(drifts: Sequence[float], flight: Sequence[float]) -> list[list[Piece
 class _Step:
     """The arrays of one step on its way."""
 
-    def __init__(self, system: System, start: State, dt: float, exact_flight: bool) -> None:
+    def __init__(self, system: System, start: State, dt: float, many: bool, exact_flight: bool) -> None:
         self.system, self.start, self.dt = system, start, dt
         self.number = start.step + 1
         self.time, self.time_remainder = start.later(dt)
@@ -131,7 +131,7 @@ class _Step:
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
-        self.point = Point.at(x, start.velocities)
+        self.point = Point(x, start.velocities, system.weights, exact=many or self.exact)
         self.out = x
         self.forces = start.forces
         self.now = start.time
@@ -171,9 +171,7 @@ class _Step:
         if self.system.force is None:
             return
         assert self.forces is not None
-        change = self.forces * self.system.inverse_masses
-        change *= fraction * self.dt
-        self.point.push += change
+        self.point.kick(fraction * self.dt, self.forces)
 
     def drift(self, stage: list[Piece]) -> None:
         start, dt, point = self.start, self.dt, self.point
@@ -190,15 +188,13 @@ class _Step:
         """Forces where the step is now."""
         if self.system.force is None:
             return
-        check_finite(self.point.x, "position", self.number)
         self.forces = self.system.forces(self.positions, self.point.v, self.now, self.number)
 
     def settle(self, fraction: float) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""
         system, positions, now, point = self.system, self.positions, self.now, self.point
-        check_finite(positions, "position", self.number)
         half_kick = (fraction * self.dt) * system.inverse_masses
-        point.settle()
+        point.land()
         drifted = point.v
         v, change = drifted, math.inf
         for _ in range(_MAX_ITERATIONS):
@@ -208,8 +204,8 @@ class _Step:
             speed = float(np.abs(following).max(initial=0.0))
             v = following
             if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
-                # A copy: the force function may keep the velocities it was given.
-                point.v, self.forces = v.copy(), system.forces(positions, v, now, self.number)
+                self.forces = system.forces(positions, v, now, self.number)
+                point.restart(v)
                 return
         raise ConvergenceError(
             f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
@@ -221,7 +217,7 @@ class _Step:
 
     def project(self) -> None:
         point = self.point
-        point.settle()
+        point.land()
         check_finite(point.x, "position", self.number)
         self.system.motion.project_velocities(point.x, point.v, time=self.now, out=point.v)
 
@@ -244,5 +240,5 @@ class _Step:
     def refuse_overflow(self) -> None:
         """Name overflow as what it is, where the engine met it first."""
         point = self.point
-        for array, item in ((point.v, "velocity"), (point.push, "velocity"), (self.out, "position")):
+        for array, item in ((self.out, "position"), (point.v, "velocity"), (point.push, "velocity")):
             check_finite(array, item, self.number)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -117,6 +118,8 @@ class System:
             #: 1/m, shape (n_atoms, 1); 0 for fixed atoms.
             self.inverse_masses: FloatArray = (1.0 / self.masses)[:, None]
         self.inverse_masses[fixed] = 0.0
+        #: The same for each coordinate, shape (n_atoms, 3).
+        self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
 
     # -- states ---------------------------------------------------------------------------------
 
@@ -286,18 +289,21 @@ def _fixed_atoms(motion: Motion) -> IntArray:
 
 def check_finite(values: FloatArray, item: str, step: int) -> None:
     """Raise `NonFiniteError` unless every number is finite."""
-    flat = values.ravel()
-    # The sum of squares is finite unless something is wrong or enormous; only then look at each number.
-    with np.errstate(over="ignore", invalid="ignore"):
-        if math.isfinite(np.dot(flat, flat)):
-            return
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        atom = int(np.argmax(bad))
-        raise NonFiniteError(
-            f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
-            "check the geometry and the force function there, or use a smaller time step",
-            item=item,
-            atom=atom,
-            step=step,
-        )
+    if _all_finite(values):
+        return
+    atom = int(np.argmax(~np.isfinite(values).all(axis=1)))
+    raise NonFiniteError(
+        f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
+        "check the geometry and the force function there, or use a smaller time step",
+        item=item,
+        atom=atom,
+        step=step,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_finite(values):  # type: ignore[no-untyped-def]
+    finite = True
+    for x in values.ravel():
+        finite &= abs(x) <= 1.7976931348623157e308
+    return finite
