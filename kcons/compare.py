@@ -321,7 +321,7 @@ def _measure(
     x, v = run.positions, run.velocities
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
         return Measurement(status="failed", note="positions are not finite", **common)
-    sigma, tangency = scene.residuals(x, v)
+    sigma, tangency = scene.residuals(x, v, run.time)
     slope, slope_error = _energy_slope(scene, log)
     return Measurement(
         status=status,

@@ -34,6 +34,23 @@ SCENES: Mapping[str, Entry] = {
     "sphere": Entry("sphere", "free particles on spheres; closed form", 10, 2, "particles"),
     "sphere-pendulum": Entry("sphere", "spherical pendulums", 10, 2, "particles", {"gravity": 1.0}),
     "ethanol": Entry("molecule", "ethanol, all bonds and angles, GFN2-xTB forces", 1, 1, "molecule"),
+    "butane": Entry("butane", "four-atom chain, bonds and angles held, free torsion", 1, 1, "molecule"),
+    "dumbbells": Entry("dumbbells", "collision of two rigid dumbbells; a periodic box from 8 on", 2, 2, "dumbbells"),
+    "rotor": Entry("rotor", "asymmetric top of 4 atoms; Euler's equations", 1, 1, "body"),
+    "tennis-racket": Entry("rotor", "the same, about its middle axis", 1, 1, "body", {"start": "tennis-racket"}),
+    "pendulum": Entry("pendulums", "planar pendulum from 179.9°; closed form", 1, 1, "pendulum"),
+    "double-pendulum": Entry(
+        "pendulums", "planar double pendulum", 1, 1, "pendulum", {"kind": "double-pendulum"}
+    ),
+    "triple-pendulum": Entry(
+        "pendulums", "planar triple pendulum", 1, 1, "pendulum", {"kind": "triple-pendulum"}
+    ),
+    "bead-ellipse": Entry("bead", "bead on a vertical ellipse", 1, 1, "bead"),
+    "bead-rotating": Entry(
+        "bead", "the same while the ellipse turns: a constraint that moves", 1, 1, "bead", {"on": "rotating-ellipse"}
+    ),
+    "bead-torus": Entry("bead", "free bead on a torus", 1, 1, "bead", {"on": "torus"}),
+    "slab": Entry("slab", "rigid CO on Cu(111), lower layers fixed, EMT forces", 1, 1, "molecules"),
 }
 
 

@@ -37,6 +37,8 @@ class Units:
 ASE_UNITS = Units("Å", "eV", "fs", units.fs, "ps", 1000 * units.fs)
 #: Radius, m v0² and R/v0 of the scenes that have no unit of their own.
 REDUCED = Units("R", "ε", "τ", 1.0, "τ", 1.0)
+#: For scenes that are given by bare numbers.
+BARE = Units("length", "energy", "τ", 1.0, "τ", 1.0)
 
 #: Progress: called with (steps done, steps in all).
 Progress = Callable[[int, int], None]
@@ -87,12 +89,15 @@ class Scene:
         With `angle_bonds`, the same as bonds and angles.
     angle_bonds : ndarray of int, shape (n, 2), or None
         The bonds that go with `angles`; None takes `bonds`.
+    fixed : ndarray of int, shape (n,)
+        Atoms that the constraint set holds by FixedAtoms; hosts that hold `bonds` fix them in their own way.
     refusals : mapping
         Method name -> why it cannot run this scene.
     solution : callable, optional
         The reference at a given time, in closed form or by an independent integrator; without it the scene is
         converged by RATTLE at `reference_step` with extrapolation.
     reference_step : float
+    cell : ndarray, shape (3,) or (3, 3), or None
     """
 
     name: str
@@ -109,6 +114,7 @@ class Scene:
     bonds: IntArray | None = None
     angles: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
     angle_bonds: IntArray | None = None
+    fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     refusals: Mapping[str, str] = field(default_factory=dict)
     solution: Callable[[float], Reference] | None = None
     reference_step: float = 0.0
@@ -181,9 +187,9 @@ class Scene:
         """Root-mean-square distance an atom."""
         return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
 
-    def residuals(self, x: FloatArray, v: FloatArray) -> tuple[float, float]:
+    def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:
         """max |sigma| in natural units, and max |A v - c| / v_rms with rows scaled to unit norm."""
-        report = self.motion.report(x, v, condition=False)
+        report = self.motion.report(x, v, time, condition=False)
         speed = float(np.sqrt(np.mean(v**2)))
         return report.residual, report.velocity_residual / speed if speed > 0 else report.velocity_residual
 
