@@ -60,8 +60,13 @@ def _parser() -> argparse.ArgumentParser:
         help="how much error each method makes, for how much time",
         description="Run a scene through several methods; table, plot and JSON of error against cost.",
     )
-    compare.add_argument("--dt", type=_numbers, help="time steps, comma separated, in the unit the scene shows")
-    compare.add_argument("--methods", type=_names, help="methods, comma separated (default: all)")
+    compare.add_argument(
+        "--dt",
+        type=_numbers,
+        help="time steps, comma separated, in the unit the scene shows; "
+        "steppers with several force evaluations a step take longer ones at the same cost",
+    )
+    compare.add_argument("--methods", type=_names, help="methods, comma separated, or all (default: the usual ones)")
     compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
@@ -180,7 +185,7 @@ def _list() -> int:
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
     print("methods")
     for name, method in methods.METHODS.items():
-        print(f"  {name:<16} {method.title}")
+        print(f"  {name:<16} {method.title}{'' if method.usual else ' (only when named)'}")
     return 0
 
 

@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.methods import Method, Run, chosen
 from kcons.scenes import Reference, Scene
 from kcons.steppers import Rattle, State, System
@@ -160,7 +160,7 @@ def compare(
     ----------
     scene : Scene
     methods : iterable of str, optional
-        Names out of `kcons.methods.METHODS`; all by default.
+        Names out of `kcons.methods.METHODS`, or 'all' alone; the usual ones by default.
     budget : float
         Seconds for each method over all its time steps. One that is predicted to exceed it is stopped
         after a step, which is reported as such.
@@ -261,6 +261,8 @@ def _all_settings(
         watcher.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
         found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher, common))
         watcher.end()
+        if found[-1].status == "not run":  # it cannot run this scene at any step
+            break
         if found[-1].status == "partial":
             given_up = found[-1]
             if given_up.step_seconds is None:  # not one step was done: no use in trying shorter ones
@@ -309,6 +311,8 @@ def _measure(
     except _OverBudgetError:
         status = "partial"
         note = f"step {len(log.seconds) + 1} was not done after {duration(perf_counter() - begun)}"
+    except UnsupportedError as error:
+        return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
     except Exception as error:  # whatever a peer raises is a result, and is shown
         status = "failed"
         first = (str(error).strip().splitlines() or [""])[0]
@@ -344,7 +348,7 @@ def _run_to_horizon(
     def write_down() -> None:
         v = run.velocities
         log.times.append(run.time)
-        log.energies.append(potential.energy(run.positions) + 0.5 * float(np.sum(masses * v * v)))
+        log.energies.append(potential.watched_energy(run.positions) + 0.5 * float(np.sum(masses * v * v)))
 
     write_down()
     while not run.finished:

@@ -6,19 +6,21 @@ knows how much of its time went into constraints.
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from ase import Atoms
-from ase.constraints import FixBondLengths, FixInternals
+from ase.constraints import FixAtoms, FixBondLengths, FixInternals
 from ase.md.verlet import VelocityVerlet
 from scipy.integrate import DOP853
 from scipy.linalg import qr
 
+from kcons import steppers
 from kcons.ase import Constraints
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
@@ -26,7 +28,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.motion import Motion
 from kcons.scenes import Scene
-from kcons.steppers import Rattle, State, System
+from kcons.steppers import Rattle, State, Stepper, System
 
 
 class Stopwatch:
@@ -57,8 +59,19 @@ class Stopwatch:
         return timed
 
 
+#: The steppers that run unless methods are named: the plain one, and of each order a composition and a splitting.
+USUAL_STEPPERS = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
+
 #: What the engine is asked for in the course of a step.
-ENGINE_CALLS = ("project_positions", "project_velocities", "project_forces", "acceleration")
+ENGINE_CALLS = (
+    "project_positions",
+    "project_velocities",
+    "project_forces",
+    "restore_positions",
+    "acceleration",
+    "multipliers",
+    "constraint_force",
+)
 #: ASE's hooks.
 ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribute_forces_md")
 
@@ -105,12 +118,15 @@ class Method(ABC):
         again and again, since with nothing held the system would soon fly apart.
     adaptive : bool
         Whether its setting is a tolerance instead of a time step.
+    usual : bool
+        Whether it runs unless methods are named.
     """
 
     name: str
     title: str
     holds: bool = True
     adaptive: bool = False
+    usual: bool = True
 
     def refuses(self, scene: Scene) -> str | None:
         """Why this method cannot run the scene, or None."""
@@ -129,11 +145,11 @@ class Method(ABC):
 
 
 class _CoreRun(Run):
-    def __init__(self, scene: Scene, motion: Motion, dt: float) -> None:
+    def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
         super().__init__()
         self.constraints.watch(motion, ENGINE_CALLS)
         self._system = System(motion, scene.potential.forces)
-        self._stepper = Rattle()
+        self._stepper = stepper
         self._start = self._system.with_forces(State(scene.positions, scene.velocities))
         self._state = self._start
         self._potential = scene.potential
@@ -164,34 +180,67 @@ class _CoreRun(Run):
         return self._state.velocities
 
 
-class CoreRattle(Method):
-    """`kcons.steppers.Rattle`, arrays in and arrays out."""
+@dataclass(frozen=True)
+class CoreStepper(Method):
+    """A stepper of `kcons.steppers`, arrays in and arrays out.
+
+    A stepper with s force evaluations a step takes steps s times as long as RATTLE, so that all cost about the same.
+    """
+
+    stepper: Stepper = field(default_factory=Rattle)
+
+    def settings(self, scene: Scene) -> tuple[float, ...]:
+        steps = scene.time_steps
+        first = scene.horizon / steps[0] / self.stepper.force_evaluations
+        if self.stepper.force_evaluations > 1:
+            first = max(2.0, first)
+        counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
+        return tuple(scene.horizon / count for count in counts)
 
     def start(self, scene: Scene, setting: float) -> Run:
-        motion = Motion(scene.constraint_set, scene.positions)
-        return _CoreRun(scene, motion, setting)
+        return _CoreRun(scene, Motion(scene.constraint_set, scene.positions), self.stepper, setting)
 
 
 class CoreVerlet(Method):
-    """The same stepper with nothing held: what a step costs before any constraint."""
+    """RATTLE with nothing held: what a step costs before any constraint."""
 
     def start(self, scene: Scene, setting: float) -> Run:
         nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
-        return _CoreRun(scene, nothing, setting)
+        return _CoreRun(scene, nothing, Rattle(), setting)
+
+
+def of_steppers(found: Any) -> list[CoreStepper]:
+    """A method for each stepper of a registry, RATTLE first.
+
+    Parameters
+    ----------
+    found : mapping of name to stepper, or iterable of steppers
+        Objects, or classes that take no arguments. Without a name, that of the class is taken: KahanLi6 is
+        `kahan-li6`.
+    """
+    named = found.items() if isinstance(found, Mapping) else ((None, item) for item in found)
+    methods = {"rattle": CoreStepper("rattle", "kcons RATTLE")}
+    for given, item in named:
+        stepper: Stepper = item() if isinstance(item, type) else item
+        kind = type(stepper).__name__
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", str(given or kind)).lower()
+        if name not in methods:
+            methods[name] = CoreStepper(name, f"kcons {kind}", usual=name in USUAL_STEPPERS, stepper=stepper)
+    return list(methods.values())
 
 
 # -- ASE --------------------------------------------------------------------------------------------
 
 
 class _AseRun(Run):
-    def __init__(self, scene: Scene, dt: float, constraint: Any | None) -> None:
+    def __init__(self, scene: Scene, dt: float, *constraints: Any) -> None:
         super().__init__()
         self._scene = scene
         self._atoms = scene.atoms()
-        if constraint is not None:
-            self._atoms.set_constraint(constraint)
-            # set_constraint keeps the object itself, so that its hooks can be timed.
-            self.constraints.watch(self._atoms.constraints[0], ASE_HOOKS)
+        self._atoms.set_constraint(constraints)
+        # set_constraint keeps the objects themselves, so that their hooks can be timed.
+        for item in self._atoms.constraints:
+            self.constraints.watch(item, ASE_HOOKS)
         self._dynamics = VelocityVerlet(self._atoms, timestep=dt)
         self._dt = dt
         self._done = 0
@@ -233,7 +282,7 @@ class AseVerlet(Method):
     """ASE's VelocityVerlet with nothing held."""
 
     def start(self, scene: Scene, setting: float) -> Run:
-        return _AseRun(scene, setting, None)
+        return _AseRun(scene, setting)
 
 
 class AseBonds(Method):
@@ -245,7 +294,7 @@ class AseBonds(Method):
     def start(self, scene: Scene, setting: float) -> Run:
         assert scene.bonds is not None
         lengths = _distances(scene.atoms(), scene.bonds)
-        return _AseRun(scene, setting, FixBondLengths(scene.bonds, bondlengths=lengths))
+        return _AseRun(scene, setting, *_fixed(scene), FixBondLengths(scene.bonds, bondlengths=lengths))
 
 
 class AseInternals(Method):
@@ -261,7 +310,11 @@ class AseInternals(Method):
         lengths = _distances(atoms, bonds)
         pairs = [[float(d), [int(i), int(j)]] for d, (i, j) in zip(lengths, bonds, strict=True)]
         triples = [[float(atoms.get_angle(*t)), [int(a) for a in t]] for t in scene.angles]
-        return _AseRun(scene, setting, FixInternals(bonds=pairs, angles_deg=triples or None))
+        return _AseRun(scene, setting, *_fixed(scene), FixInternals(bonds=pairs, angles_deg=triples or None))
+
+
+def _fixed(scene: Scene) -> list[FixAtoms]:
+    return [FixAtoms(scene.fixed)] if len(scene.fixed) else []
 
 
 def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
@@ -335,7 +388,7 @@ class ProjectedOde(Method):
 METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
-        CoreRattle("rattle", "kcons RATTLE"),
+        *of_steppers(getattr(steppers, "STEPPERS", ())),
         AseKcons("ase-kcons", "ASE Verlet + kcons"),
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals"),
@@ -347,7 +400,7 @@ METHODS: Mapping[str, Method] = {
 
 
 def chosen(names: Iterable[str] | None = None) -> list[Method]:
-    """Methods by name, all of them by default.
+    """Methods by name, the usual ones by default; the name 'all' stands for all.
 
     Raises
     ------
@@ -355,9 +408,12 @@ def chosen(names: Iterable[str] | None = None) -> list[Method]:
         Unknown name.
     """
     if names is None:
+        return [method for method in METHODS.values() if method.usual]
+    wanted = list(names)
+    if wanted == ["all"]:
         return list(METHODS.values())
     picked = []
-    for name in names:
+    for name in wanted:
         if name not in METHODS:
             raise InputError(f"there is no method {name!r}; there are {', '.join(METHODS)}", item="methods")
         picked.append(METHODS[name])

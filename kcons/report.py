@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from kcons.compare import Comparison, Measurement, duration
+from kcons.methods import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +28,28 @@ STYLES: dict[str, tuple[str, str | int]] = {
     "verlet": ("#333333", 6),
     "ase-verlet": ("#999999", 6),
 }
+
+#: For methods that have no style of their own, in their order.
+SPARE: tuple[tuple[str, str | int], ...] = (
+    ("#E69F00", "P"),
+    ("#A6761D", "X"),
+    ("#7570B3", "*"),
+    ("#E7298A", "p"),
+    ("#66A61E", "h"),
+    ("#1B9E77", "<"),
+    ("#666666", ">"),
+    ("#882255", "d"),
+    ("#332288", "H"),
+)
+
+
+def style(name: str) -> tuple[str, str | int]:
+    """Colour and marker of a method."""
+    if name in STYLES:
+        return STYLES[name]
+    others = [other for other in METHODS if other not in STYLES]
+    return SPARE[others.index(name) % len(SPARE)] if name in others else ("black", "x")
+
 
 EXPLANATION = (
     "error: root-mean-square distance an atom from the reference at t = {horizon:g} {time}; reference: {how}{good}.",
@@ -148,7 +171,7 @@ def plot(comparison: Comparison, path: Path) -> None:
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, cost in ((left, "evaluations_per_time"), (right, "seconds_per_time")):
         for name in dict.fromkeys(m.method for m in comparison.measurements):
-            colour, marker = STYLES.get(name, ("black", "x"))
+            colour, marker = style(name)
             done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and getattr(m, cost)]
             if done:
                 axes.plot(
@@ -200,7 +223,7 @@ def plot(comparison: Comparison, path: Path) -> None:
 def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
     """Floors: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line."""
     for name in dict.fromkeys(m.method for m in comparison.measurements):
-        colour, marker = STYLES.get(name, ("black", "x"))
+        colour, marker = style(name)
         floors = [m for m in comparison.of(name, "floor") if m.seconds_per_time]
         if floors:
             axes.plot(

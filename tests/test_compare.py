@@ -29,7 +29,8 @@ def spheres():
 
 
 def test_all_methods_are_there(result):
-    assert list(dict.fromkeys(m.method for m in result.measurements)) == list(methods.METHODS)
+    usual = [name for name, method in methods.METHODS.items() if method.usual]
+    assert list(dict.fromkeys(m.method for m in result.measurements)) == usual
     assert {m.status for m in result.measurements} == {"ok", "floor"}
 
 
@@ -131,7 +132,7 @@ def test_energy_slope_is_the_fit():
 # -- budget and failures ----------------------------------------------------------------------------
 
 
-class Slow(methods.CoreRattle):
+class Slow(methods.CoreStepper):
     """A peer whose every step takes a while."""
 
     pause = 0.6
@@ -148,7 +149,7 @@ class Slow(methods.CoreRattle):
         return started
 
 
-class Broken(methods.CoreRattle):
+class Broken(methods.CoreStepper):
     def start(self, scene, setting):
         raise ConvergenceError("did not converge, as an example\nwith more lines")
 
@@ -188,7 +189,7 @@ def test_failure_of_a_method_is_a_result(monkeypatch, chain):
 
 
 def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
-    class Runaway(methods.CoreRattle):
+    class Runaway(methods.CoreStepper):
         def start(self, scene, setting):
             started = super().start(scene, setting)
             advance = started.advance
@@ -216,6 +217,48 @@ def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
 def test_bad_arguments(chain, options, text):
     with pytest.raises(InputError, match=text):
         compare.compare(chain, **options)
+
+
+# -- every small scene ------------------------------------------------------------------------------
+
+PIVOT, SURFACE, TIME = "the pivot is a point", "ASE has no constraint that holds an atom on", "cannot move"
+REFUSED = {
+    "butane": {},
+    "dumbbells": {},
+    "rotor": {},
+    "tennis-racket": {},
+    "pendulum": {"ase-bonds": PIVOT, "ase-internals": PIVOT},
+    "double-pendulum": {"ase-bonds": PIVOT, "ase-internals": PIVOT},
+    "triple-pendulum": {"ase-bonds": PIVOT, "ase-internals": PIVOT},
+    "bead-ellipse": {"ase-bonds": SURFACE, "ase-internals": SURFACE},
+    "bead-rotating": {"ase-kcons": TIME, "ase-bonds": TIME, "ase-internals": TIME},
+    "bead-torus": {"ase-bonds": SURFACE, "ase-internals": SURFACE},
+    "slab": {},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_quick_comparison(name):
+    scene = scenes.build(name, quick=True)
+    steps = scene.time_steps[:2]
+    result = compare.compare(replace(scene, time_steps=steps), budget=60)
+    refused = {m.method: m.note for m in result.measurements if m.status == "not run" and m.setting == 0}
+    assert refused.keys() == REFUSED[name].keys()
+    for method, text in REFUSED[name].items():
+        assert text in refused[method]
+    assert not [m for m in result.measurements if m.status == "failed"]
+    plain = result.of("rattle")
+    assert len(plain) == len(steps)
+    assert result.observed_order("rattle") == pytest.approx(2.0, abs=0.2)
+    for m in plain:
+        assert m.constraint_residual < 1e-12
+        assert m.velocity_residual < 1e-12
+        assert m.evaluations_per_time == pytest.approx(scene.units.long_time_unit / scene.units.time_unit / m.setting)
+    for core, hosted in zip(plain, result.of("ase-kcons"), strict="ase-kcons" not in refused):
+        assert hosted.error == pytest.approx(core.error, rel=1e-5)
+    # The projected equation, at its tightest tolerance, is closer than RATTLE.
+    assert result.of("dop853")[-1].error < 0.1 * plain[-1].error
+    assert result.reference["error"] < 1e-3 * plain[-1].error
 
 
 # -- environment ------------------------------------------------------------------------------------

@@ -155,10 +155,18 @@ def test_plot_has_both_panels_with_units(tmp_path, monkeypatch):
     assert len({colour for colour, _ in report.STYLES.values()}) == len(report.STYLES)
 
 
-def test_every_method_has_a_style():
+def test_methods_differ_in_colour_and_marker(monkeypatch):
     from kcons import methods
 
-    assert set(methods.METHODS) == set(report.STYLES)
+    assert set(report.STYLES) <= set(methods.METHODS)
+    many = dict.fromkeys([*methods.METHODS, *(f"stepper-{k}" for k in range(len(report.SPARE)))])
+    monkeypatch.setattr(report, "METHODS", many)
+    known = [name for name in many if name in report.STYLES]
+    others = [name for name in many if name not in report.STYLES][: len(report.SPARE)]
+    styles = [report.style(name) for name in known + others]
+    assert len({colour for colour, _ in styles}) == len(styles)
+    assert len({marker for _, marker in styles}) == len(styles) - 1  # both floors have the same
+    assert report.style("unheard of") == ("black", "x")
 
 
 def test_plot_without_any_error(tmp_path):

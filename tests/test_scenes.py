@@ -14,13 +14,29 @@ from scipy.integrate import solve_ivp
 from kcons import projection, scenes
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.scenes import chain, molecule, water
+from kcons.scenes import chain, dumbbells, molecule, water
 from kcons.scenes.scene import converged, thermal_velocities
 from kcons.scenes.sphere import swing
 from kcons.steppers import State, System, run
+from tests.reference import cases
+
+#: Scenes that are stored reference cases, solved with 45 digits in minimal coordinates or closed form.
+STORED = {
+    "butane": "A07_butane_bonds_angles_fixed",
+    "dumbbells": "A05_two_dumbbells_lj",
+    "rotor": "A06_asymmetric_top4",
+    "tennis-racket": "A06_tennis_racket4",
+    "pendulum": "A03_planar_pendulum_179p9deg",
+    "double-pendulum": "A04_double_pendulum",
+    "triple-pendulum": "A04_triple_pendulum",
+    "bead-ellipse": "A08_bead_vertical_ellipse",
+    "bead-rotating": "A08_bead_rotating_ellipse",
+    "bead-torus": "A08_torus_geodesic",
+}
 
 SMALL = {"water": 8, "chain": 5, "chain-straight": 5, "chain-175": 5, "chain-free": 5, "sphere": 2, "ethanol": 1}
 SMALL["sphere-pendulum"] = 2
+SMALL.update(dict.fromkeys(STORED, 1), dumbbells=2, slab=1)
 
 
 def small(name, **options):
@@ -78,10 +94,14 @@ def test_rattle_reaches_the_reference_with_order_two(name):
     assert reference.error < 0.01 * errors[-1]
 
 
-@pytest.mark.parametrize("name", ["chain", "chain-free", "ethanol"])
-def test_converged_reference_against_an_independent_integrator(name):
+@pytest.mark.parametrize(
+    ("name", "size"), [("chain", 5), ("chain-free", 5), ("ethanol", 1), ("dumbbells", 8), ("slab", 1)]
+)
+def test_converged_reference_against_an_independent_integrator(name, size):
     # Eq. (105) with the dense oracle in DOP853: other equations, other code, other integrator.
-    scene = small(name)
+    scene = scenes.build(name, size, **({"forces": "emt"} if name == "ethanol" else {}))
+    if name == "dumbbells":
+        scene = scene.shortened(4)
     held, masses, shape = scene.constraint_set, scene.masses, scene.positions.shape
 
     def rate(_, y):
@@ -94,6 +114,110 @@ def test_converged_reference_against_an_independent_integrator(name):
     y = solve_ivp(rate, (0, scene.horizon), start, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
     reference = scene.reference()
     assert scene.deviation(y.reshape(2, *shape)[0], reference.positions) < 1e-7
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_scene_is_the_stored_case(name):
+    scene, case = small(name), cases.load(STORED[name])
+    x, v = case.initial.positions, case.initial.velocities
+    np.testing.assert_allclose(scene.positions, x, rtol=0, atol=5e-16)
+    np.testing.assert_allclose(scene.velocities, v, rtol=0, atol=5e-16)
+    np.testing.assert_array_equal(scene.masses, case.masses)
+    forces = scene.potential.forces(x)
+    np.testing.assert_allclose(forces, case.force(x, v), rtol=1e-13, atol=1e-13)
+    # The same accelerations: the same constraints.
+    for s in case.snapshots:
+        a = scene.motion.acceleration(s.positions, s.velocities, scene.potential.forces(s.positions), s.time)
+        np.testing.assert_allclose(a, s.accelerations, rtol=0, atol=2e-10 * max(1.0, np.abs(s.accelerations).max()))
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_solution_meets_the_stored_one(name):
+    scene, case = small(name), cases.load(STORED[name])
+    known = [s for s in case.solution if s.time <= scene.horizon]
+    assert known
+    for s in known:
+        found = scene.solution(s.time)
+        off = scene.deviation(found.positions, s.positions)
+        assert off < 4e-13
+        assert off < 5 * found.error + 1e-14  # the estimate is honest
+        assert found.error < 2e-12
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_solution_stays_on_the_constraints(name):
+    scene = small(name)
+    for time in (0.0, 0.3 * scene.horizon, scene.horizon):
+        x = scene.solution(time).positions
+        np.testing.assert_allclose(scene.constraint_set.value(x, time), 0.0, rtol=0, atol=2e-14)
+        if time == 0.0:
+            np.testing.assert_allclose(x, scene.positions, rtol=0, atol=1e-14)
+
+
+def test_moving_constraint_is_followed_in_time():
+    scene = small("bead-rotating")
+    state = end(scene, scene.time_steps[-1])
+    assert scene.residuals(state.positions, state.velocities, scene.horizon) < (1e-12, 1e-12)
+    assert scene.residuals(state.positions, state.velocities)[0] > 0.1
+
+
+@pytest.mark.parametrize("size", [8, 20])
+def test_box_of_dumbbells(size):
+    scene = scenes.build("dumbbells", size, seed=3)
+    assert scene.n_atoms == 2 * size
+    assert scene.motion.rank == size
+    sigma, tangency = scene.residuals(scene.positions, scene.velocities)
+    assert sigma < 1e-14
+    assert tangency < 1e-14
+    d = scene.positions[:, None] - scene.positions
+    d -= scene.cell * np.round(d / scene.cell)
+    other = np.arange(2 * size)[:, None] // 2 != np.arange(2 * size) // 2
+    assert np.linalg.norm(d, axis=2)[other].min() > 1.0  # no overlaps
+    x, direction = scene.positions, np.random.default_rng(1).standard_normal(scene.positions.shape)
+    slope = (scene.potential.energy(x + 1e-6 * direction) - scene.potential.energy(x - 1e-6 * direction)) / 2e-6
+    assert slope == pytest.approx(-np.sum(scene.potential.forces(x) * direction), rel=1e-6)
+    # Forces do not see where the box begins, nor by which image an atom is given.
+    moved = x + scene.cell * np.array([0.3, 2.0, -1.0])
+    np.testing.assert_allclose(scene.potential.forces(moved), scene.potential.forces(x), atol=1e-11)
+    reference = scene.reference()
+    errors = [scene.deviation(end(scene, dt).positions, reference.positions) for dt in scene.time_steps[1:]]
+    np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.1)
+    assert reference.error < 1e-4 * errors[-1]
+
+
+def test_forces_of_dumbbells_vanish_smoothly_at_the_cutoff():
+    evaluate = dumbbells._with_cutoff(13.0, 2.5)
+    for r, share in ((1.6, 1.0), (2.125, 0.5), (2.5 - 1e-3, 0.0), (2.5 + 1e-3, 0.0)):
+        # Partners of both atoms out of reach; the pair meets through the boundary.
+        x = np.array([[12.0, 0, 0], [12.0, 6, 0], [12.0 + r, 0, 0], [12.0 + r, 0, 6]])
+        energy, forces = evaluate(x)
+        assert energy == pytest.approx(share * 4 * (r**-12 - r**-6), abs=1e-13)
+        if share == 1.0:
+            assert forces[2, 0] == pytest.approx(24 * (2 * r**-13 - r**-7), rel=1e-13)
+        elif share == 0.0:
+            assert np.abs(forces).max() < 1e-9
+        np.testing.assert_array_equal(forces[0], -forces[2])
+        assert not forces[[1, 3]].any()
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
+    scene = scenes.build("slab", size)
+    symbols = np.array(scene.symbols)
+    assert list(symbols[-2 * size :]) == ["C", "O"] * size
+    metal = np.flatnonzero(symbols == "Cu")
+    heights = scene.positions[:, 2]
+    assert heights[scene.fixed].max() < np.delete(heights, scene.fixed).min()
+    assert len(scene.fixed) == len(metal) // 2
+    assert scene.motion.rank == size + 3 * len(scene.fixed)
+    assert not scene.velocities[scene.fixed].any()
+    assert scene.atoms().pbc.all()
+    # Of the molecule, carbon is the closer one, above an atom of the top layer.
+    for carbon, oxygen in scene.bonds:
+        assert 1.5 < heights[carbon] - heights[metal].max() < 2.1
+        assert heights[oxygen] > heights[carbon] + 1.0
+    state = end(scene, scene.time_steps[0])
+    assert np.array_equal(state.positions[scene.fixed], scene.positions[scene.fixed])
 
 
 def test_error_estimate_of_the_converged_reference_is_honest():
@@ -268,6 +392,13 @@ def test_atoms_carry_the_scene(name):
         ("chain", 0, {}, "at least one bond"),
         ("sphere", 0, {}, "at least one particle"),
         ("ethanol", 2, {}, "cannot be built at size 2"),
+        ("rotor", 2, {}, "rotor is one rigid body; it cannot be built at size 2"),
+        ("triple-pendulum", 0, {}, "triple-pendulum is a single system"),
+        ("butane", 3, {}, "one molecule"),
+        ("bead-torus", 2, {}, "one bead"),
+        ("bead-ellipse", 1, {"on": "cone"}, "no curve 'cone'"),
+        ("dumbbells", 3, {}, "use 2, or at least 8"),
+        ("slab", 0, {}, "at least one molecule"),
         ("ethanol", 1, {"forces": "x"}, "no forces 'x' for ethanol"),
     ],
 )
@@ -294,11 +425,11 @@ def test_time_steps_are_sorted_coarse_first():
     np.testing.assert_allclose(np.array(scene.time_steps) / units.fs, [10.0, 5.0, 2.5])
 
 
-@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum"])
+@pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "bead-rotating"])
 def test_shortened_scene_has_its_solution_at_its_own_horizon(name):
-    scene = scenes.build(name, size=2)
+    scene = small(name)
     half = scene.shortened(2)
     assert half.horizon == scene.horizon / 2
     system = System(half.motion, half.potential.forces)
-    end = run(system, State(half.positions, half.velocities), half.horizon / 400, 400)
+    end = run(system, State(half.positions, half.velocities), half.horizon / 800, 800)
     assert half.deviation(end.positions, half.reference().positions) < 1e-4

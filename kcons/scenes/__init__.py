@@ -39,12 +39,8 @@ SCENES: Mapping[str, Entry] = {
     "rotor": Entry("rotor", "asymmetric top of 4 atoms; Euler's equations", 1, 1, "body"),
     "tennis-racket": Entry("rotor", "the same, about its middle axis", 1, 1, "body", {"start": "tennis-racket"}),
     "pendulum": Entry("pendulums", "planar pendulum from 179.9°; closed form", 1, 1, "pendulum"),
-    "double-pendulum": Entry(
-        "pendulums", "planar double pendulum", 1, 1, "pendulum", {"kind": "double-pendulum"}
-    ),
-    "triple-pendulum": Entry(
-        "pendulums", "planar triple pendulum", 1, 1, "pendulum", {"kind": "triple-pendulum"}
-    ),
+    "double-pendulum": Entry("pendulums", "planar double pendulum", 1, 1, "pendulum", {"kind": "double-pendulum"}),
+    "triple-pendulum": Entry("pendulums", "planar triple pendulum", 1, 1, "pendulum", {"kind": "triple-pendulum"}),
     "bead-ellipse": Entry("bead", "bead on a vertical ellipse", 1, 1, "bead"),
     "bead-rotating": Entry(
         "bead", "the same while the ellipse turns: a constraint that moves", 1, 1, "bead", {"on": "rotating-ellipse"}

@@ -154,7 +154,9 @@ def along_torus(angle: float, rate: float, turn: float, time: float) -> Referenc
         rho = MAJOR + MINOR * np.cos(y[1])
         return np.array([momentum / rho**2, y[2], -(momentum**2) * np.sin(y[1]) / (MINOR * rho**3)])
 
-    return integrated(change, [0.0, angle, rate], time, lambda y: torus_place(y[0], y[1]), "equations of the two angles")
+    return integrated(
+        change, [0.0, angle, rate], time, lambda y: torus_place(y[0], y[1]), "equations of the two angles"
+    )
 
 
 _COMMON: dict[str, Any] = dict(

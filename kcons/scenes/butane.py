@@ -11,7 +11,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
 from kcons.constraints.target import FloatArray
 from kcons.scenes.minimal import integrated, single, spin, turned
-from kcons.scenes.potential import Evaluate, Potential
+from kcons.scenes.potential import Potential
 from kcons.scenes.scene import BARE, Reference, Scene
 
 MASSES = np.array([1.5, 1.0, 1.2, 2.0])
@@ -75,7 +75,10 @@ def build(size: int = 1, seed: int = 1) -> Scene:
 
 
 def torsion(x: FloatArray) -> tuple[float, FloatArray]:
-    """Energy k (1 + cos 3 phi) and forces; gradient of phi as in Blondel and Karplus, J. Comput. Chem. 17, 1132 (1996)."""
+    """Energy k (1 + cos 3 phi) and forces, shape (4, 3).
+
+    Gradient of phi as in Blondel and Karplus, J. Comput. Chem. 17, 1132 (1996).
+    """
     first, middle, last = x[0] - x[1], x[1] - x[2], x[3] - x[2]
     a, b = np.cross(first, middle), np.cross(last, middle)
     length = float(np.linalg.norm(middle))
@@ -119,7 +122,7 @@ def twist(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Refe
         q, s, momenta = y[:4], y[4], y[5:]
         r, change, bend = shape(s)
         speeds = np.linalg.solve(inertia(r, change), momenta)
-        omega, pace = speeds[:3], speeds[3]
+        omega, pace = np.asarray(speeds[:3], dtype=float), float(speeds[3])
         velocity = np.cross(omega, r) + pace * change
         uphill = np.sum(masses[:, None] * velocity * (np.cross(omega, change) + pace * bend))
         torque = np.sum(torsion(r)[1] * change)

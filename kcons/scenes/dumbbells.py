@@ -38,7 +38,7 @@ VELOCITIES = np.array(
     [
         [1.147583117862048, 0.19900083305560515, 0.14748659089852048],
         [0.776208441068976, -0.09950041652780257, 0.0012567045507397556],
-        [-0.8797168730164893, 0.09310400960265507, -0.16600553250211768],
+        [-0.8797168730164893, 0.09310400960265507, -0.16600550253211768],
         [-0.6505308630940826, -0.11707001800497825, 0.31126031724772063],
     ]
 )
@@ -112,12 +112,15 @@ def attraction(x: FloatArray) -> tuple[float, FloatArray]:
 
 
 def encounter(time: float) -> Reference:
-    """Centres C and unit axes n: C'' = F/M and n'' = (K - (K . n) n)/I - |n'|^2 n, K = dr/dn . f the pull on the axis."""
+    """Centres C and unit axes n: C'' = F/M and n'' = (K - (K . n) n)/I - |n'|^2 n.
+
+    With the atoms at C + a_i n, K = sum a_i f_i and I = sum m_i a_i^2.
+    """
     masses = MASSES.reshape(2, 2)
     shares = masses / masses.sum(axis=1)[:, None]
     # Places of the atoms on the axis, from the centre.
     arms = np.stack([-shares[:, 1], shares[:, 0]], axis=1) * LENGTHS[:, None]
-    inertia = np.sum(masses * arms**2, axis=1)[:, None]
+    inertia = np.sum(masses * arms * arms, axis=1)[:, None]
 
     def place(y: FloatArray) -> FloatArray:
         centers, axes = y.reshape(4, 2, 3)[:2]
@@ -125,7 +128,7 @@ def encounter(time: float) -> Reference:
         return np.asarray((centers[:, None] + arms[..., None] * n[:, None]).reshape(4, 3))
 
     def rate(_: float, y: FloatArray) -> FloatArray:
-        _, n, drift, turn = y.reshape(4, 2, 3)
+        n, drift, turn = y.reshape(4, 2, 3)[1:]
         f = attraction(place(y))[1].reshape(2, 2, 3)
         pull = np.sum(arms[..., None] * f, axis=1) / inertia
         n_squared = np.sum(n * n, axis=1)[:, None]
@@ -162,7 +165,7 @@ def _box(size: int, seed: int) -> Scene:
     motion = Motion(held, x)
     return Scene(
         name="dumbbells",
-        title=f"{size} rigid Lennard-Jones dumbbells, periodic box {side:.4g} σ, T = {TEMPERATURE:g} ε, cutoff {cutoff:.3g} σ",
+        title=f"{size} rigid Lennard-Jones dumbbells, box {side:.4g} σ, T = {TEMPERATURE:g} ε, cutoff {cutoff:.3g} σ",
         constraint_set=held,
         positions=x,
         velocities=thermal_velocities(motion, x, TEMPERATURE / units.kB, seed),

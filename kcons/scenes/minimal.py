@@ -16,7 +16,7 @@ from kcons.errors import InputError
 from kcons.scenes.scene import Reference
 
 #: Relative tolerance: the least that SciPy accepts, and a larger one whose difference tells the error.
-FINEST, COARSER = 2.3e-14, 3e-13
+FINEST, COARSER = 2.3e-14, 1e-13
 
 
 def integrated(
@@ -48,7 +48,7 @@ def integrated(
 
 
 def spin(q: FloatArray, omega: FloatArray) -> FloatArray:
-    """Rate of the unit quaternion q (scalar last) of a body that turns with `omega`, in its own axes: q (omega, 0)/2."""
+    """Rate of the quaternion q (scalar last) of a body that turns with `omega`, in its own axes: q (omega, 0)/2."""
     return 0.5 * np.concatenate([q[3] * omega + np.cross(q[:3], omega), [-q[:3] @ omega]])
 
 

@@ -105,19 +105,22 @@ def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> Scene:
 def _swing(start: float, time: float) -> Reference:
     """A pendulum (m = l = g = 1) released at rest at the angle `start`.
 
-    sin(theta/2) = k cd(t), k = sin(start/2), cd the elliptic function of Jacobi; cos(theta/2) = k'/dn(t), which keeps
-    its digits near the top.
+    sin(theta/2) = k cd(t, k) and cos(theta/2) = k' nd(t, k) with k = sin(start/2), k' = cos(start/2) and Jacobi's
+    elliptic functions. Near k = 1 they take too few digits from k^2; Landen's transformation to the smaller modulus
+    j = (1 - k')/(1 + k') mends that (Abramowitz and Stegun, 16.12).
     """
     k, other = np.sin(0.5 * start), np.cos(0.5 * start)
+    j = (1.0 - other) / (1.0 + other)
 
     def place(squared: float) -> FloatArray:
-        _, cn, dn, _ = ellipj(np.sqrt(GRAVITY) * time, squared)
-        sine, cosine = k * cn / dn, other / dn
+        sn, cn, dn, _ = ellipj(np.sqrt(GRAVITY) * time / (1.0 + j), squared)
+        below = cn * cn + 2.0 * other / (1.0 + other) * sn * sn  # 1 - j sn^2
+        sine, cosine = k * cn * dn / below, other * (1.0 + j * sn * sn) / below
         return np.array([[2.0 * sine * cosine, 0.0, 2.0 * sine**2 - 1.0]])
 
-    there = place(k * k)
-    # The functions take k^2, whose last digit matters where it is close to 1.
-    error = float(np.linalg.norm(there - place(np.nextafter(k * k, 0.0))))
+    there = place(j * j)
+    # What the last digit of the argument is worth.
+    error = float(np.linalg.norm(there - place(np.nextafter(j * j, 0.0))))
     return Reference(there, error, "Jacobi's elliptic functions")
 
 

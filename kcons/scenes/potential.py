@@ -56,6 +56,12 @@ class Potential:
         self._update(x)
         return self._energy
 
+    def watched_energy(self, x: FloatArray) -> float:
+        """Potential energy at `x` for an onlooker: neither counted nor remembered."""
+        if self._last is not None and np.array_equal(self._last, x):
+            return self._energy
+        return float(self._evaluate(x)[0])
+
     def forget(self) -> None:
         """Start counting anew; the next point is evaluated whatever it is."""
         self._last = None

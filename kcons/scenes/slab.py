@@ -50,8 +50,9 @@ def build(size: int = 1, seed: int = 1) -> Scene:
     sites = atoms.positions[top[::PATCH, ::PATCH].ravel()[:size]]
     metal = len(atoms)
     rng = np.random.default_rng(seed)
-    tilt = rng.normal(0.0, 0.1, (size, 3)) + [0.0, 0.0, 1.0]
-    carbon = sites + [0.0, 0.0, HEIGHT]
+    up = np.array([0.0, 0.0, 1.0])
+    tilt = up + rng.normal(0.0, 0.1, (size, 3))
+    carbon = sites + HEIGHT * up
     oxygen = carbon + BOND * tilt / np.linalg.norm(tilt, axis=1)[:, None]
     atoms += type(atoms)("CO" * size, positions=np.stack([carbon, oxygen], axis=1).reshape(-1, 3))
     x, masses, cell = atoms.positions.copy(), atoms.get_masses(), atoms.cell.array.copy()

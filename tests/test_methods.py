@@ -1,0 +1,137 @@
+"""Every stepper of a registry becomes a method; methods say what they cannot run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import compare, methods, report, scenes
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle, State
+
+
+class Triple:
+    """Yoshida's composition of RATTLE: order 4."""
+
+    order, reversible, force_evaluations = 4, True, 3
+    ends = 1 / (2 - 2 ** (1 / 3))
+
+    def step(self, system, state, dt):
+        for share in (self.ends, 1 - 2 * self.ends, self.ends):
+            state = Rattle().step(system, state, share * dt)
+        return state
+
+
+class KahanLi6(Triple):
+    """Named like one of the usual ones."""
+
+
+class Euler:
+    """Needs the forces where a step begins, and leaves the end without them."""
+
+    order, reversible, force_evaluations = 1, False, 1
+
+    def step(self, system, state, dt):
+        x, v, motion = state.positions, state.velocities, system.motion
+        kick = dt * system.forces(x, v, state.time, 0) * system.inverse_masses
+        v = motion.project_velocities(x, v + kick)
+        following = motion.project_positions(x + dt * v, x)
+        return State(following, motion.project_velocities(following, v), state.time + dt)
+
+
+class Unable(Triple):
+    def step(self, system, state, dt):
+        raise UnsupportedError("no such constraints here; use Rattle")
+
+
+@pytest.fixture
+def pendulum():
+    return scenes.build("double-pendulum")
+
+
+def test_registry_is_a_mapping_or_a_sequence_of_objects_or_classes():
+    found = methods.of_steppers((Rattle, KahanLi6(), Triple))
+    assert [m.name for m in found] == ["rattle", "kahan-li6", "triple"]
+    assert [m.title for m in found] == ["kcons RATTLE", "kcons KahanLi6", "kcons Triple"]
+    assert [m.usual for m in found] == [True, True, False]
+    assert [m.name for m in methods.of_steppers({"Rattle": Rattle, "BMRKN6": Triple})] == ["rattle", "bmrkn6"]
+    assert [m.name for m in methods.of_steppers(())] == ["rattle"]
+
+
+def test_steps_cost_as_much_as_those_of_rattle(pendulum):
+    for m in methods.of_steppers([Triple, Euler])[1:]:
+        steps = m.settings(pendulum)
+        s = m.stepper.force_evaluations
+        np.testing.assert_allclose(steps, s * np.array(pendulum.time_steps), rtol=0.02)
+        counts = pendulum.horizon / np.array(steps)
+        np.testing.assert_allclose(counts, np.round(counts), rtol=1e-12)
+    assert methods.METHODS["rattle"].settings(pendulum) == pytest.approx(pendulum.time_steps)
+    # At least two steps, and no step twice.
+    few = pendulum.with_time_steps([2.5, 5.0])
+    (_, triple) = methods.of_steppers([Triple])
+    assert triple.settings(few) == pytest.approx([2.5, 1.25])
+
+
+def registered(monkeypatch, *steppers):
+    found = {m.name: m for m in methods.of_steppers(steppers)}
+    monkeypatch.setattr(methods, "METHODS", {**methods.METHODS, **found})
+
+
+def test_registered_stepper_is_compared(monkeypatch, pendulum, tmp_path):
+    registered(monkeypatch, Triple)
+    result = compare.compare(pendulum.with_time_steps([0.0125, 0.00625]), methods=["rattle", "triple"])
+    assert result.observed_order("rattle") == pytest.approx(2.0, abs=0.1)
+    assert result.observed_order("triple") == pytest.approx(4.0, abs=0.15)
+    for plain, high in zip(result.of("rattle"), result.of("triple"), strict=True):
+        assert high.evaluations_per_time == pytest.approx(3 / high.setting)
+        assert high.evaluations_per_time == pytest.approx(plain.evaluations_per_time, rel=0.02)
+    assert result.of("triple")[-1].error < 0.1 * result.of("rattle")[-1].error
+    report.plot(result, tmp_path / "x.png")
+
+
+def test_onlookers_do_not_save_a_stepper_its_evaluations(monkeypatch, pendulum):
+    registered(monkeypatch, Euler)
+    result = compare.compare(pendulum, methods=["euler"])
+    for m in result.of("euler"):
+        # The forces at the start are in place; between steps the energy is written down, which must not help.
+        assert m.evaluations_per_time * result.scene["horizon"] == pytest.approx(m.steps - 1)
+
+
+def test_energies_are_read_without_being_counted(pendulum):
+    potential = scenes.build("butane").potential
+    x = scenes.build("butane").positions
+    potential.forget()
+    potential.forces(x)
+    assert potential.watched_energy(x) == potential.energy(x)
+    assert potential.watched_energy(x + 0.1 * np.eye(4, 3)) != potential.energy(x)
+    assert potential.evaluations == 1
+    potential.forces(x)
+    assert potential.evaluations == 1
+
+
+def test_what_a_stepper_does_not_support_is_not_run(monkeypatch, pendulum):
+    registered(monkeypatch, Unable)
+    (only,) = compare.compare(pendulum, methods=["unable"]).measurements
+    assert only.status == "not run"
+    assert only.note == "no such constraints here; use Rattle"
+
+
+def test_usual_methods_and_all(monkeypatch):
+    registered(monkeypatch, Triple, KahanLi6)
+    usual = [m.name for m in methods.chosen()]
+    assert "triple" not in usual
+    assert {"rattle", "kahan-li6", "ase-kcons", "dop853", "verlet"} <= set(usual)
+    assert methods.chosen(["all"]) == list(methods.METHODS.values())
+    with pytest.raises(InputError, match="there is no method 'all'"):
+        methods.chosen(["all", "rattle"])
+
+
+def test_hosts_fix_the_atoms_of_the_slab():
+    scene = scenes.build("slab")
+    for name in ("ase-bonds", "ase-internals", "ase-kcons"):
+        run = methods.METHODS[name].start(scene, scene.time_steps[0])
+        run.advance()
+        moved = np.abs(run.positions - scene.positions).max(axis=1) > 0
+        assert not moved[scene.fixed].any()
+        assert np.delete(moved, scene.fixed).all()
+        assert run.constraints.seconds > 0
