@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
@@ -61,10 +60,12 @@ class NonholonomicFlight:
     """
 
     def __init__(self, motion: Motion, inverse_masses: FloatArray) -> None:
+        from scipy.sparse.csgraph import connected_components  # slow to import, rarely needed
+
         self.motion = motion
         whole = self.whole = motion.constraint_set
         links = whole.incidence @ whole.incidence.T
-        labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+        labels = connected_components(links, directed=False)[1]
         velocity = ~whole.holonomic
         self.rows: IntArray = np.flatnonzero(np.isin(labels, labels[velocity])).astype(np.int64)
         self.held, self.atoms = whole.subset(self.rows)
