@@ -6,10 +6,11 @@ knows how much of its time went into constraints.
 
 from __future__ import annotations
 
+import inspect
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -61,6 +62,9 @@ class Stopwatch:
 
 #: The steppers that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL_STEPPERS = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
+
+#: Rate of a stepper's feedback, in inverse time steps: fast, and well within what is stable.
+FEEDBACK = 0.1
 
 #: What the engine is asked for in the course of a step.
 ENGINE_CALLS = (
@@ -185,20 +189,29 @@ class CoreStepper(Method):
     """A stepper of `kcons.steppers`, arrays in and arrays out.
 
     A stepper with s force evaluations a step takes steps s times as long as RATTLE, so that all cost about the same.
+
+    Attributes
+    ----------
+    make : callable
+        The stepper for a given time step.
     """
 
-    stepper: Stepper = field(default_factory=Rattle)
+    make: Callable[[float], Stepper] = lambda dt: Rattle()
+
+    @property
+    def stepper(self) -> Stepper:
+        """The stepper for a step of 1: order, cost and name are the same for all."""
+        return self.make(1.0)
 
     def settings(self, scene: Scene) -> tuple[float, ...]:
         steps = scene.time_steps
-        first = scene.horizon / steps[0] / self.stepper.force_evaluations
-        if self.stepper.force_evaluations > 1:
-            first = max(2.0, first)
+        evaluations = self.stepper.force_evaluations
+        first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
         counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
         return tuple(scene.horizon / count for count in counts)
 
     def start(self, scene: Scene, setting: float) -> Run:
-        return _CoreRun(scene, Motion(scene.constraint_set, scene.positions), self.stepper, setting)
+        return _CoreRun(scene, Motion(scene.constraint_set, scene.positions), self.make(setting), setting)
 
 
 class CoreVerlet(Method):
@@ -215,18 +228,25 @@ def of_steppers(found: Any) -> list[CoreStepper]:
     Parameters
     ----------
     found : mapping of name to stepper, or iterable of steppers
-        Objects, or classes that take no arguments. Without a name, that of the class is taken: KahanLi6 is
-        `kahan-li6`.
+        Objects, or classes that can do without arguments; the `rate` of a feedback is filled in. Without a name,
+        that of the class is taken: KahanLi6 is `kahan-li6`.
     """
     named = found.items() if isinstance(found, Mapping) else ((None, item) for item in found)
     methods = {"rattle": CoreStepper("rattle", "kcons RATTLE")}
     for given, item in named:
-        stepper: Stepper = item() if isinstance(item, type) else item
-        kind = type(stepper).__name__
+        kind = item.__name__ if isinstance(item, type) else type(item).__name__
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", str(given or kind)).lower()
         if name not in methods:
-            methods[name] = CoreStepper(name, f"kcons {kind}", usual=name in USUAL_STEPPERS, stepper=stepper)
+            methods[name] = CoreStepper(name, f"kcons {kind}", usual=name in USUAL_STEPPERS, make=_maker(item))
     return list(methods.values())
+
+
+def _maker(item: Any) -> Callable[[float], Stepper]:
+    if not isinstance(item, type):
+        return lambda dt: item  # type: ignore[no-any-return]
+    if "rate" in inspect.signature(item).parameters:
+        return lambda dt: item(rate=FEEDBACK / dt)  # type: ignore[no-any-return]
+    return lambda dt: item()  # type: ignore[no-any-return]
 
 
 # -- ASE --------------------------------------------------------------------------------------------

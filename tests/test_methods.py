@@ -39,6 +39,11 @@ class Euler:
         return State(following, motion.project_velocities(following, v), state.time + dt)
 
 
+class Feedback(Triple):
+    def __init__(self, rate):
+        self.rate = rate
+
+
 class Unable(Triple):
     def step(self, system, state, dt):
         raise UnsupportedError("no such constraints here; use Rattle")
@@ -70,6 +75,12 @@ def test_steps_cost_as_much_as_those_of_rattle(pendulum):
     few = pendulum.with_time_steps([2.5, 5.0])
     (_, triple) = methods.of_steppers([Triple])
     assert triple.settings(few) == pytest.approx([2.5, 1.25])
+
+
+def test_rate_of_a_feedback_goes_with_the_step(pendulum):
+    (_, found) = methods.of_steppers([Feedback])
+    assert found.start(pendulum, 0.05)._stepper.rate == pytest.approx(2.0)
+    assert found.stepper.order == 4
 
 
 def registered(monkeypatch, *steppers):
