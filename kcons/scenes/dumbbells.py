@@ -94,7 +94,7 @@ def _collision() -> Scene:
         potential=Potential(attraction, "Lennard-Jones"),
         symbols=["Ar"] * 4,
         horizon=5.0,
-        time_steps=(0.02, 0.01, 0.005, 0.0025),
+        time_steps=(0.01, 0.005, 0.0025, 0.00125),
         tolerances=(1e-4, 1e-7, 1e-10),
         units=REDUCED,
         bonds=_pairs(2),

@@ -94,7 +94,7 @@ def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> Scene:
         potential=Potential(_weight(masses), "uniform field"),
         symbols=["X"] * links,
         horizon=chosen.horizon,
-        time_steps=tuple(chosen.horizon / n for n in (80, 160, 320, 640)),
+        time_steps=tuple(chosen.horizon / n for n in (200, 400, 800, 1600)),
         tolerances=(1e-3, 1e-6, 1e-9),
         units=BARE,
         refusals={"ase-bonds": NO_PIVOT, "ase-internals": NO_PIVOT},
