@@ -7,6 +7,7 @@ Some fractions must be negative: constraints, targets and forces are then asked 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -75,7 +76,7 @@ class Composition(Splitting):
                     f"fractions {g} do not have order {order}: their powers of {power} do not cancel", item="fractions"
                 )
         halves = [0.5 * x for x in g]
-        merged = [a + b for a, b in zip(halves, halves[1:], strict=False)]
+        merged = [a + b for a, b in itertools.pairwise(halves)]
         super().__init__(kicks=(halves[0], *merged, halves[-1]), drifts=g)
         self.order = order
         self.fractions = g

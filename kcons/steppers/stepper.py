@@ -120,9 +120,7 @@ class ReversibilityCheck:
         moved = np.abs(back.positions - state.positions)
         turned = np.abs(back.velocities - state.velocities)
         # A speed of zero both before and after leaves nothing to compare with.
-        off = np.maximum(
-            np.maximum(moved - rounding, 0.0) / (length or 1.0), turned / (speed or 1.0)
-        )
+        off = np.maximum(np.maximum(moved - rounding, 0.0) / (length or 1.0), turned / (speed or 1.0))
         residual = float(off.max(initial=0.0))
         if not residual <= self.tolerance:
             atom = int(np.argmax(off.max(axis=1)))
