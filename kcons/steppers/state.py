@@ -6,6 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import BinaryIO
+from zipfile import BadZipFile
 
 import numba
 import numpy as np
@@ -65,6 +69,40 @@ class State:
         """The same point with opposite velocities."""
         # Forces are dropped since they may depend on the velocities.
         return replace(self, velocities=-self.velocities, forces=None)
+
+    def save(self, file: str | PathLike[str] | BinaryIO) -> None:
+        """Write everything the state holds in NumPy's .npz format: a run continued from it is the same to the last bit.
+
+        Parameters
+        ----------
+        file : path or binary file
+            A path is replaced in one piece, so that an interrupted write leaves the older file.
+        """
+        present = {name: value for name, value in vars(self).items() if value is not None}
+        if not isinstance(file, str | PathLike):
+            np.savez(file, **present)
+            return
+        target = Path(file)
+        unfinished = target.with_name(target.name + ".unfinished")
+        with unfinished.open("wb") as opened:
+            np.savez(opened, **present)
+        unfinished.replace(target)
+
+    @classmethod
+    def load(cls, file: str | PathLike[str] | BinaryIO) -> State:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            The file holds no state.
+        """
+        try:
+            with np.load(file) as stored:
+                values = {name: stored[name] for name in stored.files}
+            return cls(**{name: a if a.ndim else a.item() for name, a in values.items()})
+        except (TypeError, ValueError, BadZipFile, EOFError) as error:
+            raise InputError(f"{file} holds no state written by State.save: {error}", item="file") from error
 
 
 class System:
