@@ -13,7 +13,7 @@ import subprocess
 import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.methods import Method, Run, chosen
+from kcons.methods import CoreStepper, Method, Run, chosen
 from kcons.scenes import Reference, Scene
 from kcons.steppers import Rattle, State, System
 
@@ -112,12 +112,16 @@ class Comparison:
         return [m for m in self.measurements if m.method == method and m.status == status]
 
     def observed_order(self, method: str) -> float | None:
-        """Slope of log(error) against log(time step), None with fewer than two steps above the reference's error."""
+        """Slope of log(error) against log(time step) at the two finest steps whose error is above the reference's.
+
+        None with fewer than two such steps. Coarser steps are left out: high orders show at small steps only.
+        """
         floor = 5 * float(self.reference["error"])
         used = [m for m in self.of(method) if not m.adaptive and m.error is not None and m.error > max(floor, 1e-12)]
         if len(used) < 2:
             return None
-        return float(np.polyfit(np.log([m.setting for m in used]), np.log([float(m.error or 0) for m in used]), 1)[0])
+        steps, errors = np.log([(m.setting, float(m.error or 0)) for m in used[-2:]]).T
+        return float((errors[1] - errors[0]) / (steps[1] - steps[0]))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, as it goes to JSON."""
@@ -180,7 +184,7 @@ def compare(
     picked = chosen(methods)
     watching = watcher or Watcher()
     watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
-    warm_up(scene)
+    warm_up(scene, picked)
     watching.advance(1)
     watching.end()
 
@@ -220,8 +224,8 @@ def compare(
     )
 
 
-def warm_up(scene: Scene) -> None:
-    """Compile or load every kernel that the scene needs, outside of any timing."""
+def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
+    """Compile or load every kernel that the scene and these methods need, outside of any timing."""
     motion = scene.motion
     x, v = scene.positions, scene.velocities
     f = scene.potential.forces(x)
@@ -229,6 +233,10 @@ def warm_up(scene: Scene) -> None:
     Rattle().step(System(motion, scene.potential.forces), State(x, v), dt)
     motion.acceleration(x, v, f)
     motion.project_forces(x, f)
+    for method in methods:
+        if isinstance(method, CoreStepper) and method.refuses(scene) is None:
+            with suppress(Exception):  # what goes wrong is shown where it is measured
+                method.start(scene, dt).advance()
 
 
 # -- one method -------------------------------------------------------------------------------------

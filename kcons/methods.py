@@ -60,6 +60,21 @@ class Stopwatch:
         return timed
 
 
+#: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
+STEPPERS: Mapping[str, type[Stepper]] = {
+    "rattle": steppers.Rattle,
+    "geodesic": steppers.Geodesic,
+    "suzuki4": steppers.Suzuki4,
+    "yoshida4": steppers.Yoshida4,
+    "kahan-li6": steppers.KahanLi6,
+    "blanes-moan4": steppers.BlanesMoan4,
+    "blanes-moan6": steppers.BlanesMoan6,
+    "blanes-moan6a": steppers.BlanesMoan6a,
+    "projected-verlet": steppers.ProjectedVerlet,
+    "projected-rk4": steppers.ProjectedRungeKutta4,
+    "baumgarte": steppers.Baumgarte,
+}
+
 #: The steppers that run unless methods are named: the plain one, and of each order a composition and a splitting.
 USUAL_STEPPERS = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
@@ -152,7 +167,8 @@ class _CoreRun(Run):
     def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
         super().__init__()
         self.constraints.watch(motion, ENGINE_CALLS)
-        self._system = System(motion, scene.potential.forces)
+        stepper.check(system := System(motion, scene.potential.forces))
+        self._system = system
         self._stepper = stepper
         self._start = self._system.with_forces(State(scene.positions, scene.velocities))
         self._state = self._start
@@ -211,7 +227,9 @@ class CoreStepper(Method):
         return tuple(scene.horizon / count for count in counts)
 
     def start(self, scene: Scene, setting: float) -> Run:
-        return _CoreRun(scene, Motion(scene.constraint_set, scene.positions), self.make(setting), setting)
+        # What does not keep the positions on the surface cannot have rows that depend on each other there.
+        held = scene.constraint_set if self.stepper.symplectic else _independent_rows(scene)
+        return _CoreRun(scene, Motion(held, scene.positions), self.make(setting), setting)
 
 
 class CoreVerlet(Method):
@@ -408,7 +426,7 @@ class ProjectedOde(Method):
 METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
-        *of_steppers(getattr(steppers, "STEPPERS", ())),
+        *of_steppers(STEPPERS),
         AseKcons("ase-kcons", "ASE Verlet + kcons"),
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals"),

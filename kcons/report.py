@@ -107,7 +107,7 @@ def _cells(m: Measurement, note: int | None) -> dict[str, str | Text]:
     slope = "" if m.energy_slope is None else f"{m.energy_slope:.1e}"
     if m.energy_slope is not None and abs(m.energy_slope) < 2 * (m.energy_slope_error or 0.0):
         slope = f"({slope})"
-    setting = "" if m.setting == 0 else f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:g}"
+    setting = "" if m.setting == 0 else f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:.4g}"
     return {
         "step": setting,
         "error": _verdict(m, note),
@@ -158,7 +158,7 @@ def explanation(comparison: Comparison) -> str:
         if order is not None:
             orders.append(f"{title} {order:.2f}")
     if orders:
-        lines.append("observed order (error ∝ stepᵖ): " + ", ".join(orders))
+        lines.append("observed order (error ∝ stepᵖ at the finest steps): " + ", ".join(orders))
     return "\n".join(lines)
 
 
@@ -188,7 +188,7 @@ def plot(comparison: Comparison, path: Path) -> None:
                     markeredgewidth=1.6,
                     label=done[0].title,
                 )
-        if comparison.reference["error"] > 0:
+        if _reference_in_sight(comparison):
             axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
     _mark_costs_without_error(right, comparison)
     for axes in (left, right):
@@ -205,7 +205,7 @@ def plot(comparison: Comparison, path: Path) -> None:
     left.set_ylabel(f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}")
     for axes in (left, right):
         axes.grid(True, which="major", linewidth=0.5, alpha=0.5)
-    if comparison.reference["error"] > 0:
+    if _reference_in_sight(comparison):
         left.text(
             0.02,
             comparison.reference["error"],
@@ -221,6 +221,12 @@ def plot(comparison: Comparison, path: Path) -> None:
     figure.suptitle(comparison.scene["title"], fontsize=11)
     right.set_title(f"{environment['cpu']}, 1 thread; {environment['date']}", fontsize=8, loc="right")
     figure.savefig(path, dpi=150)
+
+
+def _reference_in_sight(comparison: Comparison) -> bool:
+    """Whether any error comes near that of the reference; far below them a line would only squeeze the curves."""
+    errors = [m.error for m in comparison.measurements if m.error]
+    return bool(errors) and 0 < min(errors) < 100 * float(comparison.reference["error"])
 
 
 def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
