@@ -32,10 +32,9 @@ from kcons.steppers import ProjectedRungeKutta4, ProjectedVerlet, State, Stepper
 SYSTEMS = ("butane", "dumbbells", "triple-pendulum")
 #: The error at which costs are compared.
 GOAL = 5e-7
-#: Curves end where they are this good, or this dear.
-BEST, MOST = {True: 1e-10, False: 0.2 * GOAL}, {True: 2**17, False: 2**16}
-#: A point more than a factor of this many force evaluations, and where the curves begin.
-GRID, FIRST = {True: 2**0.5, False: 2.0}, 64
+#: Curves begin and end at so many force evaluations, or end where they are this good.
+FIRST, MOST = 64, 2**17
+BEST = {True: 1e-10, False: GOAL}
 
 #: Pendulum of the energy runs: let go at 2 rad, m = l = g = 1.
 ANGLE = 2.0
@@ -53,10 +52,12 @@ def curve(scene: scenes.Scene, name: str, full: bool) -> list[dict[str, float]]:
     system = System(scene.motion, scene.potential.forces)
     cost = method.stepper.force_evaluations
     found: list[dict[str, float]] = []
+    # From point to point, evaluations grow by this factor.
+    growth = 2**0.5 if full else 2.0 if method.stepper.order > 2 else 4.0
     wanted, tried = float(FIRST), 0
-    while wanted <= MOST[full]:
+    while wanted <= MOST:
         steps = max(2, round(wanted / cost))
-        wanted *= GRID[full]
+        wanted *= growth
         if steps == tried:
             continue
         tried = steps
