@@ -230,13 +230,14 @@ def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
     x, v = scene.positions, scene.velocities
     f = scene.potential.forces(x)
     dt = min(scene.time_steps)
-    Rattle().step(System(motion, scene.potential.forces), State(x, v), dt)
+    system, start = System(motion, scene.potential.forces), State(x, v)
+    Rattle().step(system, start, dt)
     motion.acceleration(x, v, f)
     motion.project_forces(x, f)
     for method in methods:
         if isinstance(method, CoreStepper) and method.refuses(scene) is None:
             with suppress(Exception):  # what goes wrong is shown where it is measured
-                method.start(scene, dt).advance()
+                method.make(dt).step(system, start, dt)
 
 
 # -- one method -------------------------------------------------------------------------------------

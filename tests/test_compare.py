@@ -237,6 +237,9 @@ REFUSED = {
 }
 
 
+COMPOSED = ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_quick_comparison(name):
     scene = scenes.build(name, quick=True)
@@ -246,7 +249,12 @@ def test_quick_comparison(name):
     assert refused.keys() == REFUSED[name].keys()
     for method, text in REFUSED[name].items():
         assert text in refused[method]
-    assert not [m for m in result.measurements if m.status == "failed"]
+    # Compositions take their longest steps where RATTLE takes a ninth of them.
+    for m in result.measurements:
+        assert m.status != "failed" or (m.method in COMPOSED and "time step too large" in m.note)
+    for name in COMPOSED:
+        errors = [m.error for m in result.of(name)]
+        assert errors == sorted(errors, reverse=True)
     plain = result.of("rattle")
     assert len(plain) == len(steps)
     assert result.observed_order("rattle") == pytest.approx(2.0, abs=0.2)

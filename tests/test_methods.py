@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons import compare, methods, report, scenes
+from kcons import compare, methods, report, scenes, steppers
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State
 
@@ -13,8 +13,11 @@ from kcons.steppers import Rattle, State
 class Triple:
     """Yoshida's composition of RATTLE: order 4."""
 
-    order, reversible, force_evaluations = 4, True, 3
+    order, reversible, symplectic, force_evaluations = 4, True, True, 3
     ends = 1 / (2 - 2 ** (1 / 3))
+
+    def check(self, system):
+        pass
 
     def step(self, system, state, dt):
         for share in (self.ends, 1 - 2 * self.ends, self.ends):
@@ -29,7 +32,10 @@ class KahanLi6(Triple):
 class Euler:
     """Needs the forces where a step begins, and leaves the end without them."""
 
-    order, reversible, force_evaluations = 1, False, 1
+    order, reversible, symplectic, force_evaluations = 1, False, False, 1
+
+    def check(self, system):
+        pass
 
     def step(self, system, state, dt):
         x, v, motion = state.positions, state.velocities, system.motion
@@ -45,13 +51,49 @@ class Feedback(Triple):
 
 
 class Unable(Triple):
-    def step(self, system, state, dt):
+    def check(self, system):
         raise UnsupportedError("no such constraints here; use Rattle")
+
+
+NAMED = {
+    "rattle": Rattle,
+    "geodesic": steppers.Geodesic,
+    "suzuki4": steppers.Suzuki4,
+    "yoshida4": steppers.Yoshida4,
+    "kahan-li6": steppers.KahanLi6,
+    "blanes-moan4": steppers.BlanesMoan4,
+    "blanes-moan6": steppers.BlanesMoan6,
+    "blanes-moan6a": steppers.BlanesMoan6a,
+    "projected-verlet": steppers.ProjectedVerlet,
+    "projected-rk4": steppers.ProjectedRungeKutta4,
+    "baumgarte": steppers.Baumgarte,
+}
 
 
 @pytest.fixture
 def pendulum():
     return scenes.build("double-pendulum")
+
+
+def test_every_stepper_is_a_method():
+    # A stepper that is added to the package and not here is missed.
+    concrete = {
+        item
+        for name, item in vars(steppers).items()
+        if isinstance(item, type) and hasattr(item, "force_evaluations") and not name.startswith("_")
+    } - {steppers.Stepper, steppers.Splitting, steppers.Composition, steppers.RungeKuttaNystrom}
+    assert concrete == set(NAMED.values())
+    for name, kind in NAMED.items():
+        assert type(methods.METHODS[name].stepper) is kind
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_every_stepper_runs_dependent_rows_and_finds_the_trajectory(name):
+    # 21 rows of rank 19.
+    scene = scenes.build("ethanol", forces="emt").shortened(4)
+    found = compare.compare(scene.with_time_steps([0.5, 0.25]), methods=[name])
+    assert [m.status for m in found.measurements] == ["ok", "ok"]
+    assert found.measurements[-1].error < 1e-4
 
 
 def test_registry_is_a_mapping_or_a_sequence_of_objects_or_classes():
@@ -83,8 +125,8 @@ def test_rate_of_a_feedback_goes_with_the_step(pendulum):
     assert found.stepper.order == 4
 
 
-def registered(monkeypatch, *steppers):
-    found = {m.name: m for m in methods.of_steppers(steppers)}
+def registered(monkeypatch, *kinds):
+    found = {m.name: m for m in methods.of_steppers(kinds)}
     monkeypatch.setattr(methods, "METHODS", {**methods.METHODS, **found})
 
 
