@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from kcons import projection, scenes
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.scenes import chain, dumbbells, molecule, water
+from kcons.scenes.potential import Potential
 from kcons.scenes.scene import converged, thermal_velocities
 from kcons.scenes.sphere import swing
 from kcons.steppers import State, System, run
@@ -222,10 +224,27 @@ def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
 
 def test_error_estimate_of_the_converged_reference_is_honest():
     scene = small("chain")
-    fine = converged(scene, min(scene.time_steps) / 8)
-    coarse = converged(scene, max(scene.time_steps))
-    assert scene.deviation(coarse.positions, fine.positions) < coarse.error
-    assert fine.error < 1e-4 * coarse.error
+    fine = converged(scene, min(scene.time_steps) / 4)
+    assert fine.error < 1e-12
+    for dt in (4 * max(scene.time_steps), 2 * max(scene.time_steps)):
+        coarse = converged(scene, dt)
+        assert 0.05 * coarse.error < scene.deviation(coarse.positions, fine.positions) < coarse.error
+        assert coarse.error > 100 * fine.error
+
+
+def test_error_estimate_of_the_converged_reference_sees_noisy_forces():
+    scene = small("chain")
+    rng = np.random.default_rng(4)
+
+    def noisy(x):
+        energy, forces = scene.potential.energy(x), scene.potential.forces(x)
+        return energy, forces * (1 + 1e-6 * rng.standard_normal(forces.shape))
+
+    right = scene.reference()
+    found = replace(scene, potential=Potential(noisy, "noisy")).reference()
+    off = scene.deviation(found.positions, right.positions)
+    assert off > 1e3 * right.error
+    assert 0.2 * off < found.error < 20 * off
 
 
 def test_swing_meets_the_reference_pendulum():
