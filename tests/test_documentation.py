@@ -85,6 +85,11 @@ def test_links_within_the_project_lead_somewhere(page):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_readme_links_to_every_page():
+    linked = re.findall(r"\]\((docs/[\w-]+\.md)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {ROOT / page for page in linked} == set(PAGES) - {ROOT / "README.md"}
+
+
 def test_names_in_the_notation_exist():
     owners = {"projection": projection, "Motion": Motion, "ConstraintSet": ConstraintSet, "Constraint": Constraint}
     text = (ROOT / "docs/notation.md").read_text(encoding="utf-8")
