@@ -119,7 +119,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         result = compare.compare(scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked)
     text = _rendered(result)
     console = _console()
-    console.print(report.table(result, narrow=console.width < report.WIDTH))
+    console.print(report.table(result, narrow=not report.fits(result, console.width)))
     console.print(report.explanation(result), highlight=False, markup=False)
     for path in report.write(result, folder, tables=[text, report.explanation(result)]):
         print(f"wrote {path}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -65,7 +66,7 @@ EXPLANATION = (
     "floor: the first step with nothing held, again and again: what a step costs before any constraint.",
 )
 
-#: Characters that all columns take.
+#: Characters that all columns take, usually.
 WIDTH = 128
 
 #: Columns left out where there is no room for all.
@@ -101,6 +102,11 @@ def table(comparison: Comparison, *, narrow: bool = False) -> Table:
         shown.add_row(m.title if m.method != previous else "", *(cells[name] for name in kept))
         previous = m.method
     return shown
+
+
+def fits(comparison: Comparison, width: int) -> bool:
+    """Whether all columns of the table fit into `width` characters."""
+    return Console(width=1000).measure(table(comparison)).maximum <= width
 
 
 def _cells(m: Measurement, note: int | None) -> dict[str, str | Text]:
@@ -225,7 +231,7 @@ def plot(comparison: Comparison, path: Path) -> None:
 
 def _reference_in_sight(comparison: Comparison) -> bool:
     """Whether any error comes near that of the reference; far below them a line would only squeeze the curves."""
-    errors = [m.error for m in comparison.measurements if m.error]
+    errors = [m.error for m in comparison.measurements if m.error and math.isfinite(m.error)]
     return bool(errors) and 0 < min(errors) < 100 * float(comparison.reference["error"])
 
 

@@ -98,6 +98,32 @@ def test_width_fits_a_table():
     assert "…" not in page.getvalue()
 
 
+def test_whether_a_table_fits_is_measured():
+    usual, long = comparison(*ROWS), comparison(*ROWS, measured(title="a stepper with a very long name indeed"))
+    assert report.fits(usual, report.WIDTH)
+    assert not report.fits(long, report.WIDTH)
+    for found in (usual, long):
+        width = next(w for w in range(60, 300) if report.fits(found, w))
+        page = StringIO()
+        Console(file=page, width=width, color_system=None).print(report.table(found))
+        assert "…" not in page.getvalue()
+        page = StringIO()
+        Console(file=page, width=width - 1, color_system=None).print(report.table(found))
+        assert "…" in page.getvalue()
+
+
+def test_reference_is_drawn_where_errors_come_near_it(tmp_path):
+    assert not report._reference_in_sight(comparison(*ROWS))  # 1e-9 against 1e-6
+    assert report._reference_in_sight(comparison(*ROWS, measured(error=5e-8)))
+    assert not report._reference_in_sight(comparison(measured(error=None), measured(error=float("nan"))))
+
+
+def test_order_is_that_of_the_finest_steps():
+    errors = {8.0: 0.3, 4.0: 0.2, 2.0: 1.6e-3, 1.0: 1e-4}
+    found = comparison(*(measured(setting=step, error=error) for step, error in errors.items()))
+    assert found.observed_order("rattle") == pytest.approx(4.0)
+
+
 def test_explanation_has_notes_reference_and_order():
     text = report.explanation(comparison(*ROWS))
     assert "[1] too slow" in text
