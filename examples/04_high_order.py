@@ -44,11 +44,10 @@ ENERGY_STEPS, ENERGY_TIME = {True: (0.1, 0.01), False: (0.1,)}, {True: 1000.0, F
 # -- work and precision ---------------------------------------------------------------------------
 
 
-def curve(scene: scenes.Scene, name: str, full: bool) -> list[dict[str, float]]:
+def curve(scene: scenes.Scene, reference: scenes.Reference, name: str, full: bool) -> list[dict[str, float]]:
     """Step, force evaluations and error, from coarse to fine."""
     method = methods.METHODS[name]
     assert isinstance(method, methods.CoreStepper)
-    reference = scene.reference().positions
     system = System(scene.motion, scene.potential.forces)
     cost = method.stepper.force_evaluations
     found: list[dict[str, float]] = []
@@ -67,7 +66,7 @@ def curve(scene: scenes.Scene, name: str, full: bool) -> list[dict[str, float]]:
             end = run(system, State(scene.positions, scene.velocities), dt, steps, stepper=method.make(dt))
         except KconsError:  # the step is too large
             continue
-        error = scene.deviation(end.positions, reference)
+        error = scene.deviation(end.positions, reference.positions)
         found.append({"dt": dt, "evaluations": scene.potential.evaluations, "error": error})
         if error < BEST[full]:
             break
@@ -107,16 +106,17 @@ def work_precision(full: bool, console: Console) -> dict[str, Any]:
     systems: dict[str, Any] = {}
     for name in SYSTEMS:
         scene = scenes.build(name)
+        reference = scene.reference()
         curves, seconds = {}, {}
         for stepper in names:
-            curves[stepper] = curve(scene, stepper, full)
+            curves[stepper] = curve(scene, reference, stepper, full)
             seconds[stepper] = cpu_seconds(scene, stepper, curves[stepper]) if full else None
             needed = at_goal(curves[stepper], "evaluations")
             console.print(f"{name}, {stepper}: {'-' if needed is None else f'{needed:,.0f}'} evaluations for {GOAL:g}")
         systems[name] = {
             "title": scene.title,
             "horizon": scene.horizon,
-            "reference_error": scene.reference().error,
+            "reference_error": reference.error,
             "curves": curves,
             "cpu_seconds": seconds,
         }

@@ -84,7 +84,7 @@ def test_readme_quotes_the_committed_ratios():
 def test_ten_times_fewer_evaluations_here_and_now(name):
     # Where the best stepper is below the goal, RATTLE is still above it with ten times its force evaluations.
     scene = scenes.build(name)
-    curve = example.curve(scene, "blanes-moan6", full=False)
+    curve = example.curve(scene, scene.reference(), "blanes-moan6", full=False)
     best = next(p for p in curve if p["error"] < example.GOAL)
     steps = 10 * int(best["evaluations"])
     plain = compare.compare(scene.with_time_steps([scene.horizon / steps]), methods=["rattle"], budget=120)
