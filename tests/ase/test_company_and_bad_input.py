@@ -1,0 +1,248 @@
+"""Other ASE constraints beside ours, and input that is refused before anything is changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.build import molecule
+from ase.constraints import (
+    FixAtoms,
+    FixBondLengths,
+    FixCartesian,
+    FixCom,
+    FixedPlane,
+    Hookean,
+)
+from ase.md.verlet import VelocityVerlet
+from ase_systems import (
+    Free,
+    loose_waters,
+    off,
+    rigid,
+)
+
+from kcons.ase import Constraints, constrain, rigid_water
+from kcons.constraints import (
+    Distance,
+    LinearVelocity,
+    Sphere,
+)
+from kcons.errors import (
+    ContradictionError,
+    ConvergenceError,
+    InputError,
+    KconsError,
+    SingularGeometryError,
+    UnsupportedError,
+)
+
+# -- company ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("other", "hint"),
+    [
+        (FixAtoms([0]), "FixedAtoms"),
+        (FixBondLengths([[0, 4]]), "Distance"),
+        (FixedPlane([1], (0, 0, 1)), "Plane"),
+        (FixCartesian([2]), "LinearCombination"),
+        (Constraints(Distance([2, 4])), ""),
+    ],
+    ids=lambda v: type(v).__name__,
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_company_on_the_same_atoms_is_refused(other, hint, first):
+    atoms, held = rigid(2)
+    held.restore(atoms)
+    atoms.set_constraint([held, other] if first else [other, held])
+    before = atoms.positions.copy()
+    with pytest.raises(UnsupportedError, match=f"{type(other).__name__} acts on atom.*one Constraints object.*{hint}"):
+        atoms.set_positions(before + np.random.default_rng(0).normal(scale=0.01, size=(6, 3)))
+    assert np.array_equal(atoms.positions, before)
+    with pytest.raises(UnsupportedError):
+        atoms.get_forces()
+
+
+def test_constrain_beside_something_else():
+    atoms = loose_waters(2)
+    atoms.set_constraint(FixAtoms([4]))
+    held = constrain(atoms, Distance([0, 1]))
+    assert [type(c).__name__ for c in atoms.constraints] == ["FixAtoms", "Constraints"]
+    assert atoms.get_number_of_degrees_of_freedom() == 18 - 3 - 1
+    new = atoms.positions + np.random.default_rng(0).normal(scale=0.01, size=(6, 3))
+    fixed = atoms.positions[4].copy()
+    atoms.set_positions(new)
+    assert np.array_equal(atoms.positions[4], fixed) and off(atoms, held) <= 1e-14
+    with pytest.raises(UnsupportedError, match="FixAtoms acts on atom 4"):
+        constrain(atoms, Distance([4, 5]))
+    assert len(atoms.constraints) == 2
+
+
+def test_forces_only_company_is_welcome():
+    atoms, held = rigid(2)
+    atoms.set_constraint([held, Hookean(a1=0, a2=3, rt=2.5, k=1.0), FixCom()])
+    atoms.set_momenta(atoms.get_momenta())
+    VelocityVerlet(atoms, 1 * units.fs).run(10)
+    assert off(atoms, held) <= 1e-13
+    assert atoms.get_number_of_degrees_of_freedom() == 12 - 3
+
+
+def test_fix_com_beside_a_surface_is_refused():
+    atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
+    held = constrain(atoms, Sphere([0], [0, 0, 0]))
+    atoms.set_constraint([FixCom(), held])
+    with pytest.raises(UnsupportedError, match=r"FixCom acts on atom 0.*CenterOfMass"):
+        atoms.set_momenta(np.ones((2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("row", "what"),
+    [
+        (Distance([0, 1], lambda t: 1.0 + t), "moves with time"),
+        (LinearVelocity(0, [[1, 0, 0]]), "constrains velocities"),
+    ],
+)
+def test_rows_that_need_the_time_are_refused(row, what):
+    with pytest.raises(UnsupportedError, match=what):
+        constrain(molecule("H2O"), row)
+
+
+# -- bad input --------------------------------------------------------------------------------------
+
+
+def nan_at(atom):
+    atoms = molecule("H2O")
+    atoms.positions[atom, 1] = np.nan
+    return atoms
+
+
+def with_masses(masses):
+    atoms = molecule("H2O")
+    atoms.set_masses(masses)
+    return atoms
+
+
+def boxed(length):
+    atoms = molecule("H2O")
+    atoms.set_cell([length] * 3)
+    atoms.pbc = True
+    return atoms
+
+
+def coincident():
+    atoms = molecule("H2O")
+    atoms.positions[1] = atoms.positions[0]
+    return atoms
+
+
+BAD = {
+    "nan position": (nan_at(1), Distance([0, 1]), InputError, "position of atom 1 is not finite"),
+    "unknown atom": (molecule("H2O"), Distance([0, 7]), InputError, "no atom 7"),
+    "zero mass": (with_masses([16, 0, 1]), Distance([0, 1]), InputError, "atom 1 has mass 0"),
+    "negative mass": (with_masses([-16, 1, 1]), Distance([0, 1]), InputError, "atom 0 has mass -16"),
+    "nan mass": (with_masses([16, np.nan, 1]), Distance([0, 1]), InputError, "atom 1 has mass nan"),
+    "coincident": (coincident(), Distance([0, 1]), SingularGeometryError, "atoms 0 and 1 coincide"),
+    "two lengths": (
+        molecule("H2O"),
+        [Distance([0, 1], 0.9), Distance([1, 0], 1.0)],
+        ContradictionError,
+        "different targets",
+    ),
+    "half the box": (boxed(2.5), Distance([1, 2], 1.5264), InputError, "half the box"),
+    "zero cell": (boxed(0.0), Distance([0, 1]), InputError, "cell"),
+    "not ours": (molecule("H2O"), [FixAtoms([0])], InputError, "from_ase_constraints"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    atoms, rows, error, message = BAD[case]
+    with pytest.raises(error, match=message):
+        constrain(atoms, rows)
+    assert atoms.constraints == []
+
+
+@pytest.mark.parametrize("rows", [[[0, 0]], [[-1, 0]], [[0.5, 1.5]], [[0, 1, 2]]])
+def test_bad_rows_are_refused_at_once(rows):
+    with pytest.raises(InputError):
+        Distance(rows)
+
+
+def test_bad_degenerate_option():
+    with pytest.raises(InputError, match="'convert' or 'raise'"):
+        Constraints(Distance([0, 1]), degenerate="ignore")
+
+
+def failing_positions():
+    turned = molecule("H2O")
+    turned.rotate(90, "x")
+    turned.rotate(90, "y")
+    nan = molecule("H2O").positions
+    nan[2, 0] = np.nan
+    inf = molecule("H2O").positions
+    inf[0, 0] = np.inf
+    apart = turned.positions + np.array([[0, 0, 3], [0, 0, -3], [0, 0, 0]])
+    return {"a step too large": apart, "nan": nan, "inf": inf}
+
+
+@pytest.mark.parametrize("case", failing_positions())
+def test_failing_position_hook_changes_nothing(case):
+    atoms = molecule("H2O")
+    held = constrain(atoms, rigid_water(atoms))
+    new = failing_positions()[case]
+    asked, before = new.copy(), atoms.positions.copy()
+    with pytest.raises(KconsError) as caught:
+        held.adjust_positions(atoms, new)
+    assert np.array_equal(new, asked, equal_nan=True)
+    with pytest.raises(KconsError):
+        atoms.set_positions(new)
+    assert np.array_equal(atoms.positions, before)
+    if case == "a step too large":
+        assert isinstance(caught.value, ConvergenceError)
+        assert any("smaller timestep" in note for note in caught.value.__notes__)
+    # and the object still works
+    atoms.set_positions(before + 0.01)
+
+
+@pytest.mark.parametrize("hook", ["adjust_momenta", "adjust_forces"])
+def test_failing_covector_hooks_change_nothing(hook):
+    atoms = molecule("H2O")
+    held = constrain(atoms, rigid_water(atoms))
+    values = np.ones((3, 3))
+    values[1, 1] = np.nan
+    asked = values.copy()
+    with pytest.raises(KconsError):
+        getattr(held, hook)(atoms, values)
+    assert np.array_equal(values, asked, equal_nan=True)
+
+
+@pytest.mark.parametrize("hook", ["adjust_positions", "adjust_momenta", "adjust_forces"])
+def test_wrong_shapes(hook):
+    atoms = molecule("H2O")
+    held = constrain(atoms, rigid_water(atoms))
+    with pytest.raises(InputError, match=r"shape \(3, 3\)"):
+        getattr(held, hook)(atoms, np.zeros((4, 3)))
+
+
+def test_time_step_too_large_in_dynamics():
+    atoms, held = rigid(2, temperature=3000)
+    atoms.calc = Free()
+    with pytest.raises(ConvergenceError, match="smaller"):
+        VelocityVerlet(atoms, 60 * units.fs).run(50)
+    assert off(atoms, held) <= 1e-13
+    assert np.isfinite(atoms.get_momenta()).all()
+
+
+def test_nan_force_in_dynamics_is_an_error():
+    class Bad(Free):
+        def calculate(self, *args, **kwargs):
+            super().calculate(*args, **kwargs)
+            self.results["forces"][0, 0] = np.nan
+
+    atoms, _ = rigid(1)
+    atoms.calc = Bad()
+    before = atoms.positions.copy()
+    with pytest.raises(KconsError, match="not finite"):
+        VelocityVerlet(atoms, 1 * units.fs).run(1)
+    assert np.array_equal(atoms.positions, before)

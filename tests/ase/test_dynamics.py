@@ -1,0 +1,229 @@
+"""ConstrainedDynamics is right: orders, conserved quantities, moving and velocity rows, boxes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.calculators.tip3p import TIP3P
+from ase.constraints import FixAtoms, FixBondLengths, Hookean
+from ase.md.velocitydistribution import thermalize_momenta
+from ase.md.verlet import VelocityVerlet
+from ase_systems import (
+    FS,
+    Field,
+    off,
+    rigid,
+    water,
+)
+
+from kcons.ase import ConstrainedDynamics, Constraints, constrain
+from kcons.constraints import Distance, KnifeEdge, LinearVelocity
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle
+
+# -- right ------------------------------------------------------------------------------------------
+
+
+def test_follows_velocity_verlet():
+    ours, held = rigid()
+    theirs = ours.copy()
+    theirs.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(ours, FS).run(50)
+    VelocityVerlet(theirs, FS).run(50)
+    assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
+    assert np.abs(ours.get_velocities() - theirs.get_velocities()).max() <= 1e-9
+    assert off(ours, held) <= 1e-13
+
+
+class Suzuki:
+    """Order 4 by five steps of RATTLE, as any stepper may be given."""
+
+    order, reversible, force_evaluations = 4, True, 5
+
+    def step(self, system, state, dt):
+        share = 1 / (4 - 4 ** (1 / 3))
+        number = state.step + 1
+        for weight in (share, share, 1 - 4 * share, share, share):
+            state = Rattle().step(system, state, weight * dt)
+        return replace(state, step=number)
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki()], ids=lambda s: type(s).__name__)
+def test_order_of_the_stepper(stepper):
+    errors, final = [], None
+    for dt in (1 / 16, 1.0, 0.5):
+        atoms, _ = water(temperature=600)
+        ConstrainedDynamics(atoms, dt * FS, stepper).run(round(20 / dt))
+        if final is None:
+            final = atoms.get_positions()
+        else:
+            errors.append(np.abs(atoms.positions - final).max())
+    # The reference itself is 1/16 and 1/8 of the steps away.
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(stepper.order, abs=0.15)
+
+
+def test_free_flight_of_a_rigid_body():
+    atoms, held = water(Field(0.0))
+    dyn = ConstrainedDynamics(atoms, FS)
+    before = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    dyn.run(5000)
+    after = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    for a, b in zip(before, after, strict=True):
+        assert np.abs(np.subtract(a, b)).max() <= 1e-12 * np.abs(a).max()
+    assert off(atoms, held) <= 1e-13
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e6])
+def test_far_from_the_origin(distance):
+    atoms, held = water(Field(0.0), at=distance)
+    dyn = ConstrainedDynamics(atoms, FS)
+    kinetic = atoms.get_kinetic_energy()
+    dyn.run(1000)
+    assert abs(atoms.get_kinetic_energy() / kinetic - 1) <= 1e-10
+    assert off(atoms, held) <= 4 * np.spacing(max(distance, 1.0))
+
+
+def test_velocity_verlet_far_from_the_origin_is_why():
+    atoms, _ = water(Field(0.0), at=1e6)
+    kinetic = atoms.get_kinetic_energy()
+    VelocityVerlet(atoms, FS).run(200)
+    assert abs(atoms.get_kinetic_energy() / kinetic - 1) > 1e-9
+
+
+def test_target_that_moves():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Field(0.0))
+    rate = 0.01 / FS
+    row = Distance([0, 1], lambda t: 1.1 + rate * t)
+    dyn = ConstrainedDynamics(atoms, FS, constraints=row, time=0.0)
+    dyn.run(20)
+    assert dyn.get_time() == pytest.approx(20 * FS)
+    assert atoms.get_distance(0, 1) == pytest.approx(1.3, abs=1e-13)
+    # The rate came into the velocities at the start already.
+    assert atoms.get_velocities()[1, 0] - atoms.get_velocities()[0, 0] == pytest.approx(rate, rel=1e-10)
+    assert dyn.degrees_of_freedom == 5
+
+
+def test_time_can_start_elsewhere():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.2, 0, 0]], calculator=Field(0.0))
+    row = Distance([0, 1], lambda t: 1.1 + 0.01 * t / FS)
+    ConstrainedDynamics(atoms, FS, constraints=[row], time=10 * FS).run(10)
+    assert atoms.get_distance(0, 1) == pytest.approx(1.3, abs=1e-13)
+    with pytest.raises(InputError, match="off row"):
+        ConstrainedDynamics(atoms, FS, constraints=[row], time=0.0)
+
+
+def test_velocity_constraint():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Field(0.0))
+    edge = KnifeEdge(0, 1, [0, 0, 1])
+    atoms.set_momenta([[3.0, 1.0, 0], [1.0, -2.0, 0]])
+    held = constrain(atoms, Distance([0, 1]))
+    dyn = ConstrainedDynamics(atoms, 0.5 * FS, constraints=edge)
+    kinetic = atoms.get_kinetic_energy()
+    for _ in dyn.irun(200):
+        miss = dyn._systems().motion.constraint_set.jacobian(atoms.positions) @ atoms.get_velocities().ravel()
+        assert np.abs(miss).max() <= 1e-13
+    assert off(atoms, held) <= 1e-13
+    assert atoms.get_kinetic_energy() == pytest.approx(kinetic, rel=1e-6)
+    assert dyn.degrees_of_freedom == 4
+
+
+def test_open_velocity_row_on_the_atoms_is_sent_here():
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    with pytest.raises(UnsupportedError, match=r"ConstrainedDynamics\(atoms, timestep, constraints"):
+        constrain(atoms, LinearVelocity(0, [[1, 0, 0]]))
+
+
+def test_ase_constraints_are_absorbed():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_constraint([FixAtoms([8]), FixBondLengths([[0, 1], [1, 2]])])
+    thermalize_momenta(atoms, 50, rng=np.random.default_rng(0))
+    atoms.arrays["momenta"][8] = 0
+    lengths, fixed = (atoms.get_distance(0, 1), atoms.get_distance(1, 2)), atoms.positions[8].copy()
+    dyn = ConstrainedDynamics(atoms, 0.5 * FS)
+    dyn.run(20)
+    assert (atoms.get_distance(0, 1), atoms.get_distance(1, 2)) == pytest.approx(lengths, abs=1e-13)
+    assert np.array_equal(atoms.positions[8], fixed)
+    assert dyn.degrees_of_freedom == 27 - 3 - 2
+    assert dyn.get_temperature() == pytest.approx(atoms.get_temperature())
+
+
+def test_fixed_atoms_of_ase_beside_ours():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_constraint(FixAtoms([8]))
+    held = constrain(atoms, Distance([[0, 1]]))
+    fixed = atoms.positions[8].copy()
+    ConstrainedDynamics(atoms, 0.5 * FS).run(10)
+    assert np.array_equal(atoms.positions[8], fixed) and off(atoms, held) <= 1e-14
+
+
+def test_unknown_ase_constraint_is_refused():
+    from ase.constraints import FixedMode
+
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    atoms.set_constraint(FixedMode(np.ones((3, 3))))
+    with pytest.raises(UnsupportedError, match="FixedMode has no counterpart"):
+        ConstrainedDynamics(atoms, FS)
+
+
+def test_hookean_counts_as_a_force():
+    ours, held = rigid()
+    spring = Hookean(a1=0, a2=3, rt=2.0, k=1.0)
+    ours.set_constraint([held, spring])
+    theirs = ours.copy()
+    theirs.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(ours, FS).run(30)
+    VelocityVerlet(theirs, FS).run(30)
+    assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
+
+
+def test_without_constraints_it_is_velocity_verlet():
+    atoms = molecule("H2O")
+    atoms.calc = Field()
+    thermalize_momenta(atoms, 300, rng=np.random.default_rng(0))
+    peer = atoms.copy()
+    peer.calc = Field()
+    ConstrainedDynamics(atoms, FS).run(100)
+    VelocityVerlet(peer, FS).run(100)
+    assert np.abs(atoms.positions - peer.positions).max() <= 1e-13
+
+
+def boxed() -> tuple[Atoms, Constraints]:
+    atoms, held = water(Field(0.0))
+    atoms.set_cell([6.0, 6.5, 7.0])
+    atoms.pbc = True
+    return atoms, held
+
+
+def test_periodic_box_with_wrapping():
+    atoms, held = boxed()
+    other, _ = boxed()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.attach(atoms.wrap, 3)
+    dyn.run(60)
+    ConstrainedDynamics(other, FS).run(60)
+    turns = (atoms.positions - other.positions) / atoms.cell.lengths()
+    assert np.abs(turns - np.round(turns)).max() <= 1e-11 and np.abs(turns).max() > 0.5
+    assert off(atoms, held) <= 1e-13
+
+
+def test_periodic_box_that_changes():
+    atoms, _ = boxed()
+    other, _ = boxed()
+    dyn = ConstrainedDynamics(atoms, FS)
+    dyn.run(30)
+    engine = dyn._systems().motion
+    atoms.set_cell([6.5, 6.5, 7.0])  # no molecule is cut by the boundary
+    dyn.run(30)
+    assert dyn._systems().motion is engine
+    assert engine.constraint_set.half_width == pytest.approx(3.25)
+    ConstrainedDynamics(other, FS).run(60)
+    assert np.abs(atoms.positions - other.positions).max() <= 1e-13

@@ -1,0 +1,227 @@
+"""Every dynamics class of ASE with the constraint object: right, or a typed error."""
+
+from __future__ import annotations
+
+import warnings
+
+import ase.md
+import ase.optimize
+import numpy as np
+import pytest
+from ase.calculators.emt import EMT
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.contour_exploration import ContourExploration
+from ase.md.langevin import Langevin
+from ase.md.langevinbaoab import LangevinBAOAB
+from ase.md.md import MolecularDynamics
+from ase.md.melchionna import MelchionnaNPT
+from ase.md.nose_hoover_chain import MTKNPT, IsotropicMTKNPT, MaskedMTKNPT, NoseHooverChainNVT
+from ase.md.npt import NPT
+from ase.md.nvtberendsen import NVTBerendsen
+from ase.md.switch_langevin import SwitchLangevin
+from ase.md.velocitydistribution import thermalize_momenta
+from ase.md.verlet import VelocityVerlet
+from ase.optimize import BFGS
+from ase.optimize.optimize import Dynamics
+from ase_systems import (
+    FS,
+    TEMPERATURE,
+    Free,
+    classes_in,
+    dumbbells,
+    ethanol,
+    follow,
+    mean_and_error,
+    off,
+    random,
+    slip,
+)
+
+from kcons.errors import UnsupportedError
+
+# -- dynamics ---------------------------------------------------------------------------------------
+
+
+#: Canonical classes whose mean temperature is right to their standard error.
+CANONICAL = {
+    "Langevin": lambda a: Langevin(a, 2 * FS, temperature_K=TEMPERATURE, friction=0.05 / FS, fixcm=False, rng=random()),
+    "Bussi": lambda a: Bussi(a, 2 * FS, TEMPERATURE, 10 * FS, rng=random()),
+    "NVTBerendsen": lambda a: NVTBerendsen(a, 2 * FS, TEMPERATURE, 50 * FS, fixcm=False),
+    # All velocities are drawn anew at each step; see test_andersen_is_too_cold for less.
+    "Andersen": lambda a: Andersen(a, 1 * FS, TEMPERATURE, 1.0, fixcm=False, rng=random()),
+}
+#: Classes that do not go through the constraints: our error, in how many steps, and what it says.
+REFUSED = {
+    "LangevinBAOAB": (lambda a: LangevinBAOAB(a, FS, temperature_K=TEMPERATURE, T_tau=100 * FS, rng=1), 1, "off row"),
+    "NoseHooverChainNVT": (lambda a: NoseHooverChainNVT(a, FS, TEMPERATURE, 100 * FS), 2, "asks again"),
+    "MelchionnaNPT": (
+        lambda a: MelchionnaNPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS),
+        60,
+        "3 steps in a row",
+    ),
+    "NPT": (
+        lambda a: NPT(a, FS, temperature_K=TEMPERATURE, externalstress=0.0, ttime=50 * FS),
+        60,
+        "3 steps in a row",
+    ),
+}
+#: Classes that refuse constraints themselves.
+REFUSE_THEMSELVES = {
+    "IsotropicMTKNPT": lambda a: IsotropicMTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS),
+    "MTKNPT": lambda a: MTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS),
+    "MaskedMTKNPT": lambda a: MaskedMTKNPT(a, FS, TEMPERATURE, 0.0, 100 * FS, 1000 * FS, mask=(1, 1, 1)),
+}
+TESTED_BY_NAME = {
+    "VelocityVerlet",
+    "NPTBerendsen",
+    "Inhomogeneous_NPTBerendsen",
+    "SwitchLangevin",
+    "ContourExploration",
+}
+
+
+def test_no_dynamics_class_is_forgotten():
+    found = set(classes_in(ase.md, MolecularDynamics, Dynamics)) - {"MolecularDynamics"}
+    assert found == set(CANONICAL) | set(REFUSED) | set(REFUSE_THEMSELVES) | TESTED_BY_NAME
+
+
+def test_velocity_verlet_has_no_energy_slope():
+    atoms, held = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=0.01)
+    thermalize_momenta(atoms, 50, rng=random())  # EMT knows no molecules; hotter, they fall apart
+    kinetic = atoms.get_kinetic_energy()
+    energies = {}
+    for dt, steps in ((0.5, 300), (0.25, 600)):
+        run = atoms.copy()
+        run.calc = EMT()
+        energies[dt] = follow(VelocityVerlet(run, dt * FS), run.get_total_energy, steps)
+        held = run.constraints[0]
+        assert off(run, held) <= 1e-12 and slip(run, held) <= 1e-12
+        drift = np.polyfit(np.linspace(0, 1, steps + 1), energies[dt], 1)[0]
+        assert abs(drift) <= 2e-3 * kinetic
+    # Fluctuations of second order in the time step.
+    assert energies[0.5].std() / energies[0.25].std() == pytest.approx(4, rel=0.15)
+
+
+@pytest.mark.parametrize("name", CANONICAL)
+def test_temperature(name):
+    atoms, held = dumbbells()
+    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 2000)
+    mean, error = mean_and_error(seen[200:])
+    assert error < 6
+    assert abs(mean - TEMPERATURE) <= 3 * error + (0.01 * TEMPERATURE if name == "NVTBerendsen" else 0)
+    assert off(atoms, held) <= 1e-12 and slip(atoms, held) <= 1e-12
+
+
+def test_andersen_is_too_cold():
+    # Velocity components are replaced one at a time and then projected, which takes energy: a known bias of ASE's
+    # class with any constraint, documented. If this fails, ASE has put it right, and docs/ase.md must say so.
+    atoms, held = dumbbells()
+    seen = follow(Andersen(atoms, 2 * FS, TEMPERATURE, 0.1, fixcm=False, rng=random()), atoms.get_temperature, 1500)
+    mean, error = mean_and_error(seen[300:])
+    assert TEMPERATURE - 55 < mean < TEMPERATURE - 5 * error
+    assert off(atoms, held) <= 1e-12
+
+
+def test_nvt_berendsen_heats_translation_at_the_expense_of_rotation():
+    # Not RATTLE: rotation loses energy at each step and the thermostat gives it to all. The temperature is right,
+    # its distribution is not: a known fault of ASE's class with any constraint, documented. If this fails, ASE has
+    # put it right, and docs/ase.md must say so.
+    atoms, held = dumbbells()
+    NVTBerendsen(atoms, 2 * FS, TEMPERATURE, 50 * FS, fixcm=False).run(1200)
+    momenta = atoms.get_momenta().reshape(60, 2, 3).sum(axis=1)
+    translation = (momenta**2).sum() / (2 * atoms.get_masses()[:2].sum())
+    rotation = atoms.get_kinetic_energy() - translation
+    assert translation / 90 > 1.2 * rotation / 60
+    assert off(atoms, held) <= 1e-12
+
+
+def test_langevin_with_two_hamiltonians():
+    atoms, held = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=0.05)
+    thermalize_momenta(atoms, TEMPERATURE, rng=random())
+    dyn = SwitchLangevin(
+        atoms,
+        EMT(),
+        Free(),
+        0.5 * FS,
+        temperature_K=TEMPERATURE,
+        friction=0.02 / FS,
+        n_eq=20,
+        n_switch=40,
+        fixcm=False,
+    )
+    dyn.run()
+    assert len(dyn.path_data) == 40
+    assert off(atoms, held) <= 1e-12
+
+
+def test_contour_exploration_keeps_lengths():
+    atoms, held = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=0.05)
+    target = atoms.get_potential_energy() + 0.3
+    thermalize_momenta(atoms, TEMPERATURE, rng=random())
+    dyn = ContourExploration(atoms, maxstep=0.05, energy_target=target, rng=np.random.RandomState(0))
+    seen = follow(dyn, atoms.get_potential_energy, 100)
+    assert np.abs(seen[50:] - target).mean() < 0.05
+    assert off(atoms, held) <= 1e-12
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_classes_that_move_atoms_past_constraints_are_found(name):
+    make, steps, message = REFUSED[name]
+    atoms, held = dumbbells(10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ASE's own advice about its class
+        with pytest.raises(UnsupportedError, match=f"{message}.*ConstrainedDynamics.*Langevin") as caught:
+            make(atoms).run(steps)
+    assert name in str(caught.value) or name in ("NPT",)
+    # The object still works once the atoms are put right.
+    held.restore(atoms)
+    atoms.set_momenta(atoms.get_momenta())
+    VelocityVerlet(atoms, FS).run(3)
+    assert off(atoms, held) <= 1e-12
+
+
+@pytest.mark.parametrize("name", REFUSE_THEMSELVES)
+def test_classes_that_refuse_constraints_themselves(name):
+    atoms, _ = dumbbells(4)
+    with pytest.raises(NotImplementedError, match="does not support constraints"):
+        REFUSE_THEMSELVES[name](atoms)
+
+
+def test_honest_dynamics_raise_no_alarm():
+    # Positions set again and again between momenta, velocities drawn anew, long steps.
+    atoms, held = dumbbells(6)
+    raw = atoms.positions + random().normal(scale=0.02, size=atoms.positions.shape)
+    for _ in range(4):
+        atoms.set_positions(raw)
+        thermalize_momenta(atoms, 900, rng=random())
+    atoms.set_positions(raw)
+    for _ in range(4):
+        VelocityVerlet(atoms, 8 * FS).run(20)
+        thermalize_momenta(atoms, 900, rng=random())
+    assert off(atoms, held) <= 1e-12
+
+
+def test_momenta_of_edited_atoms():
+    atoms, held = dumbbells(2)
+    before = atoms.get_momenta()
+    atoms.positions[0] += 0.1
+    with pytest.raises(UnsupportedError, match=r"off row #0 Distance\(0, 1\).*restore"):
+        atoms.set_momenta(np.ones((4, 3)))
+    assert np.array_equal(atoms.get_momenta(), before)
+    held.restore(atoms)
+    atoms.set_momenta(np.ones((4, 3)))
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("name", ["Langevin", "Bussi", "Andersen"])
+def test_temperature_long(name):
+    atoms, held = dumbbells()
+    seen = follow(CANONICAL[name](atoms), atoms.get_temperature, 40_000)
+    mean, error = mean_and_error(seen[400:], blocks=20)
+    assert error < 1.5
+    assert abs(mean - TEMPERATURE) <= 3 * error
+    assert off(atoms, held) <= 1e-12

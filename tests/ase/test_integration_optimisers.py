@@ -1,0 +1,128 @@
+"""Every optimiser of ASE with the constraint object: right, or a typed error."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+
+import ase.md
+import ase.optimize
+import numpy as np
+import pytest
+from ase import units
+from ase.build import bulk, molecule
+from ase.calculators.emt import EMT
+from ase.filters import FrechetCellFilter
+from ase.optimize import BFGS, CellAwareBFGS
+from ase.optimize.minimahopping import MinimaHopping
+from ase.optimize.optimize import Dynamics
+from ase_systems import (
+    classes_in,
+    ethanol,
+    off,
+    random,
+)
+
+from kcons.ase import constrain
+from kcons.constraints import Distance
+from kcons.errors import ConvergenceError
+
+# -- optimisers -------------------------------------------------------------------------------------
+
+PLAIN = {
+    "BFGS", "BFGSLineSearch", "FIRE", "FIRE2", "GPMin", "GoodOldQuasiNewton", "LBFGS", "LBFGSLineSearch", "MDMin",
+    "ODE12r", "RFO", "SciPyFminBFGS", "SciPyFminCG",
+}  # fmt: skip
+PRECONDITIONED = {"PreconFIRE", "PreconLBFGS", "PreconODE12r"}
+GRADIENTLESS = {"SciPyFmin", "SciPyFminPowell"}
+ABSTRACT = {"Dynamics", "Optimizer", "SciPyOptimizer", "SciPyGradientlessOptimizer"}
+OTHER = {"BasinHopping", "BFGSClimbFixInternals", "CellAwareBFGS", "oldBFGS"}
+OPTIMISERS = classes_in(ase.optimize, Dynamics)
+
+
+def test_no_optimiser_is_forgotten():
+    assert set(OPTIMISERS) == PLAIN | PRECONDITIONED | GRADIENTLESS | ABSTRACT | OTHER
+
+
+@pytest.mark.parametrize("name", sorted(PLAIN | PRECONDITIONED))
+def test_optimiser(name):
+    atoms, held = ethanol()
+    if name == "GPMin":  # slow
+        atoms = molecule("H2O")
+        atoms.rattle(0.1, rng=random())
+        atoms.calc = EMT()
+        held = constrain(atoms, Distance([[0, 1], [0, 2]]))
+    start = atoms.get_potential_energy()
+    options = {"precon": None} if name in PRECONDITIONED else {}  # ASE's preconditioners know FixAtoms only
+    assert OPTIMISERS[name](atoms, logfile=None, **options).run(fmax=0.05, steps=300)
+    assert np.linalg.norm(atoms.get_forces(), axis=1).max() <= 0.05
+    assert atoms.get_potential_energy() < start - (0.01 if name == "GPMin" else 1.1)
+    assert off(atoms, held) <= 1e-12
+
+
+def test_powell_steps_too_far():
+    # Its trial points are far from each other, too far to follow the rows from one to the next.
+    atoms = molecule("H2O")
+    atoms.calc = EMT()
+    held = constrain(atoms, Distance([[0, 1], [0, 2]]))
+    with pytest.raises(ConvergenceError, match="too large for this geometry"):
+        OPTIMISERS["SciPyFminPowell"](atoms, logfile=None).run(ftol=1e-4, xtol=1e-4, steps=60)
+    assert off(atoms, held) <= 1e-12
+
+
+def test_scipy_fmin_fails_by_itself():
+    atoms = molecule("H2O")
+    atoms.calc = EMT()
+    with pytest.raises(TypeError):
+        OPTIMISERS["SciPyFmin"](atoms, logfile=None).run(ftol=1e-4, xtol=1e-4, steps=60)
+
+
+def test_basin_hopping():
+    atoms, held = ethanol()
+    start = atoms.get_potential_energy()
+    hop = OPTIMISERS["BasinHopping"](atoms, temperature=300 * units.kB, dr=0.1, logfile=None, optimizer_logfile=None)
+    hop.run(3)
+    assert hop.get_minimum()[0] < start - 1.1
+    assert off(atoms, held) <= 1e-12
+
+
+def test_minima_hopping(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    atoms, held = ethanol()
+    BFGS(atoms, logfile=None).run(fmax=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        MinimaHopping(atoms, T0=500.0, timestep=0.5, fmax=0.1, mdmin=1)(totalsteps=1)
+        gc.collect()  # it leaves files open
+    assert off(atoms, held) <= 1e-12
+
+
+@pytest.mark.filterwarnings("ignore:logm result")
+@pytest.mark.parametrize("cls", [CellAwareBFGS, BFGS], ids=lambda c: c.__name__)
+def test_cell_relaxation(cls):
+    atoms = bulk("Cu", cubic=True) * 2
+    atoms.set_cell(np.diag([7.2, 7.22, 7.25]), scale_atoms=True)
+    atoms.rattle(0.02, rng=random())
+    atoms.calc = EMT()
+    held = constrain(atoms, Distance([[0, 1], [4, 5]], [2.5, 2.5]), project=True)
+    options = {"long_output": False} if cls is CellAwareBFGS else {}
+    scale = {"exp_cell_factor": 1.0} if cls is CellAwareBFGS else {}
+    optimiser = cls(FrechetCellFilter(atoms, **scale), logfile=None, **options)
+    run = {"fmax": 0.05, "smax": 0.001} if cls is CellAwareBFGS else {"fmax": 0.05}
+    assert optimiser.run(**run, steps=200)
+    assert np.abs(atoms.get_forces()).max() <= 0.05
+    assert np.abs(atoms.get_stress()).max() <= 0.003
+    assert off(atoms, held) <= 1e-12
+
+
+def test_climbing_needs_ases_own_constraint():
+    atoms, _ = ethanol()
+    with pytest.raises(ValueError, match="FixInternals"):
+        OPTIMISERS["BFGSClimbFixInternals"](atoms, climb_coordinate=[[None, [0, 1]]], logfile=None)
+
+
+def test_old_bfgs_fails_by_itself():
+    atoms = molecule("H2O")
+    atoms.calc = EMT()
+    with pytest.raises(ValueError, match="broadcast"):
+        OPTIMISERS["oldBFGS"](atoms, logfile=None).run(fmax=0.05)
