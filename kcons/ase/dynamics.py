@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
+from operator import is_
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
-from kcons.ase.host import require_on_surface
+from kcons.ase.host import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
@@ -45,6 +47,9 @@ class ConstrainedDynamics(MolecularDynamics):
         Time at the start, for targets that move.
     forces : array_like, shape (n_atoms, 3), optional
         Applied forces at the start, if known (from a trajectory); saves one evaluation.
+    state : State, optional
+        Go on from here: what `state` of another run gave, or `State.load` read. Positions, momenta, time, forces and
+        the number of steps are taken from it, `time` and `forces` are not looked at.
     degenerate : {'convert', 'raise'}
         See `Constraints`.
     trajectory, logfile, loginterval, **kwargs
@@ -53,16 +58,18 @@ class ConstrainedDynamics(MolecularDynamics):
     Raises
     ------
     InputError
-        Time step not finite; atoms off their constraints (see `Constraints.restore`).
+        Time step not finite; atoms off their constraints (see `Constraints.restore`); a state of other atoms.
     UnsupportedError
-        An ASE constraint on the atoms that kcons cannot hold.
+        An ASE constraint on the atoms that kcons cannot hold; a stepper that cannot do what is asked of it.
 
     Notes
     -----
-    Where a step fails, atoms keep positions and momenta of the last good step, and the error names the step.
-    A run continued from the positions and momenta of a trajectory is the same to the last bit, if the
-    calculator gives the same forces; only far from the origin (more than 128 times the size of the system)
-    the object in memory knows more than the file.
+    Where a step fails, atoms keep positions and momenta of the last good step, and the error names the step; an
+    exception of the calculator itself passes through, with the number of the step in its attribute `step`.
+
+    A run that is continued is the same to the last bit, if the calculator gives the same forces: from the positions
+    and momenta of a trajectory; or, where targets move or the system is far from the origin (more than 128
+    times its size), from `state`, which knows what rounding took from time and positions.
     """
 
     def __init__(
@@ -74,6 +81,7 @@ class ConstrainedDynamics(MolecularDynamics):
         constraints: Constraint | Iterable[Constraint] = (),
         time: float = 0.0,
         forces: ArrayLike | None = None,
+        state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
         **kwargs: Any,
     ) -> None:
@@ -89,11 +97,14 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
+        self._resumed: FloatArray | None = None  # velocities of a state that was given, until the first step
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
         super().__init__(atoms, timestep, **kwargs)
-        self._start()
+        if state is not None:
+            self._resume(state)
+        self._start(self._systems())
 
     # -- what a person asks for -----------------------------------------------------------------
 
@@ -105,6 +116,11 @@ class ConstrainedDynamics(MolecularDynamics):
     def get_time(self) -> float:
         """The time reached, in ASE's unit; right also if the time step was changed."""
         return self.time
+
+    @property
+    def state(self) -> State:
+        """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`."""
+        return self._start(self._systems())
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -133,42 +149,54 @@ class ConstrainedDynamics(MolecularDynamics):
             No solution: the time step is too large; carries `step`.
         """
         system = self._systems()
-        state = self._start()
-        positions, momenta = state.positions, self.atoms.arrays["momenta"].copy()
+        state = self._start(system)
         try:
             after = self.stepper.step(system, state, self.dt)
         except BaseException as error:
-            self._put(positions, momenta)
-            if not getattr(error, "step", None):
-                error.add_note(f"in step {self.nsteps + 1}; the atoms are as they were before it")
+            self._put(state.positions, self._momenta)
+            self._name_step(error, self.nsteps + 1)
             raise
         self._momenta = after.velocities * self._weights[0]
         self._put(after.positions, self._momenta)
-        self._state = after
-        self.time = after.time
+        self._state, self.time, self._resumed = after, after.time, None
+
+    def _name_step(self, error: BaseException, number: int) -> None:
+        if getattr(error, "step", None) is None:
+            with suppress(AttributeError):
+                error.step = number  # type: ignore[attr-defined]
+            error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
-            self.atoms.get_forces()
+            state = self._start(self._systems())
+            try:
+                self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
+            except Exception as error:
+                self._name_step(error, self.nsteps)
+                raise
 
     def _put(self, positions: FloatArray, momenta: FloatArray) -> None:
-        self.atoms.set_positions(positions, apply_constraint=False)
-        self.atoms.set_momenta(momenta, apply_constraint=False)
+        arrays = self.atoms.arrays
+        arrays["positions"][...] = positions
+        arrays["momenta"][...] = momenta
 
-    def _start(self) -> State:
+    def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
-        system = self._systems()
-        x, p = self.atoms.arrays["positions"], self.atoms.arrays["momenta"]
-        masses, divisors = self._weights
-        v = p / divisors  # always from the momenta, as after a restart from a file
+        atoms = self.atoms
+        x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
-        same = last is not None and cell == self._cell and np.array_equal(last.positions, x)
-        if last is not None and same and np.array_equal(self._momenta, p):
-            return State(last.positions, v, self.time, last.forces, self.nsteps, last.remainder)
-        held = system.motion.constraint_set
-        require_on_surface(held, x, self.time)
+        cell = atoms.cell.array.tobytes() + atoms.pbc.tobytes()
+        same = last is not None and cell == self._cell and bool((last.positions == x).all())
+        if last is not None and same and (self._momenta == p).all():
+            # Velocities always come from the momenta, as after a restart from a file.
+            v = p / self._weights[1] if self._resumed is None else self._resumed
+            remainder = last.time_remainder if last.time == self.time else 0.0
+            return State(last.positions, v, self.time, last.forces, self.nsteps, last.remainder, remainder)
+        masses, divisors = self._weights
+        v = p / divisors
+        self._resumed = None
+        require_on_surface(system.motion.constraint_set, x, self.time)
         state = system.initial_state(x, v, time=self.time, project=True)
         forces = last.forces if last is not None and same and not system.velocity_dependent else self._forces
         self._forces = None
@@ -181,6 +209,23 @@ class ConstrainedDynamics(MolecularDynamics):
         self._state, self._cell = state, cell
         return state
 
+    def _resume(self, state: State) -> None:
+        """Go on from `state` exactly; the atoms are changed only if it fits them."""
+        system = self._systems()
+        n = len(self.atoms)
+        x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
+        require_on_surface(system.motion.constraint_set, x, state.time)
+        away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
+        if away > START_TOLERANCE * np.abs(v).max(initial=0.0):
+            raise InputError(
+                f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?", item="state"
+            )
+        self.time, self.nsteps = float(state.time), int(state.step)
+        self._momenta = v * self._weights[0]
+        self._put(x, self._momenta)
+        self._state, self._resumed = state, v
+        self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
+
     # -- the system -----------------------------------------------------------------------------
 
     def _systems(self) -> System:
@@ -188,7 +233,7 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         present = tuple(atoms.constraints)
         known = self._present
-        if known is None or len(present) != len(known) or any(a is not b for a, b in zip(present, known, strict=True)):
+        if known is None or len(present) != len(known) or not all(map(is_, present, known)):
             self._bound = None
         bound = self._bound
         if bound is None or not bound.fits(atoms):
@@ -197,7 +242,9 @@ class ConstrainedDynamics(MolecularDynamics):
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
+            self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
             self._system = System(bound.motion, self._force)
+            self.stepper.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
             self._weights = (
@@ -220,8 +267,11 @@ class ConstrainedDynamics(MolecularDynamics):
         return rows
 
     def _force(self, x: FloatArray, time: float) -> ArrayLike:
-        self.atoms.set_positions(x, apply_constraint=False)
-        return applied_forces(self.atoms)
+        self.atoms.arrays["positions"][...] = x
+        if self._only_forces:
+            return applied_forces(self.atoms)
+        forces: ArrayLike = self.atoms.get_forces(apply_constraint=False)
+        return forces
 
 
 def _check_timestep(timestep: float) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from ase import Atoms
@@ -24,7 +22,6 @@ from ase_systems import (
 from kcons.ase import ConstrainedDynamics, Constraints, constrain
 from kcons.constraints import Distance, KnifeEdge, LinearVelocity
 from kcons.errors import InputError, UnsupportedError
-from kcons.steppers import Rattle
 
 # -- right ------------------------------------------------------------------------------------------
 
@@ -38,33 +35,6 @@ def test_follows_velocity_verlet():
     assert np.abs(ours.positions - theirs.positions).max() <= 1e-9
     assert np.abs(ours.get_velocities() - theirs.get_velocities()).max() <= 1e-9
     assert off(ours, held) <= 1e-13
-
-
-class Suzuki:
-    """Order 4 by five steps of RATTLE, as any stepper may be given."""
-
-    order, reversible, force_evaluations = 4, True, 5
-
-    def step(self, system, state, dt):
-        share = 1 / (4 - 4 ** (1 / 3))
-        number = state.step + 1
-        for weight in (share, share, 1 - 4 * share, share, share):
-            state = Rattle().step(system, state, weight * dt)
-        return replace(state, step=number)
-
-
-@pytest.mark.parametrize("stepper", [Rattle(), Suzuki()], ids=lambda s: type(s).__name__)
-def test_order_of_the_stepper(stepper):
-    errors, final = [], None
-    for dt in (1 / 16, 1.0, 0.5):
-        atoms, _ = water(temperature=600)
-        ConstrainedDynamics(atoms, dt * FS, stepper).run(round(20 / dt))
-        if final is None:
-            final = atoms.get_positions()
-        else:
-            errors.append(np.abs(atoms.positions - final).max())
-    # The reference itself is 1/16 and 1/8 of the steps away.
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(stepper.order, abs=0.15)
 
 
 def test_free_flight_of_a_rigid_body():

@@ -60,7 +60,10 @@ def test_forces_are_not_computed_for_nobody():
     class Lazy:
         """Ends without forces, as some compositions do."""
 
-        order, reversible, force_evaluations = 1, False, 0
+        order, reversible, symplectic, force_evaluations = 1, False, False, 0
+
+        def check(self, system):
+            pass
 
         def step(self, system, state, dt):
             return replace(state, positions=state.positions + dt * state.velocities, forces=None, step=state.step + 1)
