@@ -1,19 +1,36 @@
-"""Our dynamics class beside ASE's: far from the origin, with a bond that is pulled, and the pressure of a gas.
+"""Our dynamics class beside ASE's: accuracy, cost, pressure, temperature.
 
-Run with ``python examples/05_ase_dynamics.py``; a few seconds.
+``python examples/05_ase_dynamics.py`` takes a few seconds. With ``--full --out docs/results/ase_dynamics.json`` it
+measures everything that docs/ase.md shows (minutes); ``--show FILE`` prints such a file.
 """
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.langevin import Langevin
+from ase.md.md import MolecularDynamics
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, constrain, rigid_water
+from kcons.compare import environment
 from kcons.constraints import Distance
-from kcons.steppers import Rattle
+from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
+
+FS = units.fs
+BAR = 1e5 * units.Pascal
 
 
 class Free(Calculator):
@@ -26,81 +43,290 @@ class Free(Calculator):
         self.results = {"energy": 0.0, "forces": np.zeros((len(atoms), 3)), "stress": np.zeros(6)}
 
 
-def water(at: float) -> Atoms:
-    """One rigid water molecule at a distance from the origin."""
-    atoms = molecule("H2O")
-    atoms.positions += at
-    atoms.calc = Free()
-    constrain(atoms, rigid_water(atoms))
-    thermalize_momenta(atoms, 300, rng=np.random.default_rng(1))
+def waters(n: int, spacing: float, *, hold: bool = True, periodic: bool = False) -> Atoms:
+    """Free rigid waters in random orientations on a grid, at 300 K."""
+    rng = np.random.default_rng(0)
+    side = int(np.ceil(round(n ** (1 / 3), 6)))
+    x = np.empty((n, 3, 3))
+    for k in range(n):
+        one = molecule("H2O")
+        one.rotate(rng.uniform(0, 360), rng.normal(size=3))
+        x[k] = one.positions + spacing * np.array(np.unravel_index(k, (side, side, side)))
+    atoms = Atoms("OHH" * n, positions=x.reshape(-1, 3), calculator=Free())
+    if periodic:
+        atoms.set_cell([spacing * side] * 3)
+        atoms.pbc = True
+    if hold:
+        constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
+    thermalize_momenta(atoms, 300, rng=rng)
     return atoms
 
 
-def far_from_the_origin(steps: int) -> None:
-    print(f"Kinetic energy lost by a free rigid water in {steps} steps of 1 fs (relative)")
-    print("  distance/A  VelocityVerlet  ConstrainedDynamics")
-    for distance in (0.0, 1e3, 1e6):
-        change = []
-        for dynamics in (VelocityVerlet, ConstrainedDynamics):
-            atoms = water(distance)
-            before = atoms.get_kinetic_energy()
-            dynamics(atoms, 1 * units.fs).run(steps)
-            change.append(abs(atoms.get_kinetic_energy() / before - 1))
-        print(f"  {distance:10.0e}  {change[0]:14.1e}  {change[1]:19.1e}")
+def dumbbells(n: int, side: float = 60.0) -> Atoms:
+    """An ideal gas of rigid CO in a periodic box."""
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=(n, 3))
+    axis *= 1.1 / np.linalg.norm(axis, axis=1)[:, None]
+    x = np.empty((2 * n, 3))
+    x[0::2] = rng.uniform(0, side, size=(n, 3))
+    x[1::2] = x[0::2] + axis
+    atoms = Atoms("CO" * n, positions=x, cell=[side] * 3, pbc=True, calculator=Free())
+    constrain(atoms, Distance(np.arange(2 * n).reshape(-1, 2)))
+    thermalize_momenta(atoms, 300, rng=rng)
+    return atoms
+
+
+# -- accuracy ---------------------------------------------------------------------------------------
+
+
+def far_from_the_origin(steps: int) -> list[dict]:
+    """Kinetic energy lost by a free rigid CO far from the origin."""
+    rows = []
+    for timestep in (1.0, 0.02):
+        for distance in (0.0, 1e3, 1e6, 1e9):
+            change = []
+            for dynamics in (VelocityVerlet, ConstrainedDynamics):
+                atoms = Atoms("CO", positions=np.array([[0, 0, 0], [1.1, 0, 0]]) + distance, calculator=Free())
+                constrain(atoms, Distance([0, 1]))
+                thermalize_momenta(atoms, 300, rng=np.random.default_rng(3))
+                before = atoms.get_kinetic_energy()
+                dynamics(atoms, timestep * FS).run(steps)
+                change.append(abs(atoms.get_kinetic_energy() / before - 1))
+            rows.append(
+                {"distance": distance, "timestep_fs": timestep, "steps": steps, "ase": change[0], "kcons": change[1]}
+            )
+    return rows
+
+
+def ethanol() -> tuple[Atoms, Callable[[], Calculator], str]:
+    """Ethanol whose X-H bonds are held, by GFN2-xTB where tblite is installed."""
+    try:
+        from tblite.ase import TBLite
+    except ImportError:
+        name, temperature, calculator = "EMT", 50, EMT
+    else:
+        name, temperature = "GFN2-xTB", 300
+
+        def calculator() -> Calculator:
+            return TBLite(method="GFN2-xTB", accuracy=0.01, verbosity=0)
+
+    atoms = molecule("CH3CH2OH")
+    hydrogen, heavy = np.flatnonzero(atoms.numbers == 1), np.flatnonzero(atoms.numbers != 1)
+    nearest = heavy[np.argmin(atoms.get_all_distances()[np.ix_(hydrogen, heavy)], axis=1)]
+    constrain(atoms, Distance(np.stack([nearest, hydrogen], axis=1)))
+    thermalize_momenta(atoms, temperature, rng=np.random.default_rng(0))
+    return atoms, calculator, name
+
+
+def energy_at_equal_evaluations(evaluations: int, time_fs: float) -> list[dict]:
+    """Largest deviation of the total energy over the same time with about as many force evaluations."""
+    start, calculator, forces = ethanol()
+    rows = []
+    for stepper in (Rattle(), Suzuki4(), BlanesMoan4(), BlanesMoan6()):
+        steps = round(evaluations / stepper.force_evaluations)
+        atoms = start.copy()
+        atoms.calc = calculator()
+        energies: list[float] = []
+        dynamics = ConstrainedDynamics(atoms, time_fs / steps * FS, stepper)
+        dynamics.attach(lambda atoms=atoms, energies=energies: energies.append(atoms.get_total_energy()))
+        dynamics.run(steps)
+        rows.append(
+            {
+                "stepper": repr(stepper),
+                "forces": forces,
+                "timestep_fs": time_fs / steps,
+                "evaluations": steps * stepper.force_evaluations,
+                "deviation_ev": float(np.abs(np.array(energies) - energies[0]).max()),
+            }
+        )
+    return rows
+
+
+# -- cost -------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Adds up the time spent in functions."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def wrap(self, call: Callable) -> Callable:
+        def timed(*args, **kwargs):
+            start = time.perf_counter()
+            result = call(*args, **kwargs)
+            self.seconds += time.perf_counter() - start
+            return result
+
+        return timed
+
+
+class Timed:
+    """One dynamics object, whole steps and their parts."""
+
+    def __init__(self, dynamics: MolecularDynamics) -> None:
+        self.dynamics = dynamics
+        self.forces, self.projections = Clock(), Clock()
+        self.samples: list[tuple[float, float, float]] = []
+        dynamics.run(3)
+        if isinstance(dynamics, ConstrainedDynamics):
+            system = dynamics._systems()
+            motion = system.motion
+            motion.project_positions = self.projections.wrap(motion.project_positions)
+            motion.project_velocities = self.projections.wrap(motion.project_velocities)
+            system.force = self.forces.wrap(system.force)
+
+    def sample(self, steps: int) -> None:
+        self.forces.seconds = self.projections.seconds = 0.0
+        start = time.perf_counter()
+        self.dynamics.run(steps)
+        whole = time.perf_counter() - start
+        self.samples.append((whole / steps, self.forces.seconds / steps, self.projections.seconds / steps))
+
+    def result(self) -> dict:
+        whole, forces, projections = (1e6 * float(t) for t in np.median(self.samples, axis=0))
+        found = {"step_us": whole}
+        if forces:
+            found |= {"forces_us": forces, "projections_us": projections}
+        return found
+
+
+def cost(n: int, repeats: int) -> list[dict]:
+    """Whole ASE steps of n rigid waters with a calculator that does nothing, taken in turn; medians."""
+
+    def ours(stepper: Stepper) -> MolecularDynamics:
+        return ConstrainedDynamics(waters(n, 5.0), FS, stepper)
+
+    runs = {
+        "VelocityVerlet, nothing held": Timed(VelocityVerlet(waters(n, 5.0, hold=False), FS)),
+        "VelocityVerlet": Timed(VelocityVerlet(waters(n, 5.0), FS)),
+    }
+    for stepper in (Rattle(), Suzuki4(), BlanesMoan4(), KahanLi6(), BlanesMoan6()):
+        runs[f"ConstrainedDynamics, {stepper!r}"] = Timed(ours(stepper))
+    for _ in range(repeats):
+        for timed in runs.values():
+            timed.sample(5)
+    return [{"waters": n, "dynamics": name, **timed.result()} for name, timed in runs.items()]
+
+
+# -- statistics -------------------------------------------------------------------------------------
+
+
+def _mean_and_error(values: list[float], skip: int, blocks: int = 20) -> tuple[float, float]:
+    kept = np.array(values[skip:])
+    means = kept[len(kept) % blocks :].reshape(blocks, -1).mean(axis=1)
+    return float(means.mean()), float(means.std(ddof=1) / np.sqrt(blocks))
+
+
+def statistics(steps: int) -> list[dict]:
+    """Temperature of rigid CO under ASE's thermostats, and the pressure of rigid water."""
+    rows = []
+    thermostats = {
+        "Langevin": lambda a, rng: Langevin(a, 2 * FS, temperature_K=300, friction=0.05 / FS, fixcm=False, rng=rng),
+        "Bussi": lambda a, rng: Bussi(a, 2 * FS, 300, 10 * FS, rng=rng),
+        "Andersen, probability 1": lambda a, rng: Andersen(a, FS, 300, 1.0, fixcm=False, rng=rng),
+    }
+    for name, make in thermostats.items():
+        atoms = dumbbells(60)
+        seen: list[float] = []
+        dynamics = make(atoms, np.random.default_rng(1))
+        dynamics.attach(lambda atoms=atoms, seen=seen: seen.append(atoms.get_temperature()))
+        dynamics.run(steps)
+        mean, error = _mean_and_error(seen, steps // 100)
+        rows.append({"what": f"{name}: temperature of 60 CO, K", "expected": 300.0, "mean": mean, "error": error})
+    atoms = waters(27, 8.0, periodic=True)
+    dynamics = Langevin(atoms, FS, temperature_K=300, friction=0.02 / FS, fixcm=False, rng=np.random.default_rng(5))
+    pressures: list[float] = []
+    dynamics.attach(lambda: pressures.append(-atoms.get_stress(include_ideal_gas=True)[:3].mean() / BAR), interval=5)
+    dynamics.run(steps)
+    mean, error = _mean_and_error(pressures, len(pressures) // 100)
+    expected = 27 * units.kB * 300 / atoms.get_volume() / BAR
+    rows.append(
+        {"what": "Langevin: pressure of 27 free waters, bar", "expected": expected, "mean": mean, "error": error}
+    )
+    return rows
+
+
+# -- a bond that is pulled --------------------------------------------------------------------------
 
 
 def pulled_bond(steps: int) -> None:
     atoms = molecule("CH3CH2OH")
     atoms.calc = EMT()
     length = atoms.get_distance(0, 1)
-    rate = 0.002 / units.fs
+    rate = 0.002 / FS
     bond = Distance([[0, 1]], lambda t: length + rate * t)
-    dynamics = ConstrainedDynamics(atoms, 0.5 * units.fs, Rattle(), constraints=[bond])
+    dynamics = ConstrainedDynamics(atoms, 0.5 * FS, BlanesMoan4(), constraints=[bond])
 
-    print("\nThe C-C bond of ethanol, pulled at 0.002 A/fs")
+    print("The C-C bond of ethanol, pulled at 0.002 A/fs")
     print("  time/fs  length/A  length - target/A  potential energy/eV")
 
     def show() -> None:
-        time = dynamics.get_time()
         now = atoms.get_distance(0, 1)
-        miss = now - length - rate * time
-        print(f"  {time / units.fs:7.1f}  {now:8.5f}  {miss:17.1e}  {atoms.get_potential_energy():19.4f}")
+        miss = now - length - rate * dynamics.get_time()
+        print(f"  {dynamics.get_time() / FS:7.1f}  {now:8.5f}  {miss:17.1e}  {atoms.get_potential_energy():19.4f}")
 
     dynamics.attach(show, interval=max(1, steps // 4))
     dynamics.run(steps)
+    print()
 
 
-def pressure_of_a_gas(draws: int) -> None:
-    rng = np.random.default_rng(0)
-    atoms = Atoms(cell=[24.0] * 3, pbc=True)
-    for place in np.ndindex(3, 3, 3):
-        one = molecule("H2O")
-        one.rotate(rng.uniform(0, 360), rng.normal(size=3))
-        one.translate(8.0 * np.array(place))
-        atoms += one
-    atoms.calc = Free()
-    constrain(atoms, rigid_water(atoms))
-    seen = []
-    for _ in range(draws):
-        thermalize_momenta(atoms, 300, rng=rng)
-        with_constraints, without = (
-            -atoms.get_stress(include_ideal_gas=True, apply_constraint=use)[:3].mean() for use in (True, False)
-        )
-        seen.append((with_constraints, without))
-    bar = 1e5 * units.Pascal
-    mean = np.mean(seen, axis=0) / bar
-    error = np.std(seen, axis=0)[0] / np.sqrt(draws) / bar
-    expected = 27 * units.kB * 300 / atoms.get_volume() / bar
-    print("\nPressure of 27 free rigid waters at 300 K, in bar")
-    print(
-        f"  N k T / V {expected:.1f}; found {mean[0]:.1f} +- {error:.1f}; without the constraints' part {mean[1]:.1f}"
-    )
+# -- all of it --------------------------------------------------------------------------------------
 
 
-def main(steps: int = 1000) -> None:
-    far_from_the_origin(steps)
-    pulled_bond(max(4, steps // 10))
-    pressure_of_a_gas(max(10, steps // 5))
+def run(full: bool) -> dict:
+    return {
+        "full": full,
+        "machine": environment(),
+        "cost": [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 25 if full else 3)],
+        "far": far_from_the_origin(1000 if full else 50),
+        "energy": energy_at_equal_evaluations(*((960, 480.0) if full else (48, 24.0))),
+        "statistics": statistics(60_000 if full else 200),
+    }
+
+
+def show(result: dict) -> None:
+    print("Microseconds a step of 1 fs, rigid waters, a calculator that does nothing")
+    print("(left over: kicks, drifts, checks and ASE's loop, as a multiple of the projections)")
+    print("waters  dynamics                                whole   forces  projections  left over")
+    for r in result["cost"]:
+        line = f"{r['waters']:6d}  {r['dynamics']:36s} {r['step_us']:8.0f}"
+        if "forces_us" in r:
+            rest = r["step_us"] - r["forces_us"] - r["projections_us"]
+            line += f" {r['forces_us']:8.0f} {r['projections_us']:12.0f} {rest / r['projections_us']:10.2f}"
+        print(line)
+    steps = result["far"][0]["steps"]
+    print(f"\nKinetic energy lost by a free rigid CO in {steps} steps (relative)")
+    print("step/fs  distance/A  VelocityVerlet  ConstrainedDynamics")
+    for r in result["far"]:
+        print(f"{r['timestep_fs']:7.2f}  {r['distance']:10.0e}  {r['ase']:14.1e}  {r['kcons']:19.1e}")
+    print(f"\nEthanol by {result['energy'][0]['forces']}, X-H bonds held: largest deviation of the total energy")
+    print("stepper         step/fs  evaluations  deviation/eV")
+    for r in result["energy"]:
+        print(f"{r['stepper']:14s} {r['timestep_fs']:8.2f} {r['evaluations']:12d} {r['deviation_ev']:13.1e}")
+    print("\nStatistics under ASE's thermostats           expected    found  standard error")
+    for r in result["statistics"]:
+        print(f"{r['what']:42s} {r['expected']:10.2f} {r['mean']:8.2f} {r['error']:15.2f}")
+    computer = result["machine"]
+    versions = ", ".join(f"{name} {v}" for name, v in computer["versions"].items() if v and name != "kcons")
+    print(f"\n{computer['cpu']}; {versions}")
+    print(f"commit {computer['commit']}, {computer['date']}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="everything that the page shows; minutes")
+    parser.add_argument("--out", type=Path, help="JSON file for the results")
+    parser.add_argument("--show", type=Path, help="print an earlier result and stop")
+    options = parser.parse_args()
+    if options.show:
+        show(json.loads(options.show.read_text(encoding="utf-8")))
+        return
+    pulled_bond(40)
+    result = run(options.full)
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    show(result)
 
 
 if __name__ == "__main__":
