@@ -205,7 +205,7 @@ def cost(n: int, repeats: int) -> list[dict]:
         runs[f"ConstrainedDynamics, {stepper!r}"] = Timed(ours(stepper))
     for _ in range(repeats):
         for timed in runs.values():
-            timed.sample(5)
+            timed.sample(1)
     return [{"waters": n, "dynamics": name, **timed.result()} for name, timed in runs.items()]
 
 
@@ -224,7 +224,7 @@ def statistics(steps: int) -> list[dict]:
     thermostats = {
         "Langevin": lambda a, rng: Langevin(a, 2 * FS, temperature_K=300, friction=0.05 / FS, fixcm=False, rng=rng),
         "Bussi": lambda a, rng: Bussi(a, 2 * FS, 300, 10 * FS, rng=rng),
-        "Andersen, probability 1": lambda a, rng: Andersen(a, FS, 300, 1.0, fixcm=False, rng=rng),
+        "Andersen, all drawn": lambda a, rng: Andersen(a, FS, 300, 1.0, fixcm=False, rng=rng),
     }
     for name, make in thermostats.items():
         atoms = dumbbells(60)
@@ -278,7 +278,7 @@ def run(full: bool) -> dict:
     return {
         "full": full,
         "machine": environment(),
-        "cost": [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 25 if full else 3)],
+        "cost": [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 101 if full else 5)],
         "far": far_from_the_origin(1000 if full else 50),
         "energy": energy_at_equal_evaluations(*((960, 480.0) if full else (48, 24.0))),
         "statistics": statistics(60_000 if full else 200),
@@ -304,9 +304,9 @@ def show(result: dict) -> None:
     print("stepper         step/fs  evaluations  deviation/eV")
     for r in result["energy"]:
         print(f"{r['stepper']:14s} {r['timestep_fs']:8.2f} {r['evaluations']:12d} {r['deviation_ev']:13.1e}")
-    print("\nStatistics under ASE's thermostats           expected    found  standard error")
+    print("\nStatistics under ASE's thermostats             expected    found  standard error")
     for r in result["statistics"]:
-        print(f"{r['what']:42s} {r['expected']:10.2f} {r['mean']:8.2f} {r['error']:15.2f}")
+        print(f"{r['what']:44s} {r['expected']:10.2f} {r['mean']:8.2f} {r['error']:15.2f}")
     computer = result["machine"]
     versions = ", ".join(f"{name} {v}" for name, v in computer["versions"].items() if v and name != "kcons")
     print(f"\n{computer['cpu']}; {versions}")
