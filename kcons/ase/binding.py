@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, Literal
 
 import ase.constraints
@@ -15,7 +16,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
 
 #: Arrays up to this length are compared fastest as bytes.
@@ -57,6 +58,18 @@ class Binding:
         if self.mass_bytes is not None:
             return bool(values.tobytes() == self.mass_bytes)
         return bool((values == self.mass_values).all())
+
+    def require_finite(self, values: NDArray[Any], what: str) -> None:
+        """Refuse NaN and infinity also on atoms that no row holds, which the engine does not look at."""
+        if self.all_touched or isfinite(np.vdot(values, values)):
+            return
+        bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"{what} of atom {bad[0]} is not finite: {values[bad[0]]}; look at what the calculator returned",
+                item=what,
+                atoms=[bad[0]],
+            )
 
     def follow_cell(self, atoms: Atoms, cell: FloatArray) -> None:
         """Let the engine know the cell, if it has changed; an `InputError` leaves it as it was."""

@@ -143,6 +143,7 @@ class Constraints(FixConstraint):
     def adjust_positions(self, atoms: Atoms, new: FloatArray) -> None:
         """Correct `new` in place, along the gradients at ``atoms.positions``; unchanged if that fails."""
         bound = self._bound(atoms)
+        bound.require_finite(new, "position")
         old = atoms.arrays["positions"]
         if not self._on_surface:
             require_on_surface(bound.motion.constraint_set, old)
@@ -171,19 +172,25 @@ class Constraints(FixConstraint):
             dynamics do not respect constraints.
         """
         bound = self._bound(atoms)
+        bound.require_finite(momenta, "momentum")
         if momenta.shape == (bound.n_atoms, 3):  # otherwise the engine complains
             if not self._on_surface:
                 require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
                 self._on_surface = True
             self._watch.check_momenta(bound.motion.constraint_set, bound.cell, atoms.arrays["positions"])
-        if bound.weights is None or momenta.shape != bound.weights[0].shape:
-            # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
-            self._project_covector(atoms, momenta)
-            return
-        masses, inverse_masses, velocities = bound.weights
-        np.multiply(momenta, inverse_masses, velocities)
-        bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
-        np.multiply(velocities, masses, momenta)
+        try:
+            if bound.weights is None or momenta.shape != bound.weights[0].shape:
+                # The same for momenta and forces: p - A^T (A M^-1 A^T)^-1 A M^-1 p.
+                self._project_covector(atoms, momenta)
+                return
+            masses, inverse_masses, velocities = bound.weights
+            np.multiply(momenta, inverse_masses, velocities)
+            bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
+            np.multiply(velocities, masses, momenta)
+        except InputError as error:
+            if not np.isfinite(momenta).all():
+                error.add_note("In dynamics, momenta come from forces: look at what the calculator returned")
+            raise
 
     def adjust_stress(self, atoms: Atoms, stress: FloatArray) -> None:
         """Add the constraints' part in place, Voigt order: -(1/V) sum of r (x) z over the rows.
@@ -210,6 +217,7 @@ class Constraints(FixConstraint):
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""
+        self._bound(atoms).require_finite(forces, "force")
         self._project_covector(atoms, forces)
 
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:

@@ -1,0 +1,109 @@
+"""A calculator that fails under ASE's own classes: typed error, no array changed by a hook, trajectories readable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.io import read
+from ase.io.trajectory import Trajectory
+from ase.md.andersen import Andersen
+from ase.md.bussi import Bussi
+from ase.md.langevin import Langevin
+from ase.md.nvtberendsen import NVTBerendsen
+from ase.md.verlet import VelocityVerlet
+from ase.optimize import BFGS, FIRE, LBFGS, MDMin
+from ase_systems import FS, TEMPERATURE, Field, equal, off, random, state, water
+
+from kcons.ase import constrain
+from kcons.constraints import Distance
+from kcons.errors import InputError
+
+DYNAMICS = {
+    "VelocityVerlet": lambda a: VelocityVerlet(a, FS),
+    "Langevin": lambda a: Langevin(a, FS, temperature_K=TEMPERATURE, friction=0.01 / FS, fixcm=False, rng=random()),
+    "Bussi": lambda a: Bussi(a, FS, TEMPERATURE, 50 * FS, rng=random()),
+    "Andersen": lambda a: Andersen(a, FS, TEMPERATURE, 0.1, fixcm=False, rng=random()),
+    "NVTBerendsen": lambda a: NVTBerendsen(a, FS, TEMPERATURE, 50 * FS, fixcm=False),
+}
+
+
+def no_numbers(forces):
+    forces = np.array(forces)
+    forces[1, 2] = np.nan
+    return forces
+
+
+def no_result(forces):
+    raise RuntimeError("no convergence")
+
+
+FAILURES = {
+    "nan": (no_numbers, InputError, "atom 1 is not finite"),
+    "shape": (lambda f: f[:2], ValueError, "shape"),  # ASE's arithmetic, before any hook
+    "raises": (no_result, RuntimeError, "no convergence"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+@pytest.mark.parametrize("name", DYNAMICS)
+def test_dynamics(name, case, tmp_path):
+    how, error, message = FAILURES[case]
+    atoms, held = water(Field(how=how))
+    good, _ = water()
+    dyn, peer = DYNAMICS[name](atoms), DYNAMICS[name](good)
+    peer.run(3)
+
+    def spoil():
+        if dyn.nsteps == 3:
+            atoms.calc.bad = 0
+
+    with Trajectory(tmp_path / "md.traj", "w", atoms) as file:
+        dyn.attach(file.write)
+        dyn.attach(spoil)
+        with pytest.raises(error, match=message) as caught:
+            dyn.run(20)
+    assert dyn.nsteps == 3
+    if case == "nan":
+        assert any("calculator" in note for note in caught.value.__notes__)
+    assert np.isfinite(atoms.positions).all() and np.isfinite(atoms.get_momenta()).all()
+    assert off(atoms, held) <= 1e-14
+    frames = read(tmp_path / "md.traj", index=":")
+    assert len(frames) == 4
+    assert equal(state(frames[-1]), state(good))
+
+
+@pytest.mark.parametrize("case", FAILURES)
+@pytest.mark.parametrize("cls", [BFGS, LBFGS, FIRE, MDMin], ids=lambda c: c.__name__)
+def test_optimiser(cls, case):
+    class Spoiled(EMT):
+        left = 3
+
+        def get_forces(self, atoms=None):
+            forces = super().get_forces(atoms)
+            self.left -= 1
+            return forces if self.left > 0 else how(forces)
+
+    how, error, _ = FAILURES[case]
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = Spoiled()
+    held = constrain(atoms, Distance([[0, 1], [1, 2]]))
+    with pytest.raises(error):
+        cls(atoms, logfile=None).run(fmax=0.01, steps=20)
+    assert np.isfinite(atoms.positions).all()
+    assert off(atoms, held) <= 1e-13
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("atom", [0, 8])
+def test_atoms_that_are_not_held_count_too(atom, bad):
+    atoms = molecule("CH3CH2OH")
+    held = constrain(atoms, Distance([0, 1]))
+    for hook, what in (("adjust_positions", "position"), ("adjust_momenta", "moment|velocity"), ("adjust_forces", "f")):
+        values = atoms.positions.copy()
+        values[atom, 1] = bad
+        asked = values.copy()
+        with pytest.raises(InputError, match=f"{what}.* of atom {atom} is not finite|{what}.*atom {atom}"):
+            getattr(held, hook)(atoms, values)
+        assert np.array_equal(values, asked, equal_nan=True)
