@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.build import molecule
+from ase.calculators.emt import EMT
 from ase.constraints import (
     FixAtoms,
     FixBondLengths,
@@ -14,7 +15,10 @@ from ase.constraints import (
     FixedPlane,
     Hookean,
 )
+from ase.md.langevin import Langevin
+from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
+from ase.optimize import FIRE
 from ase_systems import (
     Free,
     loose_waters,
@@ -22,8 +26,9 @@ from ase_systems import (
     rigid,
 )
 
-from kcons.ase import Constraints, constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, constrain, rigid_water
 from kcons.constraints import (
+    Angle,
     Distance,
     LinearVelocity,
     Sphere,
@@ -36,6 +41,7 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
+from kcons.steppers import BlanesMoan4
 
 # -- company ----------------------------------------------------------------------------------------
 
@@ -86,6 +92,30 @@ def test_forces_only_company_is_welcome():
     VelocityVerlet(atoms, 1 * units.fs).run(10)
     assert off(atoms, held) <= 1e-13
     assert atoms.get_number_of_degrees_of_freedom() == 12 - 3
+
+
+@pytest.mark.parametrize("run", ["VelocityVerlet", "Langevin", "ConstrainedDynamics", "FIRE"])
+def test_fixed_atoms_and_components_alongside(run):
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    atoms.set_constraint([FixAtoms([8]), FixCartesian([7], (True, False, True)), Hookean(a1=5, a2=6, rt=1.0, k=0.5)])
+    held = constrain(atoms, [Distance([[0, 1], [1, 2]]), Angle([0, 1, 2])])
+    before = atoms.get_positions()
+    rng = np.random.default_rng(0)
+    thermalize_momenta(atoms, 100, rng=rng)
+    {
+        "VelocityVerlet": lambda: VelocityVerlet(atoms, 0.5 * units.fs),
+        "Langevin": lambda: Langevin(
+            atoms, 0.5 * units.fs, temperature_K=100, friction=0.01 / units.fs, fixcm=False, rng=rng
+        ),
+        "ConstrainedDynamics": lambda: ConstrainedDynamics(atoms, 0.5 * units.fs, BlanesMoan4()),
+        "FIRE": lambda: FIRE(atoms, logfile=None),
+    }[run]().run(steps=10)
+    moved = atoms.positions - before
+    assert np.array_equal(moved[8], [0, 0, 0])
+    assert np.abs(moved[7, [0, 2]]).max() <= 1e-14 and abs(moved[7, 1]) > 1e-5
+    assert off(atoms, held) <= 1e-13
+    assert atoms.get_number_of_degrees_of_freedom() == 27 - 3 - 2 - 3
 
 
 def test_fix_com_beside_a_surface_is_refused():

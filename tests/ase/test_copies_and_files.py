@@ -11,6 +11,8 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule, sort
 from ase.constraints import (
+    FixAtoms,
+    FixCartesian,
     dict2constraint,
 )
 from ase.db import connect
@@ -85,6 +87,23 @@ def _through_db(atoms, path) -> Atoms:
     with connect(path) as db:
         db.write(atoms)
     return connect(path).get_atoms(1)
+
+
+@pytest.mark.parametrize("ours_first", [True, False])
+@pytest.mark.parametrize("way", [way for way in COPIES if way != "todict"])
+def test_found_targets_beside_other_constraints_in_either_order(way, ours_first, tmp_path):
+    atoms = molecule("CH3CH2OH")
+    held = Constraints([Distance([[0, 1], [1, 2]]), Dihedral([3, 0, 1, 2]), FixedAtoms([8])])
+    others = [FixAtoms([7]), FixCartesian([6], (True, False, True))]
+    atoms.set_constraint([held, *others] if ours_first else [*others, held])
+    found = held.engine(atoms).constraint_set.target()
+    again = COPIES[way](atoms, tmp_path)
+    assert [type(c) for c in again.constraints] == [type(c) for c in atoms.constraints]
+    twin = next(c for c in again.constraints if isinstance(c, Constraints))
+    again.positions[:] += 0.1  # the targets are those that were found, not those of the first use
+    again.positions[1] += 0.01
+    assert np.array_equal(twin.engine(again).constraint_set.target(), found)
+    assert again.get_number_of_degrees_of_freedom() == 27 - 3 - 3 - 3 - 2
 
 
 @pytest.mark.parametrize("way", COPIES)

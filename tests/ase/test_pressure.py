@@ -24,8 +24,9 @@ from ase_systems import (
     water_gas,
 )
 
-from kcons.ase import constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, constrain, rigid_water
 from kcons.constraints import Distance
+from kcons.steppers import BlanesMoan4
 
 # -- pressure ---------------------------------------------------------------------------------------
 
@@ -47,6 +48,16 @@ def test_ideal_gas_of_rigid_water():
     error = np.std(seen, ddof=1) / np.sqrt(len(seen))
     assert abs(np.mean(seen) - expected) <= 3 * error
     assert error < 0.02 * expected
+
+
+def test_pressure_along_a_trajectory_of_our_dynamics():
+    atoms = water_gas(2)
+    constrain(atoms, rigid_water(atoms))
+    thermalize_momenta(atoms, TEMPERATURE, rng=random())
+    seen = follow(ConstrainedDynamics(atoms, 2 * FS, BlanesMoan4()), lambda: pressure(atoms), 20)
+    momenta = atoms.get_momenta().reshape(8, 3, 3).sum(axis=1)
+    translation = (momenta**2).sum() / (2 * atoms.get_masses()[:3].sum())
+    assert seen == pytest.approx(2 / 3 * translation / atoms.get_volume(), rel=1e-10)  # constant: no collisions
 
 
 def test_what_ase_alone_makes_of_it():

@@ -1,0 +1,61 @@
+"""The page on ASE shows the committed measurements, and what it says of them is true."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results" / "ase_dynamics.json"
+
+
+@pytest.fixture(scope="module")
+def results():
+    return json.loads(RESULTS.read_text(encoding="utf-8"))
+
+
+def test_page_shows_the_committed_results():
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "05_ase_dynamics.py"), "--show", str(RESULTS)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    shown = "\n".join(line.rstrip() for line in result.stdout.strip("\n").split("\n"))
+    assert shown in (ROOT / "docs" / "ase.md").read_text(encoding="utf-8")
+
+
+def test_all_of_it_was_measured(results):
+    assert results["full"]
+
+
+def test_statistics_lie_within_three_standard_errors(results):
+    assert len(results["statistics"]) == 4
+    for row in results["statistics"]:
+        assert abs(row["mean"] - row["expected"]) <= 3 * row["error"], row["what"]
+        assert row["error"] <= 0.01 * row["expected"], row["what"]
+
+
+def test_energy_far_from_the_origin(results):
+    rows = results["far"]
+    assert all(row["kcons"] <= 1e-10 for row in rows)
+    assert max(row["ase"] for row in rows if row["distance"] == 1e6) > 1e-5
+
+
+def test_rattle_costs_less_than_velocity_verlet(results):
+    steps = {(row["waters"], row["dynamics"]): row["step_us"] for row in results["cost"]}
+    for n in (10, 100, 1000):
+        assert steps[n, "ConstrainedDynamics, Rattle()"] < steps[n, "VelocityVerlet"]
+
+
+def test_energy_at_equal_evaluations(results):
+    deviation = {row["stepper"]: row["deviation_ev"] for row in results["energy"]}
+    assert results["energy"][0]["forces"] == "GFN2-xTB"
+    assert deviation["BlanesMoan4()"] < deviation["Rattle()"] / 100
