@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -275,14 +276,18 @@ def pulled_bond(steps: int) -> None:
 
 
 def run(full: bool) -> dict:
-    return {
-        "full": full,
-        "machine": environment(),
-        "cost": [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 101 if full else 5)],
-        "far": far_from_the_origin(1000 if full else 50),
-        "energy": energy_at_equal_evaluations(*((960, 480.0) if full else (48, 24.0))),
-        "statistics": statistics(60_000 if full else 200),
+    result: dict = {"full": full, "machine": environment()}
+    parts = {
+        "cost": lambda: [row for n in ((10, 100, 1000) if full else (10,)) for row in cost(n, 101 if full else 5)],
+        "far": lambda: far_from_the_origin(1000 if full else 50),
+        "energy": lambda: energy_at_equal_evaluations(*((960, 480.0) if full else (48, 24.0))),
+        "statistics": lambda: statistics(40_000 if full else 200),
     }
+    for name, measure in parts.items():
+        if full:
+            print(f"measuring: {name}", file=sys.stderr, flush=True)
+        result[name] = measure()
+    return result
 
 
 def show(result: dict) -> None:
