@@ -147,16 +147,16 @@ def energy_at_equal_evaluations(evaluations: int, time_fs: float) -> list[dict]:
 
 
 class Clock:
-    """Adds up the time spent in functions."""
+    """Adds up the time that this thread works in functions, without the time it waits for others."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def wrap(self, call: Callable) -> Callable:
         def timed(*args, **kwargs):
-            start = time.perf_counter()
+            start = time.thread_time()
             result = call(*args, **kwargs)
-            self.seconds += time.perf_counter() - start
+            self.seconds += time.thread_time() - start
             return result
 
         return timed
@@ -179,9 +179,9 @@ class Timed:
 
     def sample(self, steps: int) -> None:
         self.forces.seconds = self.projections.seconds = 0.0
-        start = time.perf_counter()
+        start = time.thread_time()
         self.dynamics.run(steps)
-        whole = time.perf_counter() - start
+        whole = time.thread_time() - start
         self.samples.append((whole / steps, self.forces.seconds / steps, self.projections.seconds / steps))
 
     def result(self) -> dict:
@@ -193,7 +193,7 @@ class Timed:
 
 
 def cost(n: int, repeats: int) -> list[dict]:
-    """Whole ASE steps of n rigid waters with a calculator that does nothing, taken in turn; medians."""
+    """Whole ASE steps of n rigid waters with a calculator that does nothing, taken in turn; CPU time, medians."""
 
     def ours(stepper: Stepper) -> MolecularDynamics:
         return ConstrainedDynamics(waters(n, 5.0), FS, stepper)
@@ -291,7 +291,7 @@ def run(full: bool) -> dict:
 
 
 def show(result: dict) -> None:
-    print("Microseconds a step of 1 fs, rigid waters, a calculator that does nothing")
+    print("Microseconds of CPU a step of 1 fs, rigid waters, a calculator that does nothing; medians")
     print("(left over: kicks, drifts, checks and ASE's loop, as a multiple of the projections)")
     print("waters  dynamics                                whole   forces  projections  left over")
     for r in result["cost"]:
