@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ase.mep
 import numpy as np
 import pytest
 from ase import Atoms, units
@@ -9,10 +10,13 @@ from ase.build import fcc100, molecule
 from ase.calculators.emt import EMT
 from ase.constraints import FixAtoms
 from ase.mep import NEB, DimerControl, MinModeAtoms, MinModeTranslate
+from ase.mep.neb import NEBOptimizer
 from ase.optimize import BFGS
+from ase.optimize.optimize import Dynamics
 from ase.phonons import Phonons
 from ase.vibrations import Vibrations
 from ase_systems import (
+    classes_in,
     ethanol,
     off,
 )
@@ -78,6 +82,23 @@ def test_neb_keeps_lengths_in_all_images(rigid_path):
     for image in rigid_path:
         assert off(image, image.constraints[0]) <= 1e-12
     assert barrier(rigid_path) > 0.05
+
+
+def test_no_search_is_forgotten():
+    assert set(classes_in(ase.mep, Dynamics)) == {"MinModeTranslate", "DimerTranslate", "NEBOptimizer"}
+
+
+def test_the_optimiser_of_bands(rigid_path):
+    first, last = (image.copy() for image in (rigid_path[0], rigid_path[-1]))
+    images = [first, first.copy(), first.copy(), first.copy(), last]
+    for image in images:
+        image.calc = EMT()
+    band = NEB(images, method="improvedtangent")
+    band.interpolate(apply_constraint=True)
+    NEBOptimizer(band, logfile=None).run(fmax=0.05, steps=100)
+    for image in images:
+        assert off(image, image.constraints[0]) <= 1e-12
+    assert barrier(images) == pytest.approx(barrier(rigid_path), abs=0.02)
 
 
 def test_neb_with_the_calculator(rigid_path):
