@@ -77,7 +77,8 @@ def test_scipy_fmin_fails_by_itself():
         OPTIMISERS["SciPyFmin"](atoms, logfile=None).run(ftol=1e-4, xtol=1e-4, steps=60)
 
 
-def test_basin_hopping():
+def test_basin_hopping(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it writes trajectories
     atoms, held = ethanol()
     start = atoms.get_potential_energy()
     hop = OPTIMISERS["BasinHopping"](atoms, temperature=300 * units.kB, dr=0.1, logfile=None, optimizer_logfile=None)
