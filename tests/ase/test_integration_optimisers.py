@@ -77,11 +77,11 @@ def test_scipy_fmin_fails_by_itself():
         OPTIMISERS["SciPyFmin"](atoms, logfile=None).run(ftol=1e-4, xtol=1e-4, steps=60)
 
 
-def test_basin_hopping(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # it writes trajectories
+def test_basin_hopping():
     atoms, held = ethanol()
     start = atoms.get_potential_energy()
-    hop = OPTIMISERS["BasinHopping"](atoms, temperature=300 * units.kB, dr=0.1, logfile=None, optimizer_logfile=None)
+    quiet = dict.fromkeys(("logfile", "trajectory", "optimizer_logfile", "local_minima_trajectory"))
+    hop = OPTIMISERS["BasinHopping"](atoms, temperature=300 * units.kB, dr=0.1, **quiet)
     hop.run(3)
     assert hop.get_minimum()[0] < start - 1.1
     assert off(atoms, held) <= 1e-12
