@@ -180,7 +180,7 @@ class GreatCircles:
         change = low + ((self.radii * n - d) + self.radii * (n * less + u * sine))
         out[atoms] = there = x[atoms] + change
         x_low[atoms] = (x[atoms] - there) + change
-        push[atoms] = u * less - n * (speed**2 * sine) - outward
+        push[atoms] += u * less - n * (speed**2 * sine) - outward
         point.x = out
 
 

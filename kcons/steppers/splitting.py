@@ -141,10 +141,13 @@ class _Step:
     def kick_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
         """K D K ... D K."""
         self.kick(kicks[0])
-        for fraction, stage in zip(kicks[1:], pieces, strict=True):
+        for fraction, stage in zip(kicks[1:-1], pieces[:-1], strict=True):
             self.drift(stage)
             self.evaluate()
             self.kick(fraction)
+        self.drift(pieces[-1])
+        self.evaluate(keep=True)
+        self.kick(kicks[-1])
         self.project()
 
     def drift_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
@@ -184,11 +187,11 @@ class _Step:
             self.flight.move(point, self.out, then, self.now, fraction * dt)
             spare = None if before is first else before
 
-    def evaluate(self) -> None:
-        """Forces where the step is now."""
+    def evaluate(self, *, keep: bool = False) -> None:
+        """Forces where the step is now; to be kept, or for the next kick only."""
         if self.system.force is None:
             return
-        self.forces = self.system.forces(self.positions, self.point.v, self.now, self.number)
+        self.forces = self.system.forces(self.positions, self.point.v, self.now, self.number, copy=keep)
 
     def settle(self, fraction: float) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""

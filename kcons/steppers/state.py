@@ -246,12 +246,15 @@ class System:
             v = tangent
         return State(x, v, time, remainder=remainder)
 
-    def forces(self, x: FloatArray, v: FloatArray, time: float, step: int) -> FloatArray:
-        """Applied forces, checked, shape (n_atoms, 3); `step` is named if they are not finite."""
+    def forces(self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True) -> FloatArray:
+        """Applied forces, checked, shape (n_atoms, 3); `step` is named if they are not finite.
+
+        Without `copy` they are good until the next evaluation only: calculators like to reuse their array.
+        """
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
         raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
-        f = np.array(raw, dtype=np.float64, order="C")  # a copy: calculators like to reuse their array
+        f: FloatArray = (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
         if f.shape != (self.n_atoms, 3):
             raise InputError(
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
@@ -341,7 +344,9 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _all_finite(values):  # type: ignore[no-untyped-def]
-    finite = True
-    for x in values.ravel():
-        finite &= abs(x) <= 1.7976931348623157e308
-    return finite
+    # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
+    bits = values.ravel().view(np.int64)
+    worst = np.int64(0)
+    for i in range(bits.size):
+        worst = max(worst, bits[i] & 0x7FF0000000000000)
+    return worst != 0x7FF0000000000000

@@ -13,45 +13,71 @@ from kcons.constraints.target import FloatArray
 
 
 class Point:
-    """Where a step is: position x + x_low, velocity v + v_low + push; arrays of shape (n_atoms, 3).
+    """Where a step is: position x + x_low, velocity v + push; arrays of shape (n_atoms, 3).
 
     `x` is replaced and never written to, so that a force function may keep what it was given. Where a step has
-    one drift only there is nothing to add up; `x_low` and `v_low` are then None, and `push` is `v` itself.
+    one drift only there is nothing to add up; `x_low` is then None, and `push` is `v` itself.
+
+    A kick is kept until the next drift, which takes it in the same pass over the arrays.
     """
 
-    __slots__ = ("push", "v", "v_low", "weights", "x", "x_low")
+    __slots__ = ("_force", "_fresh", "_kick", "push", "v", "weights", "x", "x_low")
 
     def __init__(self, x: FloatArray, v: FloatArray, weights: FloatArray, *, exact: bool) -> None:
         self.x = x
-        self.v = v.copy()
+        #: Velocities as they were given, not yet a copy, until the first drift.
+        self.v = v
         #: 1/m for each coordinate.
         self.weights = weights
-        self.x_low: FloatArray | None = np.zeros_like(x) if exact else None
-        self.v_low: FloatArray | None = np.zeros_like(x) if exact else None
-        self.push = np.zeros_like(x) if exact else self.v
+        self.x_low: FloatArray | None = np.empty_like(x) if exact else None
+        self.push = np.empty_like(x) if exact else v
+        self._fresh = True
+        self._kick = 0.0
+        self._force = weights  # any finite numbers: they are multiplied by 0
 
     def kick(self, h: float, f: FloatArray) -> None:
         """Change the velocity by h M^-1 f."""
-        _kick(self.push, h, f, self.weights)
+        if self._kick:
+            self.land()
+        self._kick, self._force = h, f
 
     def fly(self, h: float, out: FloatArray) -> FloatArray:
         """Put x + h v into `out`; returns the array that takes changes of the velocity on the way."""
+        kick, force = self._kick, self._force
+        self._kick, self._force = 0.0, self.weights
         if self.x_low is None:
-            _fly_once(self.x, self.v, h, out)
+            before = self.v
+            if self._fresh:
+                self.v = self.push = np.empty_like(before)
+            _fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
+        elif self._fresh:
+            before, self.v = self.v, np.empty_like(self.v)
+            _fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
         else:
-            _fly(self.x, self.x_low, self.v, self.v_low, self.push, h, out)
+            _fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
+        self._fresh = False
         return self.push
 
     def land(self) -> None:
         """Put the whole velocity into `v`, and forget what rounding takes."""
-        if self.v_low is not None:
-            self.push += self.v_low
-            self.v += self.push
-            self.push.fill(0.0)
-            self.v_low.fill(0.0)
+        kick, force = self._kick, self._force
+        self._kick, self._force = 0.0, self.weights
+        if self._fresh:
+            self.v = self.v.copy()
+            if self.x_low is None:
+                self.push = self.v
+            else:
+                self.x_low.fill(0.0)
+                self.push.fill(0.0)
+            self._fresh = False
+        if self.x_low is None:
+            if kick:
+                _kick(self.v, kick, force, self.weights)
+        else:
+            _land(self.v, self.push, kick, force, self.weights)
 
     def restart(self, v: FloatArray) -> None:
-        """Go on with other velocities."""
+        """Go on with other velocities, after `land`."""
         np.copyto(self.v, v)
 
 
@@ -59,33 +85,61 @@ class Point:
 
 
 @numba.njit(cache=True, nogil=True)
-def _kick(push, h, f, weights):  # type: ignore[no-untyped-def]
-    p, g, w = push.ravel(), f.ravel(), weights.ravel()
-    for i in range(p.size):
-        p[i] += h * w[i] * g[i]
+def _kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
+    b, g, w = v.ravel(), f.ravel(), weights.ravel()
+    for i in range(b.size):
+        b[i] += kick * w[i] * g[i]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fly(x, x_low, v, v_low, push, h, out):  # type: ignore[no-untyped-def]
-    """Take `push` into the velocity, then out = x + h v; sums by Knuth's exact addition."""
-    a, a_low, b, b_low, p, c = x.ravel(), x_low.ravel(), v.ravel(), v_low.ravel(), push.ravel(), out.ravel()
-    for i in range(a.size):
-        change = p[i] + b_low[i]
-        total = b[i] + change
-        part = total - b[i]
-        low = (b[i] - (total - part)) + (change - part)
-        b[i] = total
-        b_low[i] = low
+def _land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
+    b, p, g, w = v.ravel(), push.ravel(), f.ravel(), weights.ravel()
+    for i in range(b.size):
+        b[i] += p[i] + kick * w[i] * g[i]
         p[i] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
+    """Take the kick and `push` into the velocity, then out = x + h v; sums by Dekker's addition.
+
+    It is exact where the change is the smaller number. Where a coordinate crosses 0 it is not; the error is then one
+    of the rounding of the change, not of the coordinate.
+    """
+    a, a_low, b, p, c = x.ravel(), x_low.ravel(), v.ravel(), push.ravel(), out.ravel()
+    g, w = f.ravel(), weights.ravel()
+    for i in range(a.size):
+        change = p[i] + kick * w[i] * g[i]
+        total = b[i] + change
+        low = change - (total - b[i])
+        b[i] = total
+        p[i] = low
         change = h * total + (h * low + a_low[i])
         there = a[i] + change
-        part = there - a[i]
-        a_low[i] = (a[i] - (there - part)) + (change - part)
+        a_low[i] = change - (there - a[i])
         c[i] = there
 
 
-@numba.njit(cache=True, nogil=True)
-def _fly_once(x, v, h, out):  # type: ignore[no-untyped-def]
-    a, b, c = x.ravel(), v.ravel(), out.ravel()
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
+    """The same from a start without remainders; `x_low`, `v` and `push` are only written to."""
+    a, a_low, b0, b, p, c = x.ravel(), x_low.ravel(), v0.ravel(), v.ravel(), push.ravel(), out.ravel()
+    g, w = f.ravel(), weights.ravel()
     for i in range(a.size):
+        change = kick * w[i] * g[i]
+        total = b0[i] + change
+        low = change - (total - b0[i])
+        b[i] = total
+        p[i] = low
+        change = h * total + h * low
+        there = a[i] + change
+        a_low[i] = change - (there - a[i])
+        c[i] = there
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
+    a, b0, b, c, g, w = x.ravel(), v0.ravel(), v.ravel(), out.ravel(), f.ravel(), weights.ravel()
+    for i in range(a.size):
+        b[i] = b0[i] + kick * w[i] * g[i]
         c[i] = a[i] + h * b[i]
