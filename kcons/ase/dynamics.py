@@ -23,6 +23,10 @@ from kcons.errors import InputError
 from kcons.steppers import Rattle, State, Stepper, System
 
 
+#: See `System`: nearer than this, the positions of a trajectory are the whole state.
+_FAR = 128.0
+
+
 class ConstrainedDynamics(MolecularDynamics):
     """Dynamics at constant energy on the constraints, by any stepper of `kcons.steppers`.
 
@@ -243,7 +247,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force)
+            self._system = System(bound.motion, self._force, far=_FAR)
             self.stepper.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)

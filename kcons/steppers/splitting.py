@@ -238,6 +238,8 @@ class _Step:
         if self.shift is not None:
             positions = x + self.shift
             remainder = x - (positions - self.shift)
+        elif self.system.is_far(x):  # by now: from here on relative to one atom
+            remainder = np.zeros_like(x) if self.point.x_low is None else self.point.x_low
         return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
 
     def refuse_overflow(self) -> None:

@@ -21,8 +21,8 @@ from kcons.errors import InputError, NonFiniteError, OverdeterminedError
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 
-#: Positions farther from the origin than this many times the size of the system carry their remainder.
-FAR = 128.0
+#: Positions farther from the origin than this many times the size of what is held carry their remainder.
+FAR = 8.0
 
 #: Residual of initial positions (relative to the row's scale) and of initial velocities (relative to the
 #: speed) that is still taken for rounding; the first step removes it.
@@ -120,6 +120,9 @@ class System:
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
         Whether `force` takes the velocities too (friction, magnetic fields).
+    far : float
+        From this many times the size of what is held away from the origin, states carry the remainder of their
+        positions. Infinite: never, so that positions and velocities alone are the whole state.
 
     Raises
     ------
@@ -134,8 +137,12 @@ class System:
         *,
         potential: Callable[[FloatArray, float], float] | None = None,
         velocity_dependent: bool = False,
+        far: float = FAR,
     ) -> None:
+        if not far >= 1:
+            raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.motion = motion
+        self.far = float(far)
         self.force = force
         self.potential = potential
         self.velocity_dependent = velocity_dependent and force is not None
@@ -219,7 +226,7 @@ class System:
             x = motion.restore_positions(x, time=time)
         remainder = None
         local = x
-        if self._is_far(x):
+        if self.is_far(x):
             shift = x[self.anchor].copy()
             local = motion.restore_positions(x - shift, time=time)
             remainder = local - (x - shift)
@@ -302,12 +309,18 @@ class System:
         """The atom that positions are taken relative to where they are far away."""
         return int(self.motion.constraint_set.incidence.indices[0])
 
-    def _is_far(self, x: FloatArray) -> bool:
+    @cached_property
+    def _free_of_origin(self) -> IntArray | None:
+        """The atoms that are held, if no row depends on where the origin is; otherwise None."""
         held = self.motion.constraint_set
         if held.n_rows == 0 or not all(c.translation_invariant for c in held.constraints):
-            return False
-        near = x[np.unique(held.incidence.indices)]
-        return bool(np.abs(near).max() > FAR * np.abs(near - x[self.anchor]).max())
+            return None
+        return np.unique(held.incidence.indices).astype(np.int64)
+
+    def is_far(self, x: FloatArray) -> bool:
+        """Whether what is held is so far from the origin that the rounding of its positions would show."""
+        atoms = self._free_of_origin
+        return atoms is not None and bool(_beyond(x, atoms, self.anchor, self.far))
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
         try:
@@ -340,6 +353,17 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
         atom=atom,
         step=step,
     )
+
+
+@numba.njit(cache=True, nogil=True)
+def _beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
+    """Whether the anchor is farther from the origin than `ratio` times any atom is from the anchor."""
+    far = max(abs(x[anchor, 0]), abs(x[anchor, 1]), abs(x[anchor, 2])) / ratio
+    for i in atoms:
+        for k in range(3):
+            if not abs(x[i, k] - x[anchor, k]) < far:
+                return False
+    return True
 
 
 @numba.njit(cache=True, nogil=True)
