@@ -22,7 +22,6 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import Rattle, State, Stepper, System
 
-
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 _FAR = 128.0
 

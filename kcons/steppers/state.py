@@ -97,12 +97,16 @@ class State:
         InputError
             The file holds no state.
         """
+        if isinstance(file, str | PathLike):
+            with Path(file).open("rb") as opened:  # NumPy would leave a broken archive open
+                return cls.load(opened)
         try:
             with np.load(file) as stored:
                 values = {name: stored[name] for name in stored.files}
             return cls(**{name: a if a.ndim else a.item() for name, a in values.items()})
         except (TypeError, ValueError, BadZipFile, EOFError) as error:
-            raise InputError(f"{file} holds no state written by State.save: {error}", item="file") from error
+            name = getattr(file, "name", "the file")
+            raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
 
 
 class System:

@@ -1,0 +1,193 @@
+"""States and systems: checks at the start, saving and loading, positions far from the origin."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Distance, FixedAtoms, MovingTarget
+from kcons.errors import InputError
+from kcons.steppers import BlanesMoan6, State, run
+from steppers.systems import SYMMETRIC, gravity, rotor, spherical_pendulum, system_of
+
+
+def test_float32_input_is_cast():
+    system, state = rotor()
+    rounded = system.initial_state(state.positions.astype(np.float32), project=True)
+    assert rounded.positions.dtype == np.float64
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
+def test_bad_mass_of_a_free_atom(mass):
+    with pytest.raises(InputError, match="atom 2 has mass"):
+        system_of([Distance([0, 1])], np.eye(3), [1, 1, mass])
+
+
+def test_massless_fixed_atom_is_allowed():
+    positions = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    system = system_of([FixedAtoms([0]), Distance([0, 1])], positions, [0.0, 1.0], gravity([0.0, 1.0]))
+    end = run(system, system.initial_state(positions, [[0, 0, 0], [0.1, 0, 0]]), 0.01, 10)
+    assert np.array_equal(end.positions[0], [0, 0, 0])
+    assert np.isfinite(system.kinetic_energy(end.velocities))
+
+
+def test_start_off_the_constraints():
+    system, state = rotor()
+    off = state.positions * 1.2
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.24; pass project=True"):
+        system.initial_state(off)
+    projected = system.initial_state(off, project=True)
+    assert np.linalg.norm(projected.positions[0] - projected.positions[1]) == pytest.approx(1.2, rel=1e-14)
+    centre = system.masses @ projected.positions / system.masses.sum()
+    assert np.abs(centre - system.masses @ off / system.masses.sum()).max() <= 1e-14
+
+
+def test_start_with_forbidden_velocities():
+    system, state = rotor(omega=1.0)
+    stretching = state.velocities + np.array([[0.5, 0, 0], [0, 0, 0]])
+    with pytest.raises(InputError, match="initial velocities violate"):
+        system.initial_state(state.positions, stretching)
+    projected = system.initial_state(state.positions, stretching, project=True)
+    relative = projected.velocities[0] - projected.velocities[1]
+    assert abs(relative[0]) <= 1e-15
+    assert system.kinetic_energy(projected.velocities) < system.kinetic_energy(stretching)
+    momentum = system.masses @ (projected.velocities - stretching)
+    assert np.abs(momentum).max() <= 1e-15
+
+
+def test_start_within_rounding_is_taken_as_given():
+    system, state = rotor()
+    again = system.initial_state(state.positions, state.velocities)
+    assert np.array_equal(again.positions, state.positions)
+    assert np.array_equal(again.velocities, state.velocities)
+
+
+def test_moving_constraint_starts_with_its_own_speed():
+    positions = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    rod = Distance([0, 1], MovingTarget(lambda t: 1 + 0.5 * t, lambda t: 0.5, lambda t: 0.0))
+    system = system_of([FixedAtoms([0]), rod], positions, [1, 1])
+    assert system.initial_state(positions).velocities[1] == pytest.approx([0.5, 0, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize("item", ["positions", "velocities"])
+@pytest.mark.parametrize("values", [np.zeros((3, 3)), [[0, 0, np.nan], [1.2, 0, 0]], "x"], ids=["shape", "nan", "text"])
+def test_bad_initial_arrays(item, values):
+    system, state = rotor()
+    arrays = {"positions": state.positions, "velocities": state.velocities, item: values}
+    with pytest.raises(InputError, match=item):
+        system.initial_state(arrays["positions"], arrays["velocities"])
+
+
+def test_energy_needs_a_potential():
+    system, state = rotor(force=lambda x, t: -x)
+    with pytest.raises(InputError, match="potential"):
+        system.total_energy(state)
+
+
+# -- saving -----------------------------------------------------------------------------------------
+
+
+def assert_same(a: State, b: State) -> None:
+    """To the last bit, in everything a state holds."""
+    assert vars(a).keys() == vars(b).keys()
+    for name, value in vars(a).items():
+        other = getattr(b, name)
+        assert type(value) is type(other), name
+        assert np.array_equal(value, other), name
+
+
+@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+@pytest.mark.parametrize("make", [spherical_pendulum, lambda: rotor(offset=1e6, force=lambda x, t: -(x - 1e6))])
+def test_a_run_goes_on_from_a_file_bit_for_bit(stepper, make, tmp_path: Path) -> None:
+    system, state = make()
+    whole = run(system, state, 0.1, 20, stepper=stepper)
+    run(system, state, 0.1, 10, stepper=stepper).save(tmp_path / "half.npz")
+    again, _ = make()
+    assert_same(run(again, State.load(tmp_path / "half.npz"), 0.1, 10, stepper=stepper), whole)
+
+
+def test_all_of_a_state_is_saved() -> None:
+    rng = np.random.default_rng(2)
+    x, v, f, low = rng.normal(size=(4, 5, 3))
+    for state in (State(x, v), State(x, v, 0.1, f, 7, 1e-12 * low, 1e-18)):
+        file = io.BytesIO()
+        state.save(file)
+        file.seek(0)
+        assert_same(State.load(file), state)
+
+
+def test_an_unfinished_file_leaves_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, state = rotor()
+    path = tmp_path / "state.npz"
+    state.save(path)
+
+    def broken(file, **arrays):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez", broken)
+    with pytest.raises(OSError, match="disk full"):
+        state.reversed().save(path)
+    assert_same(State.load(path), state)
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive at all", b"PK\x03\x04 torn"])
+def test_what_is_no_state_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="holds no state"):
+        State.load(path)
+
+
+def test_other_arrays_are_no_state(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", positions=np.zeros((1, 3)), charges=np.zeros(1))
+    with pytest.raises(InputError, match="holds no state"):
+        State.load(tmp_path / "x.npz")
+
+
+# -- time and distance ------------------------------------------------------------------------------
+
+
+def test_time_adds_up_exactly() -> None:
+    system, state = rotor(omega=0.0)
+    assert run(system, state, 0.1, 1000).time == 100.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
+@pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
+def test_energy_far_from_the_origin(stepper, offset) -> None:
+    system, state = rotor(omega=1.0, offset=offset)
+    start = system.total_energy(state)
+    end = run(system, state, 0.05, 1000, stepper=stepper)
+    assert abs(system.total_energy(end) / start - 1) <= 1e-10
+    length = np.linalg.norm(end.positions[0] - end.positions[1])
+    assert abs(length - 1.2) <= 1.2 * max(4 * np.spacing(offset), 1e-14)
+
+
+def test_a_body_that_flies_away_is_as_accurate_as_one_at_home() -> None:
+    """Turning while the centre moves off at 20 a unit of time: its angle does not depend on where it is."""
+    home, still = rotor(omega=1.0)
+    _, moving = rotor(omega=1.0)
+    moving = State(moving.positions, moving.velocities + np.array([20.0, 0.0, 0.0]))
+    near = run(home, still, 0.05, 1000, stepper=BlanesMoan6())
+    far = run(home, moving, 0.05, 1000, stepper=BlanesMoan6())
+    assert far.remainder is not None and near.remainder is None
+    bond = np.diff(far.positions + far.remainder, axis=0) - np.diff(near.positions, axis=0)
+    # Rounding at 1000 is 1e-13; without the remainder a thousand steps add up to 1e-10.
+    assert np.abs(bond).max() <= 3e-12
+
+
+def test_far_may_be_switched_off() -> None:
+    _, state = rotor(offset=1e6, far=np.inf)
+    assert state.remainder is None
+    _, state = rotor(offset=1e6)
+    assert state.remainder is not None
+
+
+@pytest.mark.parametrize("far", [0.0, -1.0, np.nan])
+def test_bad_far(far) -> None:
+    with pytest.raises(InputError, match="far is"):
+        rotor(far=far)
