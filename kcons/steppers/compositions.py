@@ -41,8 +41,14 @@ KAHAN_LI_6 = _palindrome(
 class Composition(Splitting):
     """RATTLE steps of different length in turn, merged where they meet.
 
+    Reversible; symplectic for position rows and forces that derive from a potential. One force evaluation a
+    fraction, more for forces that depend on velocities.
+
     Works with all that `Rattle` works with: velocity rows, rows and targets that move, friction (of which the
-    stages that go back see the reverse). Not with targets or forces that are defined from the start on only.
+    stages that go back see the reverse).
+
+    Not for targets or forces with fewer derivatives in time than the order, which is then lost. Where the sums of
+    the fractions leave [0, 1], as those of `Yoshida4` do, not for targets or forces that begin with the run either.
 
     Parameters
     ----------
@@ -87,21 +93,34 @@ class Composition(Splitting):
 
 
 class Suzuki4(Composition):
-    """Order 4, five force evaluations: the robust choice of order 4 for all that is held."""
+    """Order 4, five force evaluations: the robust choice of order 4 for all that is held.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
+    Not for targets or forces that are not smooth in time.
+    """
 
     def __init__(self) -> None:
         super().__init__(SUZUKI_4, 4, "Suzuki4()")
 
 
 class Yoshida4(Composition):
-    """Order 4, three force evaluations: the triple jump, with steps of -1.70 and 1.35."""
+    """Order 4, three force evaluations: the triple jump, the fewest and with the largest error.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. Stages lie between -0.35 and
+    1.35 of the step. Not for targets or forces that begin with the run, nor for strong friction.
+    """
 
     def __init__(self) -> None:
         super().__init__(YOSHIDA_4, 4, "Yoshida4()")
 
 
 class KahanLi6(Composition):
-    """Order 6, nine force evaluations: for high accuracy where forces depend on velocities."""
+    """Order 6, nine force evaluations: for high accuracy where forces depend on velocities.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
+    Not for targets or forces that are not smooth in time, nor where solves are tight: some of its RATTLE steps are
+    0.79 of the whole step long.
+    """
 
     def __init__(self) -> None:
         super().__init__(KAHAN_LI_6, 6, "KahanLi6()")

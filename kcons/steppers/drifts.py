@@ -160,10 +160,11 @@ class GreatCircles:
         return cls(held, np.concatenate(centers), np.concatenate(radii), still)
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        x, atoms, x_low = point.x, self.atoms, point.x_low
-        assert x_low is not None
-        low = x_low[atoms]
+        x, atoms = point.x, self.atoms
+        low = point.remainder(atoms)
         push = point.fly(h, out)
+        x_low = point.x_low
+        assert x_low is not None
         out[self.resting] = x[self.resting]
         x_low[self.resting] = 0.0
         d = (x[atoms] - self.centers) + low

@@ -15,6 +15,12 @@ class Geodesic(Splitting):
     sphere at rest. What is left is the error of the splitting alone: as that of velocity Verlet without
     constraints, it depends on how fast the forces vary, no longer on how fast the constrained directions turn.
 
+    Reversible; symplectic for position rows and forces that derive from a potential. Works with moving rows, which
+    are met at the time of each substep, with velocity rows, and with forces that depend on velocities.
+
+    Not worth it where forces are cheap and vary as fast as the constrained directions turn: RATTLE with as many
+    smaller steps is then better. Great circles not for rows that move or hold more than one atom.
+
     A rigid rotor in free flight turns by exactly n asin(omega dt/n) a step of n substeps; without a solution for
     omega dt >= n. An atom on a sphere turns by exactly omega dt.
 
@@ -31,14 +37,14 @@ class Geodesic(Splitting):
     """
 
     def __init__(self, substeps: int = 8, great_circles: bool | None = None) -> None:
-        if int(substeps) != substeps or substeps < 1:
+        if not (substeps >= 1 and float(substeps).is_integer()):
             raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
         self.substeps = int(substeps)
         self.great_circles = great_circles
         super().__init__(
             kicks=(0.5, 0.5),
             drifts=(1.0,),
-            flight=(1.0 / substeps,) * int(substeps),
+            flight=(1.0 / int(substeps),) * int(substeps),
             exact_flight=great_circles is not False,
         )
 

@@ -99,6 +99,9 @@ class ProjectedOde:
 class ProjectedVerlet(ProjectedOde):
     """Velocity Verlet on (105), the velocity in b predicted: order 2, one force evaluation, nothing conserved.
 
+    Neither reversible nor symplectic. Not for use but for comparison: energy drifts by a thousand times what that of
+    `Rattle` may, and without `project` the constraints drift too, until it diverges.
+
     Parameters
     ----------
     project : bool
@@ -122,6 +125,9 @@ class ProjectedVerlet(ProjectedOde):
 
 class ProjectedRungeKutta4(ProjectedOde):
     """The classical Runge-Kutta scheme on (105): order 4, four force evaluations, nothing conserved.
+
+    Neither reversible nor symplectic. Not for long runs, in which energy drifts steadily; use `BlanesMoan4` or
+    `Suzuki4` there. Without `project` the constraints drift too.
 
     Parameters
     ----------
@@ -159,6 +165,9 @@ class ProjectedRungeKutta4(ProjectedOde):
 
 class Baumgarte(ProjectedRungeKutta4):
     """(105) with feedback, A a = b - 2 rate (A v - c) - rate^2 sigma, by Runge-Kutta: order 4, drift bounded.
+
+    Four force evaluations. Neither reversible nor symplectic. Not where constraints are to hold: they are off by
+    about the error of the scheme, and energy drifts.
 
     Parameters
     ----------

@@ -6,7 +6,9 @@ from kcons.steppers.splitting import Splitting
 
 
 class Rattle(Splitting):
-    """Velocity Verlet with exactly solved constraints: order 2, reversible, symplectic for holonomic rows.
+    """Velocity Verlet with exactly solved constraints: order 2, one force evaluation a step.
+
+    Reversible; symplectic for position rows and forces that derive from a potential.
 
     One step from (x0, v0) at t0 to (x1, v1) at t1 = t0 + dt::
 
@@ -25,6 +27,8 @@ class Rattle(Splitting):
 
     A rigid rotor in free flight turns by exactly asin(omega dt) a step; for omega dt >= 1 there is no
     solution and the step raises.
+
+    Not for rows or forces that jump in time, which reduce every order to 1.
 
     References
     ----------

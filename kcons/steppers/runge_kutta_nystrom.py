@@ -65,10 +65,11 @@ DRIFTS_6A = _mirrored_odd(
 class RungeKuttaNystrom(Splitting):
     """Kicks and constrained drifts with the fractions of Blanes and Moan.
 
-    Works with moving rows and with rows linear in the velocities; forces may depend on time. Along great circles
-    where every row allows it.
+    Reversible; symplectic for position rows and forces that derive from a potential. Works with moving rows and with
+    rows linear in the velocities; forces may depend on time. Along great circles where every row allows it.
 
-    Not with forces that depend on the velocities: the order would be lost without any sign.
+    Not with forces that depend on the velocities: the order would be lost without any sign, and `check` raises.
+    Not worth it where forces cost less than the projections of a drift, five or nine to a force evaluation.
 
     References
     ----------
@@ -84,7 +85,11 @@ class RungeKuttaNystrom(Splitting):
 
 
 class BlanesMoan4(RungeKuttaNystrom):
-    """Order 4, six force evaluations (SRKN_6^b), drifts by Suzuki's composition."""
+    """Order 4, six force evaluations (SRKN_6^b), drifts by Suzuki's composition: 30 projections a step.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
+    Not for forces that depend on the velocities (raises; use Suzuki4 instead).
+    """
 
     order = 4
 
@@ -93,7 +98,11 @@ class BlanesMoan4(RungeKuttaNystrom):
 
 
 class BlanesMoan6(RungeKuttaNystrom):
-    """Order 6, eleven force evaluations (SRKN_11^b), drifts by Kahan and Li's composition."""
+    """Order 6, eleven force evaluations (SRKN_11^b), drifts by Kahan and Li's composition: 99 projections a step.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
+    Not for forces that depend on the velocities (raises; use KahanLi6 instead).
+    """
 
     order = 6
 
@@ -102,7 +111,12 @@ class BlanesMoan6(RungeKuttaNystrom):
 
 
 class BlanesMoan6a(RungeKuttaNystrom):
-    """Order 6, fourteen force evaluations (SRKN_14^a), beginning and ending with a drift."""
+    """Order 6, fourteen force evaluations (SRKN_14^a), beginning and ending with a drift: 135 projections a step.
+
+    Reversible; symplectic for position rows and forces that derive from a potential. All stages lie within the step.
+    Not for forces that depend on the velocities (raises; use KahanLi6 instead), nor where the forces at the end of
+    a step are wanted: its states carry none.
+    """
 
     order = 6
 

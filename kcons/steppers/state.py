@@ -265,7 +265,12 @@ class System:
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
         raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
-        f: FloatArray = (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
+        try:
+            f: FloatArray = (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"the force function returned no array of numbers at step {step}: {error}", item="forces"
+            ) from None
         if f.shape != (self.n_atoms, 3):
             raise InputError(
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",

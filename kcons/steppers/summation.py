@@ -9,6 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 
 
@@ -57,6 +58,12 @@ class Point:
             _fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
         self._fresh = False
         return self.push
+
+    def remainder(self, atoms: IntArray) -> FloatArray:
+        """What rounding has taken from the positions of some atoms so far, shape (len(atoms), 3)."""
+        if self._fresh or self.x_low is None:
+            return np.zeros((len(atoms), 3))
+        return self.x_low[atoms]
 
     def land(self) -> None:
         """Put the whole velocity into `v`, and forget what rounding takes."""
