@@ -1,0 +1,66 @@
+"""What an integrator may hold besides the constraints of its System."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import openmm
+
+from kcons.errors import KconsError
+from kcons.openmm.program import Program
+
+
+class Part(Protocol):
+    """Rows of one kind, and the computations that keep them.
+
+    A program is written once and calls each method where its computations belong. The variables at hand are x, v,
+    m, dt; `xu`, positions as they were before anything brought them onto constraints; and `failed`, which a part
+    sets to its own `code` when a solve does not converge. The integrator then puts positions and velocities back
+    to what they were before the step and asks the part that has this code for the error to raise.
+
+    Attributes
+    ----------
+    code : int
+        Number of the part in its integrator, from 1; set by the integrator before `declare`.
+    evaluates : bool
+        Whether `remember` or `project` evaluate force groups or move x, after which the applied forces must be
+        computed again or kept.
+    meets_system : bool
+        Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
+        within its own `land`; at most one part of an integrator may.
+    groups : frozenset of int
+        Force groups that carry rows, not forces.
+    """
+
+    code: int
+    evaluates: bool
+    meets_system: bool
+    groups: frozenset[int]
+
+    def declare(self, program: Program) -> None:
+        """Variables and tables."""
+        ...
+
+    def remember(self, program: Program) -> None:
+        """Before each drift, x on the constraints: keep the gradients at x."""
+        ...
+
+    def land(self, program: Program, h: str) -> None:
+        """After x = xu: bring x onto the rows along the gradients that were kept. `h` is the length of the drift."""
+        ...
+
+    def project(self, program: Program) -> None:
+        """Make v tangent to the rows at x."""
+        ...
+
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
+        ...
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error for a step in which the part set `failed`."""
+        ...
+
+    def rank(self, context: openmm.Context) -> int:
+        """How many degrees of freedom the rows take, beyond the constraints of the System."""
+        ...

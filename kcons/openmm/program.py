@@ -1,0 +1,115 @@
+"""An integrator as a list of computations, each with the words that explain it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import openmm
+
+
+class Program:
+    """Writes the computations of a CustomIntegrator and their listing, line by line.
+
+    Parameters
+    ----------
+    integrator : openmm.CustomIntegrator
+        The computations are added to it as they are written.
+    """
+
+    def __init__(self, integrator: openmm.CustomIntegrator) -> None:
+        self.integrator = integrator
+        self.variables: list[str] = []
+        self._lines: list[tuple[int, str, str]] = []
+        self._depth = 0
+        self._known: set[str] = {"x", "v", "m", "f", "dt", "energy"}
+
+    # -- variables ------------------------------------------------------------------------------
+
+    def number(self, name: str, words: str, value: float = 0.0) -> str:
+        """Declare a global variable; returns its name."""
+        if name not in self._known:
+            self._known.add(name)
+            self.integrator.addGlobalVariable(name, value)
+            self.variables.append(f"{name}: {words}")
+        return name
+
+    def vector(self, name: str, words: str) -> str:
+        """Declare a variable with a value for each degree of freedom; returns its name."""
+        if name not in self._known:
+            self._known.add(name)
+            self.integrator.addPerDofVariable(name, 0)
+            self.variables.append(f"{name}: {words} (each degree of freedom)")
+        return name
+
+    def table(self, name: str, values: Sequence[float], words: str) -> str:
+        """Declare a table of constants, written name(k) in expressions; returns its name."""
+        self._known.add(name)
+        self.integrator.addTabulatedFunction(name, openmm.Discrete1DFunction(list(values)))
+        self.variables.append(f"{name}(k): {words}")
+        return name
+
+    # -- computations ---------------------------------------------------------------------------
+
+    def let(self, variable: str, expression: str, words: str) -> None:
+        """variable = expression for one global variable."""
+        self.integrator.addComputeGlobal(variable, expression)
+        self._line(f"{variable} = {expression}", words)
+
+    def each(self, variable: str, expression: str, words: str) -> None:
+        """variable = expression for each degree of freedom."""
+        self.integrator.addComputePerDof(variable, expression)
+        self._line(f"{variable} = {expression}", words)
+
+    def sum(self, variable: str, expression: str, words: str) -> None:
+        """variable = sum of expression over all degrees of freedom."""
+        self.integrator.addComputeSum(variable, expression)
+        self._line(f"{variable} = sum({expression})", words)
+
+    def hold_positions(self, words: str) -> None:
+        self.integrator.addConstrainPositions()
+        self._line("constrain positions", words)
+
+    def hold_velocities(self, words: str) -> None:
+        self.integrator.addConstrainVelocities()
+        self._line("constrain velocities", words)
+
+    def let_others_act(self) -> None:
+        """Barostats, CMMotionRemover, Andersen thermostats change the state here."""
+        self.integrator.addUpdateContextState()
+        self._line("update context state", "barostats and other outside agents may act")
+
+    @contextmanager
+    def loop(self, condition: str, words: str) -> Iterator[None]:
+        """Repeat what is written inside while `condition` holds."""
+        self.integrator.beginWhileBlock(condition)
+        self._line(f"while {condition}:", words)
+        with self._inside():
+            yield
+
+    @contextmanager
+    def when(self, condition: str, words: str) -> Iterator[None]:
+        """Do what is written inside if `condition` holds."""
+        self.integrator.beginIfBlock(condition)
+        self._line(f"if {condition}:", words)
+        with self._inside():
+            yield
+
+    @contextmanager
+    def _inside(self) -> Iterator[None]:
+        self._depth += 1
+        yield
+        self._depth -= 1
+        self.integrator.endBlock()
+
+    def _line(self, code: str, words: str) -> None:
+        self._lines.append((self._depth, code, words))
+
+    # -- listing --------------------------------------------------------------------------------
+
+    def listing(self) -> str:
+        """The variables, and the steps with their words in a column beside."""
+        codes = ["    " * depth + code for depth, code, _ in self._lines]
+        width = min(max((len(code) for code in codes), default=0), 60)
+        steps = [f"  {code:<{width}}  # {words}" for code, (_, _, words) in zip(codes, self._lines, strict=True)]
+        return "\n".join(["variables", *(f"  {line}" for line in self.variables), "each step", *steps])
