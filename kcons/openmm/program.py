@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -18,11 +19,18 @@ class Program:
     """
 
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
-        self.integrator = integrator
+        # Weak, for the integrator owns its program.
+        self._integrator = weakref.ref(integrator)
         self.variables: list[str] = []
         self._lines: list[tuple[int, str, str]] = []
         self._depth = 0
         self._known: set[str] = {"x", "v", "m", "f", "dt", "energy"}
+
+    @property
+    def integrator(self) -> openmm.CustomIntegrator:
+        integrator = self._integrator()
+        assert integrator is not None
+        return integrator
 
     # -- variables ------------------------------------------------------------------------------
 

@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.openmm.copies import as_projected, remade, settings_of
+from kcons.openmm.ensemble import ConstantEnergy, Ensemble
+from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.minimization import descend
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    Rattle,
-    Splitting,
-    Suzuki4,
-    Yoshida4,
-)
-
-#: Schemes by name.
-SCHEMES: dict[str, type[Splitting]] = {
-    "rattle": Rattle,
-    "geodesic": Geodesic,
-    "suzuki4": Suzuki4,
-    "yoshida4": Yoshida4,
-    "kahan-li6": KahanLi6,
-    "blanes-moan4": BlanesMoan4,
-    "blanes-moan6": BlanesMoan6,
-    "blanes-moan6a": BlanesMoan6a,
-}
-LEAPFROG = "leapfrog"
+from kcons.openmm.schemes import LEAPFROG, stages_of, to_scheme
+from kcons.steppers.splitting import Splitting
 
 
 class ProjectedIntegrator(openmm.CustomIntegrator):
@@ -45,22 +29,35 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     `constrainVelocities` is the projector M_par^+ M, its `constrainPositions` the drift's solve. Only the tolerance
     limits the accuracy.
 
+    At the first step the integrator looks at the System and its Context: what it cannot propagate it refuses, and
+    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that OpenMM's
+    solvers did converge, which OpenMM itself does not tell.
+
     Parameters
     ----------
     timestep : Quantity or float
-        In ps if a float.
+        In ps if a float; more than 0. OpenMM refuses negative steps: to go back, turn the velocities round.
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
-        'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog' for systems with virtual sites.
+        'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
+        openmm.VerletIntegrator, for Systems with virtual sites.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float
         Relative tolerance of the System's constraints.
+    check_every : int
+        Steps between two checks; 0 for none but the first.
+    ensemble : Ensemble, optional
+        How velocities change between drifts; constant energy by default.
 
     Raises
     ------
     InputError, UnsupportedError
-        A time step that is no finite number, an unknown scheme, parts that do not go together.
+        A time step that is no positive number, an unknown scheme, parts that do not go together.
+
+    Notes
+    -----
+    Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
     """
 
     def __init__(
@@ -70,54 +67,102 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         *,
         parts: Sequence[Part] = (),
         tolerance: float = 1e-10,
+        check_every: int = 100,
+        ensemble: Ensemble | None = None,
     ) -> None:
-        dt = timestep.value_in_unit(unit.picoseconds) if unit.is_quantity(timestep) else float(timestep)
-        if not np.isfinite(dt):
-            raise InputError(f"the time step is {timestep}; give a finite one", item="timestep")
-        super().__init__(dt)
+        super().__init__(_picoseconds(timestep))
         self.setConstraintTolerance(tolerance)
-        self.scheme = _scheme(scheme)
+        if int(check_every) != check_every or check_every < 0:
+            raise InputError(f"check_every is {check_every}; give a number of steps, 0 for never", item="check_every")
+        self.check_every = int(check_every)
+        #: None for the leapfrog.
+        self.scheme = to_scheme(scheme)
+        self.ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
         self.parts = tuple(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
         for k, part in enumerate(self.parts, start=1):
             part.code = k
-        groups = frozenset().union(*(part.groups for part in self.parts)) if self.parts else frozenset()
-        self.row_groups: frozenset[int] = groups
-        if groups:
-            self.setIntegrationForceGroups({g for g in range(32) if g not in groups})
+        #: Force groups that carry rows, not forces.
+        self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
+        self._guard: Guard | None = None
+        if self.row_groups:
+            self.setIntegrationForceGroups(-1)
         self.program = Program(self)
         self._write(self.program)
+
+    def __repr__(self) -> str:
+        scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
+        held = "".join(f", {part!r}" for part in self.parts)
+        return f"<ProjectedIntegrator: {scheme}, {self._dt * 1e3:g} fs{held}>"
+
+    def __str__(self) -> str:
+        return f"{self!r}\n{self.listing()}"
+
+    def listing(self) -> str:
+        """The steps of the integrator, in words."""
+        return self.program.listing()
 
     # -- the program ----------------------------------------------------------------------------
 
     def _write(self, p: Program) -> None:
         #: Where parts evaluate row groups, the applied forces are kept here: OpenMM remembers the last groups only.
-        self._kept = any(part.evaluates for part in self.parts)
+        self._kept = self.scheme is not None and any(part.evaluates for part in self.parts)
         self._force = p.vector("force", "applied forces at x") if self._kept else "f"
         p.vector("xu", "positions before constraints act on them")
+        self.ensemble.declare(p)
         for part in self.parts:
             part.declare(p)
-        if not self.parts:
+        if self.scheme is None:
+            # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
+            # impulse of the forces at x is added, and half that of the constraints in the drift to x.
+            self.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
+            p.vector("impulse", "change of v by the constraints in the last drift")
+        self._drifts, self._kicks = stages_of(self.scheme)
+        if self.parts:
+            self._write_guarded(p)
+        else:
             p.let_others_act()
             self._write_step(p)
-            return
+
+    def _write_guarded(self, p: Program) -> None:
+        """A step that is taken back when a part fails.
+
+        The same program also brings positions, or velocities alone, onto the constraints: the last stage of the
+        tables is a drift without kicks, to which `_run_alone` goes directly.
+        """
+        n = len(self._drifts)
+        self._alone = n + 1
         p.number("failed", "number of the part whose solve failed, 0 for none")
         p.number("good_steps", "steps done since the integrator was made")
-        p.number("stale", "whether forces must be computed anew", 1.0)
-        p.number("moved", "how far others have moved x since the last step")
+        p.number("first_stage", f"0; {self._alone} to apply the constraints alone")
+        p.number("end_stage", "where the stages end", n)
+        p.number("stage", "number of the drift")
+        p.number("h", "length of the drift")
+        p.table("drift_share", [*self._drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
+        p.table("kick_share", [*self._kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
         p.vector("x_last", "positions after the last good step")
-        p.vector("v_last", "velocities after the last good step")
-        p.let_others_act()
+        p.vector("v_last", "velocities before this step")
+        if self._kept:
+            p.number("stale", "whether forces must be computed anew", 1.0)
+            p.number("moved", "how far others have moved x since the last step")
+        else:
+            p.number("stale", "whether this is a fresh start", 1.0)
+        with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
+            p.let_others_act()
         with p.when("failed = 0", "after a failure nothing moves"):
-            p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
-            with p.when("moved + stale != 0", "others did"):
-                p.each("x_last", "x", "start here")
-                if self._kept:
+            if self._kept:
+                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
+                with p.when("moved + stale != 0", "others did"):
+                    p.each("x_last", "x", "start here")
                     p.each("force", "f", "applied forces")
+            else:
+                p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
             p.each("v_last", "v", "to come back to")
-            self._write_step(p)
+            self._write_loop(p)
+            with p.when("failed = 0", "all solves converged"):
+                self._project(p)
             with p.when("failed = 0", "the step is good"):
                 p.each("x_last", "x", "positions of the last good step")
                 p.let("good_steps", "good_steps+1", "count it")
@@ -126,64 +171,113 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
                 p.each("v", "v_last", "back to where the step began")
                 p.let("stale", "1", "forces are those of elsewhere")
 
+    def _write_loop(self, p: Program) -> None:
+        """The stages of a step with parts."""
+        first = "kick_share(first_stage)*dt"
+        if self._kicks[0]:
+            self.ensemble.kick(p, first, self._force, "", lambda: self._project(p))
+        p.let("stage", "first_stage", "first drift")
+        with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+            p.let("h", "dt*drift_share(stage)", "length of this drift")
+            impulse = self._drift(p, "h")
+            p.each("v", f"v+{impulse}", "impulse of the constraints")
+            p.let("stage", "stage+1", "what follows")
+            with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
+                self._evaluate(p)
+                self.ensemble.kick(p, "kick_share(stage)*dt", self._force, "", lambda: self._project(p))
+
     def _write_step(self, p: Program) -> None:
-        scheme = self.scheme
-        if scheme is None:
-            p.each("v", "v+dt*f/m", "kick from half a step before x to half a step after")
-            self._drift(p, "dt")
-            return
-        flat = [a * w for a in scheme.drifts for w in scheme.flight]
-        # Kicks before each piece of a drift, and after the last.
-        kicks = [0.0] * (len(flat) + 1)
-        every = len(scheme.flight)
-        first = 0 if scheme.kick_first else every
-        for k, b in enumerate(scheme.kicks):
-            kicks[first + k * every] = b
-        if len(flat) == 1:
-            p.each("v", f"v+{kicks[0]!r}*dt*{self._force}/m", "kick")
-            self._drift(p, "dt")
-            self._evaluate(p)
-            p.each("v", f"v+{kicks[1]!r}*dt*{self._force}/m", "kick")
+        """A step without parts."""
+        drifts, kicks = self._drifts, self._kicks
+
+        def project() -> None:
+            self._project(p)
+
+        if kicks[0]:
+            self.ensemble.kick(p, f"{kicks[0]!r}*dt", "f", "", project)
+        if len(drifts) == 1:
+            impulse = self._drift(p, "dt")
+            if kicks[1]:
+                self.ensemble.kick(p, f"{kicks[1]!r}*dt", "f", impulse, project)
+            else:
+                p.each("v", f"v+{impulse}", "impulse of the constraints")
         else:
-            p.table("drift_share", flat, "length of each drift as a fraction of the step")
+            p.table("drift_share", drifts, "length of drift k as a fraction of the step")
             p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
             p.number("stage", "number of the drift")
             p.number("h", "length of the drift")
             p.let("stage", "0", "first drift")
-            if kicks[0]:
-                p.each("v", f"v+{kicks[0]!r}*dt*{self._force}/m", "kick")
-            with p.loop(f"stage < {len(flat)}", "all drifts and kicks of the scheme"):
+            with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
                 p.let("h", "dt*drift_share(stage)", "length of this drift")
-                self._drift(p, "h")
+                impulse = self._drift(p, "h")
+                p.each("v", f"v+{impulse}", "impulse of the constraints")
                 p.let("stage", "stage+1", "what follows")
                 with p.when("kick_share(stage) != 0", "a kick follows"):
-                    self._evaluate(p)
-                    p.each("v", f"v+dt*kick_share(stage)*{self._force}/m", "kick")
-        p.hold_velocities("tangent to the constraints of the System")
-        for part in self.parts:
-            part.project(p)
+                    self.ensemble.kick(p, "kick_share(stage)*dt", "f", "", project)
+        if self.scheme is not None:
+            project()
 
     def _evaluate(self, p: Program) -> None:
         if self._kept:
             p.each("force", "f", "applied forces")
 
-    def _drift(self, p: Program, h: str) -> None:
-        """Fly h along all constraints; v takes the impulse that keeps x on them."""
+    def _drift(self, p: Program, h: str) -> str:
+        """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""
         for part in self.parts:
             part.remember(p)
         p.each("x", f"x+{h}*v", "fly")
         p.each("xu", "x", "unconstrained")
-        apart = [part for part in self.parts if not part.meets_system]
-        for part in apart:
-            part.land(p, h)
+        for part in self.parts:
+            if not part.meets_system:
+                part.land(p, h)
         together = [part for part in self.parts if part.meets_system]
         if together:
             together[0].land(p, h)
         else:
             p.hold_positions("onto the constraints of the System")
-        p.each("v", f"v+(x-xu)/{h}", "impulse of the constraints")
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraints did to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _project(self, p: Program) -> None:
+        p.hold_velocities("tangent to the constraints of the System")
+        for part in self.parts:
+            part.project(p)
 
     # -- running --------------------------------------------------------------------------------
+
+    @property
+    def context(self) -> openmm.Context:
+        """The Context that this integrator belongs to.
+
+        Found by itself; set it where this fails.
+
+        Raises
+        ------
+        UnsupportedError
+            There is none.
+        """
+        guard = self._guard
+        context = None if guard is None else guard.alive
+        if context is None:
+            context = find_context(self)
+            if context is None:
+                raise UnsupportedError("this integrator belongs to no Context; create one with it first")
+            self.context = context
+        return context
+
+    @context.setter
+    def context(self, context: openmm.Context) -> None:
+        if self._guard is None or self._guard.alive is not context:
+            self._guard = Guard(context, self)
+
+    def _watch(self, context: openmm.Context | None = None) -> Guard:
+        if context is None:
+            context = self.context
+        self.context = context
+        assert self._guard is not None
+        return self._guard
 
     def step(self, steps: int) -> None:
         """Make `steps` steps.
@@ -191,31 +285,318 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         Raises
         ------
         KconsError
-            A solve of one of the parts failed: positions and velocities are those before that step, `error.step` is
-            its number.
+            A solve of one of the parts failed: positions, velocities, time and step count are those before that
+            step, `error.step` is its number. Or a check failed, or a NaN appeared: they are those of the last check.
+        InputError, UnsupportedError
+            At the first step: the System cannot be propagated, or the start is not on the constraints.
         """
-        if not self.parts:
+        guard = self._watch()
+        if not guard.started:
+            guard.begin()
+        if self._kept and guard.surroundings_changed():
+            self.refresh()
+        while steps > 0:
+            block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
+            self._run(guard, block)
+            guard.count(block)
+            steps -= block
+        if self._kept:
+            guard.note_surroundings()
+
+    def _run(self, guard: Guard, steps: int) -> None:
+        context = guard.context
+        time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
+        before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
+        try:
             super().step(steps)
-            return
-        for _ in range(steps):
-            super().step(1)
+        except openmm.OpenMMException as error:
+            guard.put_back()
+            if "NaN" not in str(error):
+                raise
+            raise NonFiniteError(
+                f"{error} It appeared after step {first}; positions and velocities are those of step "
+                f"{context.getStepCount()}. Take a smaller time step, or minimise the energy first",
+                item="position",
+                step=first,
+            ) from error
+        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
+        done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
+        # OpenMM's clock goes on with the first step size after setStepSize.
+        expected = time + done * self._dt
+        if code or abs(context.getTime().value_in_unit(unit.picosecond) - expected) > 1e-6 * self._dt:
+            context.setTime(expected)
+        if code:
+            context.setStepCount(first + done)
+            guard.since_check += done
+            raise self._failure(code, first + done + 1)
+
+    def _failure(self, code: int, step: int) -> KconsError:
+        error = self.parts[code - 1].failure(self, step)
+        self.setGlobalVariableByName("failed", 0.0)
+        return error
+
+    def refresh(self) -> None:
+        """Compute the forces anew at the next step.
+
+        To be called after `updateParametersInContext`, which cannot be seen from here; where parts are held, forces
+        are kept from one step to the next. Changed positions, parameters and boxes are seen.
+        """
+        if self.parts:
+            self.setGlobalVariableByName("stale", 1.0)
+
+    def check(self, context: openmm.Context | None = None) -> None:
+        """Whether all is well: the System, its constraints and the parts, at the present state.
+
+        Raises
+        ------
+        KconsError
+            What is wrong. Also a failure in a step that ran within a CompoundIntegrator.
+        """
+        guard = self._watch(context)
+        if self.parts:
             code = int(self.getGlobalVariableByName("failed"))
             if code:
-                number = int(self.getGlobalVariableByName("good_steps")) + 1
-                self.setGlobalVariableByName("failed", 0.0)
-                raise self.parts[code - 1].failure(self, number)
+                raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
+        guard.check()
+        for part in self.parts:
+            part.check(guard.context)
 
-    def listing(self) -> str:
-        """The steps of the integrator, in words."""
-        return self.program.listing()
+    # -- constraints outside of steps -----------------------------------------------------------
+
+    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Bring positions onto all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            They cannot be reached from here; positions are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        start, velocities = positions_of(context), velocities_of(context)
+        tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
+        try:
+            context.applyConstraints(tolerance)
+            if self.parts:
+                context.setVelocities(np.zeros_like(velocities))
+                self._run_alone(guard, self._alone, self._alone + 1)
+            guard.check_rows(positions_of(context), None)
+        except KconsError:
+            context.setPositions(start)
+            raise
+        finally:
+            context.setVelocities(velocities)
+
+    def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Make velocities tangent to all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            A part cannot do it; velocities are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        if not self.parts:
+            context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+            return
+        velocities = velocities_of(context)
+        try:
+            self._run_alone(guard, self._alone, self._alone)
+        except KconsError:
+            context.setVelocities(velocities)
+            raise
+
+    def _run_alone(self, guard: Guard, first: int, end: int) -> None:
+        """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
+        context = guard.context
+        time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
+        self.setGlobalVariableByName("first_stage", float(first))
+        self.setGlobalVariableByName("end_stage", float(end))
+        try:
+            super().step(1)
+        finally:
+            self.setGlobalVariableByName("first_stage", 0.0)
+            self.setGlobalVariableByName("end_stage", float(len(self._drifts)))
+            self.setGlobalVariableByName("good_steps", good)
+            self.refresh()
+            context.setTime(time)
+            context.setStepCount(count)
+        code = int(self.getGlobalVariableByName("failed"))
+        if code:
+            raise self._failure(code, count)
+
+    def setVelocitiesToTemperature(
+        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
+    ) -> None:
+        """Draw velocities for a temperature (K if a float) and make them tangent to all constraints.
+
+        Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
+        """
+        arguments = (temperature,) if seed is None else (temperature, int(seed))
+        context.setVelocitiesToTemperature(*arguments)
+        self.applyVelocityConstraints(context)
+
+    def minimizeEnergy(
+        self,
+        context: openmm.Context | None = None,
+        tolerance: unit.Quantity | float = 10.0,
+        maxIterations: int = 0,
+    ) -> None:
+        """Minimise the energy with all constraints kept.
+
+        Without parts this is OpenMM's LocalEnergyMinimizer, followed by `applyConstraints`; OpenMM's minimiser knows
+        nothing of parts.
+
+        Parameters
+        ----------
+        tolerance : Quantity or float
+            Root mean square of the force components along the constraints, in kJ/mol/nm if a float.
+        maxIterations : int
+            0 for no limit.
+        """
+        context = self._watch(context).context
+        if unit.is_quantity(tolerance):
+            tolerance = tolerance.value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        if self.parts:
+            descend(self, context, tolerance, maxIterations)
+        else:
+            openmm.LocalEnergyMinimizer.minimize(context, tolerance, maxIterations)
+            self.applyConstraints(context)
+
+    # -- temperature ----------------------------------------------------------------------------
+
+    def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
+        """Three for each particle with a mass, less the rank of all constraints.
+
+        Also less three where a CMMotionRemover keeps the centre of mass at rest. Found at the first call.
+        """
+        return self._watch(context).degrees_of_freedom()
+
+    def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
+        """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
+        guard = self._watch(context)
+        if self.scheme is None:
+            state = guard.context.getState(energy=True, groups=self.getIntegrationForceGroups())
+            return state.getKineticEnergy()
+        v = velocities_of(guard.context)
+        return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
+
+    def computeSystemTemperature(self) -> unit.Quantity:
+        """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.
+
+        Raises
+        ------
+        InputError
+            No degree of freedom is left.
+        """
+        freedom = self.degrees_of_freedom()
+        if freedom <= 0:
+            raise InputError("the constraints leave no degree of freedom: there is no temperature", item="constraints")
+        return (2 * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
+
+    # -- settings -------------------------------------------------------------------------------
+
+    @property
+    def _dt(self) -> float:
+        return float(self.getStepSize().value_in_unit(unit.picosecond))
+
+    def setStepSize(self, size: unit.Quantity | float) -> None:
+        """Change the time step.
+
+        Raises
+        ------
+        InputError
+            It is no positive number.
+        """
+        super().setStepSize(_picoseconds(size))
+
+    def setConstraintTolerance(self, tol: float) -> None:
+        """Change the relative tolerance of the System's constraints.
+
+        Raises
+        ------
+        InputError
+            It is not between 0 and 1.
+        """
+        if not 0 < tol < 1:
+            raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
+        super().setConstraintTolerance(tol)
+
+    def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
+        """Choose the force groups that act; groups that carry rows never do.
+
+        Parameters
+        ----------
+        groups : int or iterable of int
+            A bit mask or group numbers. -1 and all 32 groups mean: all but the groups of rows.
+
+        Raises
+        ------
+        InputError
+            Groups that carry rows are among those given.
+        UnsupportedError
+            The Context exists; it has read the groups and would ignore the change.
+        """
+        if getattr(self, "_guard", None) is not None or (getattr(self, "program", None) and find_context(self)):
+            raise UnsupportedError("the Context has read the force groups already; set them before it is created")
+        wanted = {g for g in range(32) if (groups >> g) & 1} if isinstance(groups, int) else set(groups)
+        rows = self.row_groups
+        if len(wanted) == 32:
+            wanted -= rows
+        if wanted & rows:
+            raise InputError(
+                f"force groups {sorted(wanted & rows)} carry constraint rows, their forces are gradients and must not "
+                "act; leave them out",
+                item="groups",
+            )
+        super().setIntegrationForceGroups(wanted)
+
+    # -- copies and files -----------------------------------------------------------------------
+
+    @classmethod
+    def from_xml(cls, xml: str, **arguments: Any) -> ProjectedIntegrator:
+        """The integrator that XmlSerializer wrote; OpenMM itself reads it as a plain CustomIntegrator.
+
+        Parameters
+        ----------
+        xml : str
+            The text of the file.
+        **arguments
+            `parts`, `check_every` and `ensemble`, which the file does not contain.
+
+        Raises
+        ------
+        InputError
+            The file has no program of this class with these parts.
+        """
+        return as_projected(cls, openmm.XmlSerializer.deserialize(xml), **arguments)
+
+    @classmethod
+    def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> ProjectedIntegrator:
+        """A plain CustomIntegrator that was one of these once, see `from_xml`."""
+        return as_projected(cls, integrator, **arguments)
+
+    def _making(self) -> tuple[Any, ...]:
+        scheme = LEAPFROG if self.scheme is None else self.scheme
+        return self._dt, scheme, self.parts, self.getConstraintTolerance(), self.check_every, self.ensemble
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return remade, (type(self), self._making(), settings_of(self))
+
+    def __copy__(self) -> ProjectedIntegrator:
+        """Without the Context, and with copies of the parts: an integrator and its parts serve one Context."""
+        return remade(type(self), deepcopy(self._making()), settings_of(self))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
+        return self.__copy__()
 
 
-def _scheme(scheme: str | Splitting) -> Splitting | None:
-    if isinstance(scheme, Splitting):
-        return scheme
-    if scheme == LEAPFROG:
-        return None
-    if scheme not in SCHEMES:
-        known = ", ".join((*SCHEMES, LEAPFROG))
-        raise InputError(f"no scheme {scheme!r}; known: {known}", item="scheme")
-    return SCHEMES[scheme]()
+def _picoseconds(timestep: Any) -> float:
+    dt = timestep.value_in_unit(unit.picoseconds) if unit.is_quantity(timestep) else float(timestep)
+    if not (np.isfinite(dt) and dt > 0):
+        raise InputError(
+            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
+            item="timestep",
+        )
+    return float(dt)

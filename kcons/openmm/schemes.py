@@ -1,0 +1,62 @@
+"""Schemes by name, and their stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from kcons.errors import InputError
+from kcons.steppers import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Geodesic,
+    KahanLi6,
+    Rattle,
+    Suzuki4,
+    Yoshida4,
+)
+from kcons.steppers.splitting import Splitting
+
+#: Schemes by name.
+SCHEMES: dict[str, Callable[[], Splitting]] = {
+    "rattle": Rattle,
+    "geodesic": Geodesic,
+    "suzuki4": Suzuki4,
+    "yoshida4": Yoshida4,
+    "kahan-li6": KahanLi6,
+    "blanes-moan4": BlanesMoan4,
+    "blanes-moan6": BlanesMoan6,
+    "blanes-moan6a": BlanesMoan6a,
+}
+LEAPFROG = "leapfrog"
+
+
+def to_scheme(scheme: str | Splitting) -> Splitting | None:
+    """The splitting of a name; None for the leapfrog.
+
+    Raises
+    ------
+    InputError
+        An unknown name.
+    """
+    if isinstance(scheme, Splitting):
+        return scheme
+    if scheme == LEAPFROG:
+        return None
+    if scheme not in SCHEMES:
+        known = ", ".join((*SCHEMES, LEAPFROG))
+        raise InputError(f"no scheme {scheme!r}; known: {known}", item="scheme")
+    return SCHEMES[scheme]()
+
+
+def stages_of(scheme: Splitting | None) -> tuple[list[float], list[float]]:
+    """Drifts, and the kick before each of them and after the last, as fractions of the step."""
+    if scheme is None:
+        return [1.0], [1.0, 0.0]
+    drifts = [a * w for a in scheme.drifts for w in scheme.flight]
+    kicks = [0.0] * (len(drifts) + 1)
+    every = len(scheme.flight)
+    first = 0 if scheme.kick_first else every
+    for k, b in enumerate(scheme.kicks):
+        kicks[first + k * every] = b
+    return drifts, kicks

@@ -1,0 +1,193 @@
+"""What OpenMM itself holds in a System, what of it can be trusted, and what an integrator must refuse.
+
+OpenMM ignores a constraint solver that does not converge; the residuals here are computed from positions and
+velocities, independently of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import openmm
+from numpy.typing import NDArray
+from openmm import unit
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance
+from kcons.constraints.target import FloatArray
+from kcons.errors import UnsupportedError
+from kcons.plan import make_plan
+
+IntArray = NDArray[np.int64]
+
+#: Forces that need an integrator of their own.
+_FOREIGN = {
+    "DrudeForce": "Drude particles need openmm.DrudeLangevinIntegrator or openmm.DrudeSCFIntegrator",
+    "RPMDMonteCarloBarostat": "ring polymers need openmm.RPMDIntegrator",
+}
+BAROSTATS = frozenset(
+    {"MonteCarloBarostat", "MonteCarloAnisotropicBarostat", "MonteCarloMembraneBarostat", "MonteCarloFlexibleBarostat"}
+)
+
+
+@dataclass(frozen=True)
+class SystemRows:
+    """The constraints of a System that act, as arrays.
+
+    Attributes
+    ----------
+    masses : ndarray, shape (n_particles,)
+    pairs : ndarray of int, shape (n_rows, 2)
+    lengths : ndarray, shape (n_rows,)
+        What OpenMM's solvers hold: SETTLE stores its distances in single precision.
+    numbers : ndarray of int, shape (n_rows,)
+        Which constraint of the System each row is. OpenMM ignores those between massless particles.
+    settled : ndarray of bool, shape (n_rows,)
+        Rows that SETTLE holds.
+    """
+
+    masses: FloatArray
+    pairs: IntArray
+    lengths: FloatArray
+    numbers: IntArray
+    settled: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, system: openmm.System) -> SystemRows:
+        n = system.getNumParticles()
+        masses = np.array([system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(n)])
+        pairs, lengths, numbers = [], [], []
+        for k in range(system.getNumConstraints()):
+            i, j, d = system.getConstraintParameters(k)
+            if masses[i] or masses[j]:
+                pairs.append((i, j))
+                lengths.append(d.value_in_unit(unit.nanometer))
+                numbers.append(k)
+        table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        given = np.array(lengths, dtype=float)
+        settled = _settled(table, given, n)
+        held = np.where(settled, given.astype(np.float32).astype(float), given)
+        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled)
+
+    @property
+    def n_rows(self) -> int:
+        return len(self.pairs)
+
+    def stretches(self, x: FloatArray) -> FloatArray:
+        """(d - d0)/d0 of each row at positions x, shape (n_rows,)."""
+        r = x[self.pairs[:, 0]] - x[self.pairs[:, 1]]
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", r, r)) / self.lengths - 1)
+
+    def stretching_speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
+        """A v of each row relative to the root mean square velocity, shape (n_rows,)."""
+        i, j = self.pairs.T
+        r = x[i] - x[j]
+        rate = np.einsum("ij,ij->i", r, v[i] - v[j]) / np.sqrt(np.einsum("ij,ij->i", r, r))
+        speed = np.sqrt(np.mean(v * v)) if v.size else 0.0
+        return np.asarray(rate / speed if speed > 0 else np.zeros(len(rate)))
+
+    def name(self, row: int) -> str:
+        i, j = self.pairs[row]
+        return f"constraint {self.numbers[row]} of the System (particles {i} and {j}, {self.lengths[row]:.6g} nm)"
+
+    def rank(self, x: FloatArray) -> int:
+        """Independent rows at positions x. Isolated triangles have rank 3."""
+        rest = ~self.settled
+        count = int(np.sum(self.settled))
+        if not rest.any():
+            return count
+        atoms, pairs = np.unique(self.pairs[rest], return_inverse=True)
+        distances = Distance(pairs.reshape(-1, 2), self.lengths[rest])
+        rows = ConstraintSet([distances], x[atoms], self.masses[atoms])
+        return count + make_plan(rows, np.ascontiguousarray(x[atoms]), 0.0).rank
+
+
+def _settled(pairs: IntArray, lengths: FloatArray, n: int) -> NDArray[np.bool_]:
+    """Which rows are isolated triangles with two equal sides; OpenMM's own rule."""
+    count = np.bincount(pairs.ravel(), minlength=n)
+    neighbours: dict[int, dict[int, np.float32]] = {}
+    for (i, j), d in zip(pairs.tolist(), lengths.astype(np.float32), strict=True):
+        if count[i] == 2 and count[j] == 2:
+            neighbours.setdefault(i, {})[j] = d
+            neighbours.setdefault(j, {})[i] = d
+    held = np.zeros(n, bool)
+    for i, around in neighbours.items():
+        if len(around) == 2:
+            j, k = around
+            if k in neighbours[j]:
+                sides = {around[j], around[k], neighbours[j][k]}
+                held[[i, j, k]] = len(sides) < 3
+    return held[pairs[:, 0]] & held[pairs[:, 1]] if len(pairs) else np.zeros(0, bool)
+
+
+def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
+    return (system.getForce(k) for k in range(system.getNumForces()))
+
+
+def removes_centre_of_mass_motion(system: openmm.System) -> bool:
+    return any(isinstance(force, openmm.CMMotionRemover) for force in forces_of(system))
+
+
+def check_system(system: openmm.System, *, leapfrog: bool) -> None:
+    """Refuse Systems that a CustomIntegrator of kicks and drifts cannot propagate.
+
+    Raises
+    ------
+    UnsupportedError
+        Virtual sites in any scheme but the leapfrog, particles or forces that need an integrator of their own, a
+        barostat that scales atoms one by one although bonds are held.
+    """
+    for force in forces_of(system):
+        name = type(force).__name__
+        if name in _FOREIGN:
+            raise UnsupportedError(f"the System has a {name}: {_FOREIGN[name]}")
+        scales_atoms = name == "MonteCarloFlexibleBarostat" and not force.getScaleMoleculesAsRigid()
+        if scales_atoms and system.getNumConstraints():
+            raise UnsupportedError(
+                "MonteCarloFlexibleBarostat with scaleMoleculesAsRigid=False moves the atoms of a molecule apart and "
+                "breaks the constraints; let it scale molecules as rigid"
+            )
+    if leapfrog:
+        return
+    sites = [k for k in range(system.getNumParticles()) if system.isVirtualSite(k)]
+    if sites:
+        raise UnsupportedError(
+            f"particle {sites[0]} is a virtual site: OpenMM places virtual sites at the end of a step only, and every "
+            "scheme but 'leapfrog' needs forces within the step, where the sites would still be those of the step "
+            "before. Use scheme='leapfrog'"
+        )
+
+
+def refuse_barostat(context: openmm.Context, rows: Iterable[Sequence[int]], kind: str) -> None:
+    """Refuse a barostat that would break rows: it moves molecules as wholes, each by a vector of its own.
+
+    Parameters
+    ----------
+    context : openmm.Context
+    rows : iterable of sequences of int
+        The particles of each row. A row on one particle only is taken to hold it in space.
+    kind : str
+        What the rows are called.
+
+    Raises
+    ------
+    UnsupportedError
+        There is a barostat, and a row holds particles of several molecules together or one in space.
+    """
+    names = {type(force).__name__ for force in forces_of(context.getSystem())} & BAROSTATS
+    if not names:
+        return
+    molecule = np.empty(context.getSystem().getNumParticles(), dtype=np.int64)
+    for number, members in enumerate(context.getMolecules()):
+        molecule[list(members)] = number
+    for row in rows:
+        atoms = [int(a) for a in row]
+        if len(atoms) < 2 or len(set(molecule[atoms].tolist())) > 1:
+            what = "holds a particle in space" if len(atoms) < 2 else "holds particles of several molecules together"
+            raise UnsupportedError(
+                f"{kind} on particles {', '.join(map(str, atoms[:6]))}{', ...' if len(atoms) > 6 else ''} {what}; "
+                f"{names.pop()} moves whole molecules and would break it. Run at constant volume, or join the "
+                "molecules by bonds of no strength"
+            )

@@ -1,0 +1,57 @@
+"""A part for tests, small enough to be seen to be right."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.errors import ConvergenceError, InputError
+from kcons.openmm.guard import positions_of
+
+
+class HeldCoordinates:
+    """Particles that stay at one value of one coordinate.
+
+    `steepest` is the largest displacement that is accepted in one drift; beyond it the part fails.
+    """
+
+    code = 0
+    meets_system = False
+
+    def __init__(self, particles, axis, value, n, *, evaluates=False, steepest=np.inf, groups=()):
+        self.mask = np.zeros((n, 3))
+        self.mask[list(particles), axis] = 1.0
+        self.value, self.evaluates, self.steepest = value, evaluates, steepest
+        self.groups = frozenset(groups)
+        self.particles, self.axis = list(particles), axis
+
+    def declare(self, program):
+        program.vector("held", "1 where a coordinate is held")
+        program.number("level", "where it is held", self.value)
+        program.number("steepest", "longest way accepted", self.steepest)
+        program.number("off", "how far off it was")
+        program.integrator.setPerDofVariableByName("held", [list(row) for row in self.mask])
+        for group in self.groups:
+            program.vector("row", "gradient")
+
+    def remember(self, program):
+        for group in self.groups:
+            program.each("row", f"-f{group}", "a row group")
+
+    def land(self, program, h):
+        program.sum("off", "held*(x-level)^2", "how far off")
+        program.each("x", "x-held*(x-level)", "back to the level")
+        program.let("failed", f"select(step(off-steepest^2),{self.code},failed)", "too far is a failure")
+
+    def project(self, program):
+        program.each("v", "v*(1-held)", "at rest across")
+
+    def check(self, context):
+        miss = np.abs(positions_of(context)[self.particles, self.axis] - self.value).max()
+        if miss > 1e-9:
+            raise InputError(f"off the level by {miss:.3g}", item="positions")
+
+    def failure(self, integrator, step):
+        return ConvergenceError("too steep", step=step)
+
+    def rank(self, context):
+        return len(self.particles)
