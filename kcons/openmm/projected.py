@@ -17,7 +17,8 @@ from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.minimization import descend
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
-from kcons.openmm.schemes import LEAPFROG, stages_of, to_scheme
+from kcons.openmm.schemes import LEAPFROG, to_scheme
+from kcons.openmm.steps import StepWriter
 from kcons.steppers.splitting import Splitting
 
 
@@ -89,7 +90,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if self.row_groups:
             self.setIntegrationForceGroups(-1)
         self.program = Program(self)
-        self._write(self.program)
+        self._plan = StepWriter(self.program, self.scheme, self.parts, self.ensemble)
+        self._plan.write()
 
     def __repr__(self) -> str:
         scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
@@ -102,148 +104,6 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     def listing(self) -> str:
         """The steps of the integrator, in words."""
         return self.program.listing()
-
-    # -- the program ----------------------------------------------------------------------------
-
-    def _write(self, p: Program) -> None:
-        #: Where parts evaluate row groups, the applied forces are kept here: OpenMM remembers the last groups only.
-        self._kept = self.scheme is not None and any(part.evaluates for part in self.parts)
-        self._force = p.vector("force", "applied forces at x") if self._kept else "f"
-        p.vector("xu", "positions before constraints act on them")
-        self.ensemble.declare(p)
-        for part in self.parts:
-            part.declare(p)
-        if self.scheme is None:
-            # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
-            # impulse of the forces at x is added, and half that of the constraints in the drift to x.
-            self.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
-            p.vector("impulse", "change of v by the constraints in the last drift")
-        self._drifts, self._kicks = stages_of(self.scheme)
-        if self.parts:
-            self._write_guarded(p)
-        else:
-            p.let_others_act()
-            self._write_step(p)
-
-    def _write_guarded(self, p: Program) -> None:
-        """A step that is taken back when a part fails.
-
-        The same program also brings positions, or velocities alone, onto the constraints: the last stage of the
-        tables is a drift without kicks, to which `_run_alone` goes directly.
-        """
-        n = len(self._drifts)
-        self._alone = n + 1
-        p.number("failed", "number of the part whose solve failed, 0 for none")
-        p.number("good_steps", "steps done since the integrator was made")
-        p.number("first_stage", f"0; {self._alone} to apply the constraints alone")
-        p.number("end_stage", "where the stages end", n)
-        p.number("stage", "number of the drift")
-        p.number("h", "length of the drift")
-        p.table("drift_share", [*self._drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
-        p.table("kick_share", [*self._kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
-        p.vector("x_last", "positions after the last good step")
-        p.vector("v_last", "velocities before this step")
-        if self._kept:
-            p.number("stale", "whether forces must be computed anew", 1.0)
-            p.number("moved", "how far others have moved x since the last step")
-        else:
-            p.number("stale", "whether this is a fresh start", 1.0)
-        with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
-            p.let_others_act()
-        with p.when("failed = 0", "after a failure nothing moves"):
-            if self._kept:
-                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
-                with p.when("moved + stale != 0", "others did"):
-                    p.each("x_last", "x", "start here")
-                    p.each("force", "f", "applied forces")
-            else:
-                p.each("x_last", "x", "to come back to")
-            p.let("stale", "0", "forces belong to x")
-            p.each("v_last", "v", "to come back to")
-            self._write_loop(p)
-            with p.when("failed = 0", "all solves converged"):
-                self._project(p)
-            with p.when("failed = 0", "the step is good"):
-                p.each("x_last", "x", "positions of the last good step")
-                p.let("good_steps", "good_steps+1", "count it")
-            with p.when("failed != 0", "a solve failed"):
-                p.each("x", "x_last", "back to where the step began")
-                p.each("v", "v_last", "back to where the step began")
-                p.let("stale", "1", "forces are those of elsewhere")
-
-    def _write_loop(self, p: Program) -> None:
-        """The stages of a step with parts."""
-        first = "kick_share(first_stage)*dt"
-        if self._kicks[0]:
-            self.ensemble.kick(p, first, self._force, "", lambda: self._project(p))
-        p.let("stage", "first_stage", "first drift")
-        with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
-            p.let("h", "dt*drift_share(stage)", "length of this drift")
-            impulse = self._drift(p, "h")
-            p.each("v", f"v+{impulse}", "impulse of the constraints")
-            p.let("stage", "stage+1", "what follows")
-            with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
-                self._evaluate(p)
-                self.ensemble.kick(p, "kick_share(stage)*dt", self._force, "", lambda: self._project(p))
-
-    def _write_step(self, p: Program) -> None:
-        """A step without parts."""
-        drifts, kicks = self._drifts, self._kicks
-
-        def project() -> None:
-            self._project(p)
-
-        if kicks[0]:
-            self.ensemble.kick(p, f"{kicks[0]!r}*dt", "f", "", project)
-        if len(drifts) == 1:
-            impulse = self._drift(p, "dt")
-            if kicks[1]:
-                self.ensemble.kick(p, f"{kicks[1]!r}*dt", "f", impulse, project)
-            else:
-                p.each("v", f"v+{impulse}", "impulse of the constraints")
-        else:
-            p.table("drift_share", drifts, "length of drift k as a fraction of the step")
-            p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
-            p.number("stage", "number of the drift")
-            p.number("h", "length of the drift")
-            p.let("stage", "0", "first drift")
-            with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
-                p.let("h", "dt*drift_share(stage)", "length of this drift")
-                impulse = self._drift(p, "h")
-                p.each("v", f"v+{impulse}", "impulse of the constraints")
-                p.let("stage", "stage+1", "what follows")
-                with p.when("kick_share(stage) != 0", "a kick follows"):
-                    self.ensemble.kick(p, "kick_share(stage)*dt", "f", "", project)
-        if self.scheme is not None:
-            project()
-
-    def _evaluate(self, p: Program) -> None:
-        if self._kept:
-            p.each("force", "f", "applied forces")
-
-    def _drift(self, p: Program, h: str) -> str:
-        """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""
-        for part in self.parts:
-            part.remember(p)
-        p.each("x", f"x+{h}*v", "fly")
-        p.each("xu", "x", "unconstrained")
-        for part in self.parts:
-            if not part.meets_system:
-                part.land(p, h)
-        together = [part for part in self.parts if part.meets_system]
-        if together:
-            together[0].land(p, h)
-        else:
-            p.hold_positions("onto the constraints of the System")
-        if self.scheme is None:
-            p.each("impulse", f"(x-xu)/{h}", "what the constraints did to v")
-            return "impulse"
-        return f"(x-xu)/{h}"
-
-    def _project(self, p: Program) -> None:
-        p.hold_velocities("tangent to the constraints of the System")
-        for part in self.parts:
-            part.project(p)
 
     # -- running --------------------------------------------------------------------------------
 
@@ -293,14 +153,14 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         guard = self._watch()
         if not guard.started:
             guard.begin()
-        if self._kept and guard.surroundings_changed():
+        if self._plan.kept and guard.surroundings_changed():
             self.refresh()
         while steps > 0:
             block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
             self._run(guard, block)
             guard.count(block)
             steps -= block
-        if self._kept:
+        if self._plan.kept:
             guard.note_surroundings()
 
     def _run(self, guard: Guard, steps: int) -> None:
@@ -379,7 +239,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             context.applyConstraints(tolerance)
             if self.parts:
                 context.setVelocities(np.zeros_like(velocities))
-                self._run_alone(guard, self._alone, self._alone + 1)
+                self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
             guard.check_rows(positions_of(context), None)
         except KconsError:
             context.setPositions(start)
@@ -402,7 +262,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             return
         velocities = velocities_of(context)
         try:
-            self._run_alone(guard, self._alone, self._alone)
+            self._run_alone(guard, self._plan.alone, self._plan.alone)
         except KconsError:
             context.setVelocities(velocities)
             raise
@@ -417,7 +277,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             super().step(1)
         finally:
             self.setGlobalVariableByName("first_stage", 0.0)
-            self.setGlobalVariableByName("end_stage", float(len(self._drifts)))
+            self.setGlobalVariableByName("end_stage", float(len(self._plan.drifts)))
             self.setGlobalVariableByName("good_steps", good)
             self.refresh()
             context.setTime(time)
@@ -456,8 +316,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             0 for no limit.
         """
         context = self._watch(context).context
-        if unit.is_quantity(tolerance):
-            tolerance = tolerance.value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        tolerance = _value(tolerance, unit.kilojoule_per_mole / unit.nanometer)
         if self.parts:
             descend(self, context, tolerance, maxIterations)
         else:
@@ -592,11 +451,15 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         return self.__copy__()
 
 
+def _value(quantity: Any, of: unit.Unit) -> float:
+    return float(quantity.value_in_unit(of) if unit.is_quantity(quantity) else quantity)
+
+
 def _picoseconds(timestep: Any) -> float:
-    dt = timestep.value_in_unit(unit.picoseconds) if unit.is_quantity(timestep) else float(timestep)
+    dt = _value(timestep, unit.picosecond)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
             f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
             item="timestep",
         )
-    return float(dt)
+    return dt

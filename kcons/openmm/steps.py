@@ -1,0 +1,174 @@
+"""Writes the program of one step: kicks, drifts along the constraints, projections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kcons.openmm.ensemble import Ensemble
+from kcons.openmm.part import Part
+from kcons.openmm.program import Program
+from kcons.openmm.schemes import stages_of
+from kcons.steppers.splitting import Splitting
+
+
+class StepWriter:
+    """One step of a scheme, with what is held.
+
+    Attributes
+    ----------
+    drifts, kicks : list of float
+        The stages of the scheme as fractions of the step; see `stages_of`.
+    alone : int
+        With parts: number of the stage that is a drift without kicks, for applying constraints outside of steps.
+    kept : bool
+        Whether the applied forces are kept in a variable: where parts evaluate row groups, OpenMM remembers the
+        forces of the last groups only.
+    """
+
+    def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
+        self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
+        self.drifts, self.kicks = stages_of(scheme)
+        self.alone = len(self.drifts) + 1
+        self.kept = scheme is not None and any(part.evaluates for part in self.parts)
+
+    def write(self) -> None:
+        p = self.program
+        self.force = p.vector("force", "applied forces at x") if self.kept else "f"
+        p.vector("xu", "positions before constraints act on them")
+        if self.scheme is None:
+            # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
+            # impulse of the forces at x is added, and half that of the constraints in the drift to x.
+            p.integrator.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
+            p.vector("impulse", "change of v by the constraints in the last drift")
+        self.ensemble.declare(p)
+        if self.parts:
+            self._declare_guards()
+            for part in self.parts:
+                part.declare(p)
+            self._write_guarded()
+        else:
+            p.let_others_act()
+            self._write_plain()
+
+    # -- a step without parts -------------------------------------------------------------------
+
+    def _write_plain(self) -> None:
+        p, drifts, kicks = self.program, self.drifts, self.kicks
+        if kicks[0]:
+            self._kick(f"{kicks[0]!r}*dt")
+        if len(drifts) == 1:
+            impulse = self._drift("dt")
+            if kicks[1]:
+                self._kick(f"{kicks[1]!r}*dt", impulse)
+            else:
+                p.each("v", f"v+{impulse}", "impulse of the constraints")
+        else:
+            p.table("drift_share", drifts, "length of drift k as a fraction of the step")
+            p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
+            p.number("stage", "number of the drift")
+            p.number("h", "length of the drift")
+            p.let("stage", "0", "first drift")
+            # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
+            with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
+                p.let("h", "dt*drift_share(stage)", "length of this drift")
+                p.each("v", f"v+{self._drift('h')}", "impulse of the constraints")
+                p.let("stage", "stage+1", "what follows")
+                with p.when("kick_share(stage) != 0", "a kick follows"):
+                    self._kick("dt*kick_share(stage)")
+        if self.scheme is not None:
+            self._project()
+
+    # -- a step that is taken back when a part fails --------------------------------------------
+
+    def _declare_guards(self) -> None:
+        p, n = self.program, len(self.drifts)
+        p.number("failed", "number of the part whose solve failed, 0 for none")
+        p.number("good_steps", "steps done since the integrator was made")
+        p.number("first_stage", f"0; {self.alone} to apply the constraints alone")
+        p.number("end_stage", "where the stages end", n)
+        p.number("stage", "number of the drift")
+        p.number("h", "length of the drift")
+        p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
+        p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
+        p.vector("x_last", "positions to come back to")
+        p.vector("v_last", "velocities to come back to")
+        p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
+        if self.kept:
+            p.number("moved", "how far others have moved x since the last step")
+
+    def _write_guarded(self) -> None:
+        """The same program brings positions, or velocities alone, onto the constraints.
+
+        It starts at the last stage of the tables then, a drift without kicks, or behind it.
+        """
+        p = self.program
+        with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
+            p.let_others_act()
+        with p.when("failed = 0", "after a failure nothing moves"):
+            if self.kept:
+                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
+                with p.when("moved+stale != 0", "others did"):
+                    p.each("x_last", "x", "start here")
+                    p.each("force", "f", "applied forces")
+            else:
+                p.each("x_last", "x", "to come back to")
+            p.let("stale", "0", "forces belong to x")
+            p.each("v_last", "v", "to come back to")
+            self._write_loop()
+            # The leapfrog has velocities of half a step ago, which belong to no x.
+            condition = "failed = 0" if self.scheme is not None else "first_stage*step(0.5-failed) != 0"
+            with p.when(condition, "all solves converged" if self.scheme is not None else "constraints alone"):
+                self._project()
+            with p.when("failed = 0", "the step is good"):
+                p.let("good_steps", "good_steps+1", "count it")
+                if self.kept:
+                    p.each("x_last", "x", "where forces were computed")
+            with p.when("failed != 0", "a solve failed"):
+                p.each("x", "x_last", "back to where the step began")
+                p.each("v", "v_last", "back to where the step began")
+                p.let("stale", "1", "forces are those of elsewhere")
+
+    def _write_loop(self) -> None:
+        p = self.program
+        if self.kicks[0]:
+            self._kick("dt*kick_share(first_stage)")
+        p.let("stage", "first_stage", "first drift")
+        with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+            p.let("h", "dt*drift_share(stage)", "length of this drift")
+            p.each("v", f"v+{self._drift('h')}", "impulse of the constraints")
+            p.let("stage", "stage+1", "what follows")
+            with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
+                if self.kept:
+                    p.each("force", "f", "applied forces")
+                self._kick("dt*kick_share(stage)")
+
+    # -- what both are made of ------------------------------------------------------------------
+
+    def _kick(self, h: str, impulse: str = "") -> None:
+        self.ensemble.kick(self.program, h, self.force, impulse, self._project)
+
+    def _drift(self, h: str) -> str:
+        """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""
+        p = self.program
+        for part in self.parts:
+            part.remember(p)
+        p.each("x", f"x+{h}*v", "fly")
+        p.each("xu", "x", "unconstrained")
+        for part in self.parts:
+            if not part.meets_system:
+                part.land(p, h)
+        together = [part for part in self.parts if part.meets_system]
+        if together:
+            together[0].land(p, h)
+        else:
+            p.hold_positions("onto the constraints of the System")
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraints did to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _project(self) -> None:
+        p = self.program
+        p.hold_velocities("tangent to the constraints of the System")
+        for part in self.parts:
+            part.project(p)
