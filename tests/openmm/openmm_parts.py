@@ -30,7 +30,7 @@ class HeldCoordinates:
         program.number("steepest", "longest way accepted", self.steepest)
         program.number("off", "how far off it was")
         program.integrator.setPerDofVariableByName("held", [list(row) for row in self.mask])
-        for group in self.groups:
+        if self.groups:
             program.vector("row", "gradient")
 
     def remember(self, program):

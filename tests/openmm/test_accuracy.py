@@ -1,0 +1,274 @@
+"""How exact the integrator is: order, constraints, reversibility, and against independent implementations."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import (
+    DATA,
+    PLATFORMS,
+    alanine,
+    dumbbell,
+    forces_at,
+    masses_of,
+    residuals,
+    rows_of,
+    started,
+    state_of,
+    total_energy,
+    water_box,
+)
+
+from kcons import projection
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance
+from kcons.motion import Motion
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.schemes import SCHEMES
+from kcons.steppers import State
+from kcons.steppers import System as CoreSystem
+
+TIME = 0.048  # ps
+#: Order, and time steps in fs that divide the time, where the leading term rules and rounding does not.
+ORDERS = {
+    "rattle": (2, (1.0, 0.5, 0.25)),
+    "geodesic": (2, (1.0, 0.5, 0.25)),
+    "suzuki4": (4, (2.0, 1.0, 0.5)),
+    "yoshida4": (4, (1.0, 0.5, 0.25)),
+    "kahan-li6": (6, (2.0, 1.5, 1.0)),
+    "blanes-moan4": (4, (1.5, 1.0, 0.75)),
+    "blanes-moan6": (6, (4.0, 3.0, 2.4)),
+    "blanes-moan6a": (6, (4.0, 3.0, 2.4)),
+}
+
+
+def flown(scheme, dt, start=None, time=TIME, tolerance=1e-13):
+    """Positions and velocities after a time, as one array."""
+    system, x, v = alanine() if start is None else start
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=tolerance)
+    context = started(system, integrator, x, v)
+    steps = round(time / dt)
+    assert steps * dt == pytest.approx(time, rel=1e-12)
+    integrator.step(steps)
+    return np.array(state_of(context))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return flown("blanes-moan6a", 1e-3)
+
+
+@pytest.mark.parametrize("scheme", ORDERS)
+def test_order_with_all_bonds_held(scheme, truth):
+    order, steps = ORDERS[scheme]
+    errors = [np.abs(flown(scheme, 1e-3 * dt) - truth).max(axis=(1, 2)) for dt in steps]
+    for name, column in zip(("positions", "velocities"), np.transpose(errors), strict=True):
+        slope = np.polyfit(np.log(steps), np.log(column), 1)[0]
+        assert slope == pytest.approx(order, abs=0.15), name
+
+
+def test_leapfrog_has_order_2_in_positions(truth):
+    system, x, v = alanine()
+    errors = []
+    for dt in (1e-3, 0.5e-3, 0.25e-3):
+        integrator = ProjectedIntegrator(dt, "leapfrog", tolerance=1e-13)
+        context = started(system, integrator, x, v)
+        context.setVelocities(v - 0.5 * dt * forces_at(context) / masses_of(system)[:, None])
+        integrator.step(round(TIME / dt))
+        errors.append(np.abs(state_of(context)[0] - truth[0]).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(2, abs=0.15)
+
+
+def test_far_fewer_force_evaluations_than_rattle(truth):
+    """At 5e-7 nm after 48 fs, from the error of RATTLE, which falls as the square of its step."""
+    rattle = np.abs(flown("rattle", 1e-3 / 16)[0] - truth[0]).max()
+    steps_of_rattle = 16000 * np.sqrt(rattle / 5e-7)
+    assert np.abs(flown("blanes-moan6", 6e-3)[0] - truth[0]).max() <= 5e-7
+    evaluations = SCHEMES["blanes-moan6"]().force_evaluations / 6e-3
+    assert steps_of_rattle / evaluations >= 10
+
+
+# -- constraints ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog"])
+def test_constraints_to_the_last_digits(scheme, platform):
+    system, x, v = alanine()
+    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-13)
+    context = started(system, integrator, x, v, platform)
+    for _ in range(10):
+        integrator.step(3)
+        distance, along = residuals(system, context)
+        assert distance <= 1e-12
+        assert along <= 1e-12 or scheme == "leapfrog"
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6"])
+def test_constraints_of_water(scheme, platform):
+    """SETTLE rounds its distances to single precision: with lengths that are floats it is exact."""
+    worst = []
+    for exact in (True, False):
+        system, x = water_box(exact=exact)
+        integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-13)
+        context = started(system, integrator, x, platform=platform)
+        integrator.minimizeEnergy(context, maxIterations=20)
+        integrator.setVelocitiesToTemperature(context, 300, 1)
+        integrator.step(20)
+        distance, along = residuals(system, context)
+        assert along <= 1e-12
+        worst.append(distance)
+    assert worst[0] <= 1e-12
+    assert 1e-12 < worst[1] <= 6e-8
+
+
+# -- back in time -----------------------------------------------------------------------------------
+
+
+#: Velocities take (x - xu)/h of every substep: rounding enters as the sum over the substeps of 1/h. The finest
+#: substeps are 1/100 of a step in blanes-moan6 and 1/1400 in blanes-moan6a.
+FLOOR = {"blanes-moan6": 10.0, "blanes-moan6a": 100.0}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_reversible(scheme):
+    """OpenMM takes no negative steps; velocities are turned round instead."""
+    system, x, v = alanine()
+    dt, steps = {"blanes-moan6": (4e-3, 5), "blanes-moan6a": (4e-3, 1)}.get(scheme, (0.5e-3, 20))
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14)
+    context = started(system, integrator, x, v)
+    integrator.step(1)
+    x, v = state_of(context)
+    integrator.step(steps)
+    context.setVelocities(-state_of(context)[1])
+    integrator.step(steps)
+    after, back = state_of(context)
+    assert np.abs(after - x).max() <= 1e-12
+    assert np.abs(back + v).max() <= 1e-10 * np.abs(v).max()
+
+
+# -- against others ---------------------------------------------------------------------------------
+
+
+def mixture():
+    """Alanine dipeptide with its bonds held, and rigid water: CCMA and SETTLE in one System."""
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    box = app.Modeller(pdb.topology, pdb.positions)
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    box.addSolvent(field, boxSize=openmm.Vec3(1.8, 1.8, 1.8))
+    system = field.createSystem(
+        box.topology, nonbondedMethod=app.PME, nonbondedCutoff=0.8, constraints=app.AllBonds, rigidWater=True
+    )
+    return system, box.positions
+
+
+def test_projector_against_the_dense_oracle():
+    """v := f/m, constrained, is M_par^+ f; also where SETTLE rounds its lengths: it projects at x as it is."""
+    system, positions = mixture()
+    integrator = ProjectedIntegrator(1e-3, tolerance=1e-13)
+    context = started(system, integrator, positions)
+    integrator.minimizeEnergy(context, maxIterations=10)
+    x, f, masses = state_of(context)[0], forces_at(context), masses_of(system)
+    # The molecule and the first 40 waters: rows of different molecules do not mix.
+    atoms = np.arange(22 + 3 * 40)
+    pairs, lengths = rows_of(system)
+    mine = (pairs < len(atoms)).all(axis=1)
+    held = ConstraintSet([Distance(pairs[mine], lengths[mine])], x[atoms], masses[atoms])
+    exact = projection.constrained_inverse(held.jacobian(x[atoms]).toarray(), masses[atoms]) @ f[atoms].ravel()
+    context.setVelocities(f / masses[:, None])
+    integrator.applyVelocityConstraints(context)
+    found = state_of(context)[1][atoms].ravel()
+    assert np.abs(found - exact).max() <= 1e-12 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_one_bond_as_verlet_integrator(platform):
+    """RATTLE and OpenMM's leapfrog visit the same positions."""
+    system, x, v = dumbbell()
+    dt = 0.5e-3
+    ours = ProjectedIntegrator(dt, tolerance=1e-14)
+    context = started(system, ours, x, v, platform)
+    ours.applyVelocityConstraints(context)
+    v = state_of(context)[1]
+    theirs = openmm.VerletIntegrator(dt)
+    theirs.setConstraintTolerance(1e-14)
+    other = started(system, theirs, x, platform=platform)
+    other.setVelocities(v - 0.5 * dt * forces_at(other) / masses_of(system)[:, None])
+    ours.step(100)
+    theirs.step(100)
+    assert np.abs(state_of(context)[0] - state_of(other)[0]).max() <= 1e-12
+    ours.step(3900)
+    theirs.step(3900)
+    assert np.abs(state_of(context)[0] - state_of(other)[0]).max() <= 1e-9
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_one_bond_as_the_core_stepper(scheme):
+    """The same scheme in kcons' own engine, with the same forces."""
+    system, x, v = dumbbell()
+    dt = 0.5e-3
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14)
+    context = started(system, integrator, x, v)
+    integrator.applyVelocityConstraints(context)
+    v = state_of(context)[1]
+    k, c = 50.0, 500.0
+
+    def force(r, t):
+        x, y, z = r.T
+        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
+
+    np.testing.assert_allclose(forces_at(context), force(x, 0.0), rtol=1e-12)
+    motion = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x)
+    core, state = CoreSystem(motion, force), State(x, v)
+    stepper = SCHEMES[scheme]()
+    for steps, limit in ((100, 1e-12), (1900 if scheme == "rattle" else 400, 1e-9)):
+        for _ in range(steps):
+            state = stepper.step(core, state, dt)
+        integrator.step(steps)
+        assert np.abs(state_of(context)[0] - state.positions).max() <= limit * FLOOR.get(scheme, 1.0)
+
+
+def test_energy_is_kept():
+    """Fluctuations fall with the order; there is no drift."""
+    system, x, v = alanine()
+    spread = {}
+    for scheme in ("rattle", "suzuki4", "blanes-moan6"):
+        integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12)
+        context = started(system, integrator, x, v)
+        energies = []
+        for _ in range(100):
+            integrator.step(2)
+            energies.append(total_energy(context))
+        half = len(energies) // 2
+        spread[scheme] = np.std(energies)
+        # Below 1e-8 kJ/mol it is rounding.
+        assert abs(np.mean(energies[:half]) - np.mean(energies[half:])) <= max(spread[scheme], 1e-8)
+    assert spread["suzuki4"] < 0.05 * spread["rattle"]
+    assert spread["blanes-moan6"] < 0.01 * spread["suzuki4"]
+
+
+def test_one_force_evaluation_a_step():
+    """Counted by a force that is a Python function."""
+    calls = []
+
+    def bond(state):
+        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        calls.append(1)
+        return 50.0 * float(np.sum(x**2)), -100.0 * np.asarray(x)
+
+    for scheme in (*SCHEMES, "leapfrog"):
+        system, x, v = dumbbell()
+        system.removeForce(0)
+        system.addForce(openmm.PythonForce(bond))
+        integrator = ProjectedIntegrator(1e-3, scheme)
+        context = started(system, integrator, x, v)
+        integrator.step(2)
+        calls.clear()
+        integrator.step(10)
+        expected = 1 if scheme == "leapfrog" else SCHEMES[scheme]().force_evaluations
+        assert len(calls) == 10 * expected, scheme
+        del context
