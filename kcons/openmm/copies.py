@@ -62,7 +62,7 @@ def as_projected(
     if not isinstance(integrator, openmm.CustomIntegrator):
         raise InputError(f"{type(integrator).__name__} is no CustomIntegrator", item="integrator")
     wanted = program_of(integrator)
-    for scheme in _candidates(integrator):
+    for scheme in _candidates(integrator, bool(parts)):
         making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
         made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
         if program_of(made) == wanted:
@@ -92,14 +92,14 @@ def program_of(integrator: openmm.CustomIntegrator) -> tuple[Any, ...]:
     )
 
 
-def _candidates(integrator: openmm.CustomIntegrator) -> Iterable[str | Splitting]:
+def _candidates(integrator: openmm.CustomIntegrator, parts: bool) -> Iterable[str | Splitting]:
     """Schemes by name, then what the tables say, for splittings of one's own."""
     yield from SCHEMES
     yield LEAPFROG
     tables = dict(program_of(integrator)[3])
     if "drift_share" in tables:
         drifts, kicks = list(tables["drift_share"]), list(tables["kick_share"])
-        if len(drifts) == len(kicks):  # with parts: two entries for applying constraints alone
+        if parts:  # two entries more, for applying constraints alone
             drifts, kicks = drifts[:-2], kicks[:-2]
         if kicks[0]:
             yield Splitting(kicks, drifts)

@@ -146,7 +146,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         ------
         KconsError
             A solve of one of the parts failed: positions, velocities, time and step count are those before that
-            step, `error.step` is its number. Or a check failed, or a NaN appeared: they are those of the last check.
+            step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
+            check failed, or a NaN appeared: they are those of the last check.
         InputError, UnsupportedError
             At the first step: the System cannot be propagated, or the start is not on the constraints.
         """

@@ -130,6 +130,21 @@ def removes_centre_of_mass_motion(system: openmm.System) -> bool:
     return any(isinstance(force, openmm.CMMotionRemover) for force in forces_of(system))
 
 
+def refuse_motion_remover(system: openmm.System, kind: str) -> None:
+    """Refuse a CMMotionRemover beside rows that hold particles in space.
+
+    Raises
+    ------
+    UnsupportedError
+        There is one: it takes away a momentum that such rows give.
+    """
+    if removes_centre_of_mass_motion(system):
+        raise UnsupportedError(
+            f"{kind} holds particles in space, and the CMMotionRemover of the System moves them; remove it, or create "
+            "the System with removeCMMotion=False"
+        )
+
+
 def check_system(system: openmm.System, *, leapfrog: bool) -> None:
     """Refuse Systems that a CustomIntegrator of kicks and drifts cannot propagate.
 

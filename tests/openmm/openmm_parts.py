@@ -40,13 +40,13 @@ class HeldCoordinates:
     def land(self, program, h):
         program.sum("off", "held*(x-level)^2", "how far off")
         program.each("x", "x-held*(x-level)", "back to the level")
-        program.let("failed", f"select(step(off-steepest^2),{self.code},failed)", "too far is a failure")
+        program.let("failed", f"select(step(off-steepest*abs(steepest)),{self.code},failed)", "too far is a failure")
 
     def project(self, program):
         program.each("v", "v*(1-held)", "at rest across")
 
     def check(self, context):
-        miss = np.abs(positions_of(context)[self.particles, self.axis] - self.value).max()
+        miss = np.abs(positions_of(context)[self.particles, self.axis] - self.value).max(initial=0.0)
         if miss > 1e-9:
             raise InputError(f"off the level by {miss:.3g}", item="positions")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cache
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
+from openmm_parts import HeldCoordinates
 
 from kcons.openmm.guard import positions_of, velocities_of
 
@@ -44,6 +46,10 @@ def state_of(context):
 def total_energy(context):
     state = context.getState(energy=True)
     return (state.getKineticEnergy() + state.getPotentialEnergy()).value_in_unit(unit.kilojoule_per_mole)
+
+
+def potential_energy(context):
+    return context.getState(energy=True).getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)
 
 
 def forces_at(context):
@@ -130,3 +136,24 @@ def alanine(held="AllBonds"):
     integrator.setVelocitiesToTemperature(context, 300, 1)
     integrator.step(200)
     return system, *state_of(context)
+
+
+def loose_alanine():
+    """The same with a flexible bond to its first atom, a hydrogen, and nothing that removes momentum."""
+    system = copy.deepcopy(alanine()[0])
+    # What is held in space does not go together with a CMMotionRemover.
+    kinds = [type(force) for force in system.getForces()]
+    system.removeForce(kinds.index(openmm.CMMotionRemover))
+    for k in reversed(range(system.getNumConstraints())):
+        i, j, d = system.getConstraintParameters(k)
+        if 0 in (i, j):
+            system.removeConstraint(k)
+            bond = openmm.HarmonicBondForce()
+            bond.addBond(i, j, d, 2e5)
+            system.addForce(bond)
+    return system, *alanine()[1:]
+
+
+def holding(**arguments):
+    """A part that holds z of the atom that no constraint of `loose_alanine` touches."""
+    return HeldCoordinates([0], 2, float(alanine()[1][0, 2]), 22, **arguments)

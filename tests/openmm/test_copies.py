@@ -1,0 +1,97 @@
+"""Pickles, copies, and the way back from XML."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm_systems import (
+    holding,
+    loose_alanine,
+    started,
+    state_of,
+)
+
+from kcons.errors import InputError
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.copies import program_of
+from kcons.openmm.schemes import SCHEMES
+from kcons.steppers import Geodesic
+from kcons.steppers.splitting import Splitting
+
+ALL = [*SCHEMES, "leapfrog"]
+
+
+# -- files and copies -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", [*ALL, Geodesic(3), Splitting((0.3, 0.4, 0.3), (0.5, 0.5))], ids=str)
+@pytest.mark.parametrize("parts", [False, True])
+def test_xml_and_the_way_back(scheme, parts):
+    system, x, v = loose_alanine()
+
+    def held():
+        return [holding()] if parts else []
+
+    integrator = ProjectedIntegrator(2e-3, scheme, parts=held(), tolerance=1e-9)
+    integrator.setRandomNumberSeed(5)
+    integrator.setIntegrationForceGroups({0, 1, 2})
+    text = openmm.XmlSerializer.serialize(integrator)
+    plain = openmm.XmlSerializer.deserialize(text)
+    assert type(plain) is openmm.CustomIntegrator
+    for again in (
+        ProjectedIntegrator.from_xml(text, parts=held()),
+        ProjectedIntegrator.as_projected(plain, parts=held()),
+    ):
+        assert type(again) is ProjectedIntegrator
+        assert program_of(again) == program_of(integrator)
+        assert again.getStepSize() == integrator.getStepSize()
+        assert again.getConstraintTolerance() == 1e-9
+        assert again.getRandomNumberSeed() == 5
+        assert again.getIntegrationForceGroups() == 7
+    if scheme in ALL:
+        assert repr(again).split(",")[0] == repr(integrator).split(",")[0]
+    a, b = started(system, integrator, x, v), started(system, again, x, v)
+    integrator.step(3)
+    again.step(3)
+    np.testing.assert_array_equal(state_of(a), state_of(b))
+
+
+def test_xml_of_something_else():
+    with pytest.raises(InputError, match="VerletIntegrator is no CustomIntegrator"):
+        ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(openmm.VerletIntegrator(1e-3)))
+    with pytest.raises(InputError, match="no program of ProjectedIntegrator"):
+        ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(openmm.CustomIntegrator(1e-3)))
+    text = openmm.XmlSerializer.serialize(ProjectedIntegrator(1e-3, parts=[holding()]))
+    with pytest.raises(InputError, match="the same parts"):
+        ProjectedIntegrator.from_xml(text)
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "blanes-moan6", "leapfrog"])
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pickle.loads(pickle.dumps(i))])
+def test_copies(scheme, how):
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=[holding()], tolerance=1e-11, check_every=17)
+    context = started(system, integrator, x, v)
+    integrator.setRandomNumberSeed(3)
+    integrator.setGlobalVariableByName("steepest", 0.5)
+    integrator.step(3)
+    again = how(integrator)
+    assert type(again) is ProjectedIntegrator
+    assert program_of(again) == program_of(integrator)
+    assert again.getConstraintTolerance() == 1e-11
+    assert again.check_every == 17
+    assert again.getRandomNumberSeed() == 3
+    assert again.getGlobalVariableByName("steepest") == 0.5
+    assert again.parts[0] is not integrator.parts[0]
+    other = started(system, again, *state_of(context))
+    integrator.step(3)
+    again.step(3)
+    if scheme == "leapfrog":
+        np.testing.assert_allclose(state_of(context), state_of(other), rtol=1e-9, atol=1e-12)
+    else:
+        np.testing.assert_array_equal(state_of(context), state_of(other))
+    assert other.getStepCount() == 3

@@ -1,0 +1,187 @@
+"""What an integrator sees of its Context, before and during a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from openmm import unit
+from openmm_systems import (
+    PLATFORMS,
+    alanine,
+    dumbbell,
+    holding,
+    loose_alanine,
+    residuals,
+    started,
+    state_of,
+)
+
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import ProjectedIntegrator
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+PS = unit.picosecond
+
+
+# -- its Context ------------------------------------------------------------------------------------
+
+
+def test_finds_its_context():
+    system, x, v = dumbbell()
+    first, second = ProjectedIntegrator(1e-3), ProjectedIntegrator(1e-3)
+    with pytest.raises(UnsupportedError, match="belongs to no Context"):
+        first.step(1)
+    contexts = [started(system, integrator, x, v) for integrator in (first, second)]
+    assert first.context is contexts[0]
+    assert second.context is contexts[1]
+    third = ProjectedIntegrator(1e-3)
+    context = started(system, third, x, v)
+    third.context = context
+    third.step(1)
+    assert context.getStepCount() == 1
+    del context
+    with pytest.raises(UnsupportedError, match="belongs to no Context"):
+        third.step(1)
+
+
+def test_compound_integrator():
+    """OpenMM runs the program; checks are to be called for. A step called directly has them."""
+    system, x, v = alanine()
+    alone = ProjectedIntegrator(1e-3)
+    lonely = started(system, alone, x, v)
+    alone.step(10)
+    compound, ours, other = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3), openmm.VerletIntegrator(1e-3)
+    compound.addIntegrator(ours)
+    compound.addIntegrator(other)
+    context = started(system, compound, x, v)
+    assert ours.context is context
+    compound.step(10)
+    ours.check()
+    np.testing.assert_array_equal(state_of(context), state_of(lonely))
+    assert ours.degrees_of_freedom() == alone.degrees_of_freedom()
+    compound.setCurrentIntegrator(1)
+    compound.step(2)
+    compound.setCurrentIntegrator(0)
+    ours.step(2)
+    assert context.getStepCount() == 14
+
+
+def test_compound_integrator_tells_of_failures_when_asked():
+    system, x, v = loose_alanine()
+    compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3, parts=[holding(steepest=-1.0)])
+    compound.addIntegrator(ours)
+    context = started(system, compound, x, v)
+    before = state_of(context)
+    compound.step(5)
+    np.testing.assert_array_equal(state_of(context), before)
+    with pytest.raises(ConvergenceError, match="too steep"):
+        ours.check()
+
+
+# -- the start --------------------------------------------------------------------------------------
+
+
+def test_start_off_the_constraints_is_refused():
+    system, x, v = alanine()
+    x = x.copy()
+    x[4] += 0.01
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimise") as caught:
+        integrator.step(1)
+    assert 4 in caught.value.atoms
+    np.testing.assert_array_equal(state_of(context), [x, v])
+    integrator.applyConstraints(context)
+    integrator.step(1)
+    assert residuals(system, context)[0] < 1e-9
+
+
+def test_small_misses_at_the_start_are_tidied_up():
+    system, x, v = alanine()
+    rng = np.random.default_rng(0)
+    integrator = ProjectedIntegrator(1e-3, tolerance=1e-12)
+    context = started(system, integrator, x + 1e-7 * rng.normal(size=x.shape), v + 0.3 * rng.normal(size=x.shape))
+    reference = started(system, other := ProjectedIntegrator(1e-3, tolerance=1e-12), *state_of(context))
+    other.applyConstraints(reference)
+    other.applyVelocityConstraints(reference)
+    integrator.step(1)
+    other.step(1)
+    np.testing.assert_array_equal(state_of(context), state_of(reference))
+
+
+def test_nan_at_the_start():
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v * np.nan)
+    with pytest.raises(NonFiniteError, match="velocity of particle 0"):
+        integrator.step(1)
+    del context
+
+
+# -- checks during a run ----------------------------------------------------------------------------
+
+
+def hexagon(rows):
+    """Planar six-ring held by some of its 15 distances."""
+    angles = np.arange(6) * np.pi / 3
+    x = 0.14 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    pairs = sorted(
+        ((i, j) for i in range(6) for j in range(i)), key=lambda ij: np.linalg.norm(x[ij[0]] - x[ij[1]]).round(6)
+    )
+    system = openmm.System()
+    for _ in x:
+        system.addParticle(12.0)
+    for i, j in pairs[:rows]:
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    return system, x
+
+
+@platforms
+def test_solvers_that_do_not_converge_are_found(platform):
+    """OpenMM says nothing; the ring by 12 distances is one of the cases that break its solver."""
+    system, x = hexagon(12)
+    rng = np.random.default_rng(0)
+    integrator = ProjectedIntegrator(2e-3, check_every=5)
+    context = started(system, integrator, x, rng.normal(size=x.shape), platform)
+    with pytest.raises((ConvergenceError, NonFiniteError)) as caught:
+        integrator.step(100)
+    assert np.isfinite(state_of(context)).all()
+    if isinstance(caught.value, ConvergenceError):
+        assert "hand them over" in str(caught.value)
+        assert len(caught.value.atoms) == 2
+
+
+@platforms
+def test_explosion_puts_back_what_was_checked_last(platform):
+    system = openmm.System()
+    well = openmm.CustomExternalForce("k*x^4")
+    well.addGlobalParameter("k", 1.0)
+    well.addParticle(system.addParticle(1.0), [])
+    system.addForce(well)
+    integrator = ProjectedIntegrator(1e-3, check_every=10)
+    context = started(system, integrator, [[1.0, 0, 0]], [[0.5, 0, 0]], platform)
+    integrator.step(20)
+    good = state_of(context)
+    context.setParameter("k", 1e12)
+    with pytest.raises(NonFiniteError) as caught:
+        integrator.step(1000)
+    assert caught.value.item in ("position", "velocity")
+    np.testing.assert_array_equal(state_of(context), good)
+    assert context.getStepCount() == 20
+    assert context.getTime() / PS == pytest.approx(0.02)
+    context.setParameter("k", 1.0)
+    integrator.step(10)
+    assert context.getStepCount() == 30
+
+
+def test_clock_follows_the_step_size():
+    """OpenMM's own clock goes on with the first step size on Reference and CPU."""
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    integrator.step(3)
+    integrator.setStepSize(5e-4)
+    integrator.step(4)
+    assert context.getTime() / PS == pytest.approx(0.005, rel=1e-12)
+    assert context.getStepCount() == 7

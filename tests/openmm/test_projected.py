@@ -1,0 +1,343 @@
+"""ProjectedIntegrator as a citizen of OpenMM: arguments, settings, restarts, reporters."""
+
+from __future__ import annotations
+
+import copy
+import io
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_parts import HeldCoordinates
+from openmm_systems import (
+    DATA,
+    PLATFORMS,
+    alanine,
+    context_of,
+    holding,
+    loose_alanine,
+    masses_of,
+    residuals,
+    started,
+    state_of,
+    water_box,
+)
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.copies import program_of
+from kcons.openmm.system_checks import refuse_barostat
+from kcons.steppers import Geodesic
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+PS = unit.picosecond
+
+
+# -- arguments --------------------------------------------------------------------------------------
+
+
+def test_units_and_arguments():
+    assert ProjectedIntegrator(2 * unit.femtoseconds).getStepSize() == 0.002 * PS
+    assert ProjectedIntegrator(0.002).getConstraintTolerance() == 1e-10
+    for bad in (0, -0.001, np.nan, np.inf, -1 * unit.femtosecond):
+        with pytest.raises(InputError, match="positive"):
+            ProjectedIntegrator(bad)
+    integrator = ProjectedIntegrator(0.001)
+    with pytest.raises(InputError, match="positive"):
+        integrator.setStepSize(-0.001)
+    with pytest.raises(InputError, match="tolerance"):
+        integrator.setConstraintTolerance(0.0)
+    with pytest.raises(InputError, match="no scheme 'rattel'; known: rattle, geodesic"):
+        ProjectedIntegrator(0.001, "rattel")
+    with pytest.raises(InputError, match="check_every"):
+        ProjectedIntegrator(0.001, check_every=-1)
+    meeting = [holding(), holding()]
+    for part in meeting:
+        part.meets_system = True
+    with pytest.raises(UnsupportedError, match="only one part"):
+        ProjectedIntegrator(0.001, parts=meeting)
+
+
+def test_any_splitting_is_a_scheme():
+    system, x, v = alanine()
+    by_name, by_object = ProjectedIntegrator(1e-3, "geodesic"), ProjectedIntegrator(1e-3, Geodesic(8))
+    assert program_of(by_name) == program_of(by_object)
+    a, b = (started(system, integrator, x, v) for integrator in (by_name, by_object))
+    by_name.step(5)
+    by_object.step(5)
+    np.testing.assert_array_equal(state_of(a), state_of(b))
+    assert "Geodesic(substeps=3)" in repr(ProjectedIntegrator(1e-3, Geodesic(3)))
+
+
+# -- barostats, thermostats, centre of mass ----------------------------------------------------------
+
+
+@platforms
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "leapfrog"])
+def test_barostat(scheme, platform):
+    system, x = water_box(64)
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 2))
+    integrator = ProjectedIntegrator(1e-3, scheme)
+    context = started(system, integrator, x, platform=platform)
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    volumes = set()
+    for _ in range(20):
+        integrator.step(4)
+        volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
+        assert residuals(system, context)[0] < 1e-7
+    assert len(volumes) > 5
+
+
+class Witness(HeldCoordinates):
+    """Holds nothing; sees whether the forces that were kept are those at x."""
+
+    def __init__(self, n):
+        super().__init__([], 0, 0.0, n, evaluates=True)
+
+    def declare(self, program):
+        super().declare(program)
+        program.number("gap", "kept forces against those at x")
+        program.number("worst_gap", "the largest one")
+
+    def remember(self, program):
+        program.sum("gap", "(force-f)^2", "both at x")
+        program.let("worst_gap", "max(worst_gap,gap)", "the largest one")
+
+
+def test_barostat_with_a_part_that_keeps_forces():
+    """Box and positions change at the beginning of a step; the forces of that step must be the new ones."""
+    system, x = water_box(64)
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 1))
+    integrator = ProjectedIntegrator(5e-4, parts=[Witness(192)])
+    context = started(system, integrator, x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    volumes = set()
+    for _ in range(10):
+        integrator.step(2)
+        volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
+    assert len(volumes) > 5
+    assert integrator.getGlobalVariableByName("worst_gap") == 0
+
+
+def test_barostat_and_rows_between_molecules():
+    system, x = water_box(64)
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x)
+    refuse_barostat(context, [[0, 3], [5]], "a distance")  # no barostat
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
+    context = started(system, again := ProjectedIntegrator(1e-3), x)
+    refuse_barostat(context, [[0, 1], [3, 4, 5]], "a distance")
+    with pytest.raises(UnsupportedError, match=r"a distance on particles 0, 3 .*several molecules.*MonteCarloBarostat"):
+        refuse_barostat(context, [[0, 1], [0, 3]], "a distance")
+    with pytest.raises(UnsupportedError, match="in space"):
+        refuse_barostat(context, [[2]], "a plane")
+    del again
+    flexible = openmm.MonteCarloFlexibleBarostat(1.0, 300.0)
+    flexible.setScaleMoleculesAsRigid(False)
+    system, x = water_box(64)
+    system.addForce(flexible)
+    context = started(system, loose := ProjectedIntegrator(1e-3), x)
+    with pytest.raises(UnsupportedError, match="MonteCarloFlexibleBarostat"):
+        loose.step(1)
+
+
+def test_centre_of_mass_motion():
+    system, x, v = alanine()
+    without = copy.deepcopy(system)
+    kinds = [type(f) for f in without.getForces()]
+    without.removeForce(kinds.index(openmm.CMMotionRemover))
+    counts = []
+    for which in (system, without):
+        integrator = ProjectedIntegrator(1e-3)
+        context = started(which, integrator, x, v + np.array([5.0, 0, 0]))
+        integrator.step(2)
+        counts.append(integrator.degrees_of_freedom())
+        momentum = masses_of(system) @ state_of(context)[1]
+        assert (np.abs(momentum).max() < 1e-8) == (which is system)
+    assert counts == [3 * 22 - 21 - 3, 3 * 22 - 21]
+
+
+# -- force groups and seeds -------------------------------------------------------------------------
+
+
+def test_force_groups_of_the_user():
+    system, x, v = alanine()
+    system = copy.deepcopy(system)
+    for k, force in enumerate(system.getForces()):
+        force.setForceGroup(k % 3)
+    only = copy.deepcopy(system)
+    for k in reversed(range(only.getNumForces())):
+        if only.getForce(k).getForceGroup() != 1:
+            only.removeForce(k)
+    integrator, other = ProjectedIntegrator(1e-3), ProjectedIntegrator(1e-3)
+    integrator.setIntegrationForceGroups({1})
+    context, alone = started(system, integrator, x, v), started(only, other, x, v)
+    integrator.step(5)
+    other.step(5)
+    # CCMA takes its couplings from angle forces, which are not all there in the second System.
+    np.testing.assert_allclose(state_of(context), state_of(alone), rtol=1e-10, atol=1e-12)
+    with pytest.raises(UnsupportedError, match="before"):
+        integrator.setIntegrationForceGroups({0})
+    with pytest.raises(UnsupportedError, match="before"):
+        other.setIntegrationForceGroups(-1)
+
+
+def test_force_groups_of_rows_never_act():
+    integrator = ProjectedIntegrator(1e-3, parts=[holding(groups={5, 7})])
+    everything = set(range(32)) - {5, 7}
+
+    def groups():
+        mask = integrator.getIntegrationForceGroups()
+        return {g for g in range(32) if (mask >> g) & 1}
+
+    assert groups() == everything
+    integrator.setIntegrationForceGroups({0, 3})
+    assert groups() == {0, 3}
+    for all_of_them in (-1, 0xFFFFFFFF, set(range(32))):
+        integrator.setIntegrationForceGroups(all_of_them)
+        assert groups() == everything
+    for bad in ({0, 7}, 1 << 5):
+        with pytest.raises(InputError, match="carry constraint rows"):
+            integrator.setIntegrationForceGroups(bad)
+
+
+def test_row_group_does_not_move_anything():
+    system, x, v = loose_alanine()
+    positions = []
+    for strength in (0.0, 1e3):
+        heavy = copy.deepcopy(system)
+        row = openmm.CustomExternalForce(f"{strength}*x")
+        row.addParticle(3)
+        row.setForceGroup(9)
+        heavy.addForce(row)
+        integrator = ProjectedIntegrator(1e-3, "suzuki4", parts=[holding(evaluates=True, groups={9})])
+        context = started(heavy, integrator, x, v)
+        integrator.step(5)
+        positions.append(state_of(context))
+    np.testing.assert_array_equal(*positions)
+
+
+# -- restarts ---------------------------------------------------------------------------------------
+
+
+def simulation(platform, integrator):
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    system, x, v = loose_alanine()
+    place = openmm.Platform.getPlatformByName(platform)
+    made = app.Simulation(pdb.topology, system, integrator, place, {"Threads": "1"} if platform == "CPU" else {})
+    made.context.setPositions(x)
+    made.context.setVelocities(v)
+    return made
+
+
+@pytest.mark.parametrize("how", ["checkpoint", "state"])
+@pytest.mark.parametrize("evaluates", [None, False, True])
+@pytest.mark.parametrize("scheme", ["rattle", "suzuki4", "leapfrog"])
+def test_restart_bit_for_bit(scheme, evaluates, how, tmp_path):
+    def integrator():
+        parts = [] if evaluates is None else [holding(evaluates=evaluates)]
+        return ProjectedIntegrator(1e-3, scheme, parts=parts)
+
+    through = simulation("Reference", integrator())
+    through.step(20)
+    name = str(tmp_path / "restart")
+    if how == "checkpoint":
+        through.saveCheckpoint(name)
+    else:
+        through.saveState(name)
+    through.step(20)
+    again = simulation("Reference", integrator())
+    if how == "checkpoint":
+        again.loadCheckpoint(name)
+    else:
+        again.loadState(name)
+    assert again.context.getStepCount() == 20
+    again.step(20)
+    np.testing.assert_array_equal(state_of(again.context), state_of(through.context))
+    assert again.context.getTime() == through.context.getTime()
+
+
+@platforms
+def test_restart_is_no_worse_than_that_of_verlet_integrator(platform, tmp_path):
+    errors = []
+    for kind in (lambda: ProjectedIntegrator(1e-3), lambda: openmm.VerletIntegrator(1e-3)):
+        through = simulation(platform, kind())
+        through.step(20)
+        through.saveCheckpoint(str(tmp_path / "restart"))
+        through.step(20)
+        again = simulation(platform, kind())
+        again.loadCheckpoint(str(tmp_path / "restart"))
+        again.step(20)
+        errors.append(np.abs(state_of(again.context)[0] - state_of(through.context)[0]).max())
+    assert errors[0] <= max(errors[1], 1e-14)
+
+
+def test_checkpoint_within_a_run_goes_back():
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, parts=[holding(evaluates=True)])
+    context = started(system, integrator, x, v)
+    integrator.step(5)
+    mark = context.createCheckpoint()
+    integrator.step(5)
+    there = state_of(context)
+    context.loadCheckpoint(mark)
+    integrator.step(5)
+    np.testing.assert_array_equal(state_of(context), there)
+
+
+# -- Simulation and reporters -----------------------------------------------------------------------
+
+
+def test_reporters(tmp_path):
+    system, _, _ = alanine()
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    integrator = ProjectedIntegrator(1 * unit.femtosecond)
+    made = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    made.context.setPositions(pdb.positions)
+    made.minimizeEnergy(maxIterations=20)
+    integrator.setVelocitiesToTemperature(made.context, 300 * unit.kelvin, 2)
+    table = io.StringIO()
+    made.reporters += [
+        app.StateDataReporter(table, 5, step=True, time=True, temperature=True, kineticEnergy=True, totalEnergy=True),
+        app.DCDReporter(str(tmp_path / "run.dcd"), 5),
+        app.PDBReporter(str(tmp_path / "run.pdb"), 10),
+    ]
+    made.step(20)
+    for reporter in made.reporters[1:]:
+        del reporter
+    rows = [[float(word) for word in line.split(",")] for line in table.getvalue().splitlines()[1:]]
+    assert [row[0] for row in rows] == [5, 10, 15, 20]
+    kinetic = np.array([row[2] for row in rows])
+    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+    np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
+    assert (tmp_path / "run.dcd").stat().st_size > 4 * 22 * 12
+    assert len(app.PDBFile(str(tmp_path / "run.pdb")).positions) == 22
+    assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(rows[-1][4], rel=1e-12)
+
+
+def test_degrees_of_freedom_count_the_rank():
+    """Methane by all ten distances has nine independent ones."""
+    corners = 0.06 * np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    system = openmm.System()
+    for m in (12.0, 1.0, 1.0, 1.0, 1.0, 0.0):
+        system.addParticle(m)
+    for i in range(5):
+        for j in range(i):
+            system.addConstraint(j, i, float(np.linalg.norm(corners[i] - corners[j])))
+    integrator = ProjectedIntegrator(1e-3)
+    context = context_of(system, integrator)
+    context.setPositions([*corners, [1, 1, 1]])
+    assert integrator.degrees_of_freedom(context) == 6
+
+
+def test_no_degree_of_freedom_no_temperature():
+    system = openmm.System()
+    system.addParticle(0.0)
+    integrator = ProjectedIntegrator(1e-3)
+    context = context_of(system, integrator)
+    context.setPositions([[0, 0, 0]])
+    assert integrator.degrees_of_freedom(context) == 0
+    with pytest.raises(InputError, match="no degree of freedom"):
+        integrator.computeSystemTemperature()

@@ -1,0 +1,152 @@
+"""Systems that cannot be propagated, and the rows of a System."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import (
+    PLATFORMS,
+    dumbbell,
+    forces_at,
+    masses_of,
+    started,
+    state_of,
+    total_energy,
+)
+
+from kcons.errors import UnsupportedError
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.system_checks import SystemRows, refuse_motion_remover
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+
+
+# -- what cannot be propagated ----------------------------------------------------------------------
+
+
+def tip4p(molecules=12):
+    """Four-site water: the fourth site is virtual and carries the charge."""
+    box = app.Modeller(app.Topology(), [])
+    field = app.ForceField("amber14/tip4pew.xml")
+    box.addSolvent(field, model="tip4pew", boxSize=openmm.Vec3(1.9, 1.9, 1.9))
+    box.delete(list(box.topology.residues())[molecules:])
+    return field.createSystem(box.topology, removeCMMotion=False), box.positions
+
+
+@pytest.fixture(scope="module")
+def water_with_sites():
+    system, positions = tip4p()
+    integrator = openmm.VerletIntegrator(1e-3)
+    integrator.setConstraintTolerance(1e-10)
+    context = started(system, integrator, positions)
+    openmm.LocalEnergyMinimizer.minimize(context, 100, 30)
+    context.applyConstraints(1e-10)
+    context.setVelocitiesToTemperature(300, 1)
+    integrator.step(20)
+    return system, *state_of(context)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_virtual_sites_are_refused_within_steps(water_with_sites, scheme):
+    system, x, v = water_with_sites
+    integrator = ProjectedIntegrator(1e-3, scheme)
+    context = started(system, integrator, x, v)
+    with pytest.raises(UnsupportedError, match=r"particle 3 is a virtual site.*leapfrog"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), [x, v])
+
+
+def test_why_virtual_sites_are_refused(water_with_sites):
+    """Forces of the middle of a step are those of the sites at its beginning."""
+    system, x, v = water_with_sites
+    plain = openmm.CustomIntegrator(1e-3)
+    plain.addPerDofVariable("seen", 0)
+    plain.addComputePerDof("x", "x+dt*v")
+    plain.addConstrainPositions()
+    plain.addComputePerDof("seen", "f")
+    context = started(system, plain, x, v)
+    plain.step(1)
+    seen, now = np.array(plain.getPerDofVariableByName("seen")), forces_at(context)
+    massive = masses_of(system) > 0
+    assert np.abs(seen - now)[massive].max() > 1e-3 * np.abs(now).max()
+
+
+@platforms
+def test_leapfrog_with_virtual_sites_is_verlet_integrator(water_with_sites, platform):
+    system, x, v = water_with_sites
+    ours, theirs = ProjectedIntegrator(1e-3, "leapfrog", tolerance=1e-10), openmm.VerletIntegrator(1e-3)
+    theirs.setConstraintTolerance(1e-10)
+    a, b = (started(system, integrator, x, v, platform) for integrator in (ours, theirs))
+    energies = []
+    for _ in range(20):
+        ours.step(2)
+        theirs.step(2)
+        energies.append([total_energy(a), total_energy(b)])
+    # The CPU platform computes forces in single precision.
+    assert np.abs(state_of(a)[0] - state_of(b)[0]).max() < (1e-9 if platform == "Reference" else 1e-6)
+    mine, verlet = np.ptp(np.array(energies)[1:], axis=0)
+    # VerletIntegrator finds the impulse of the constraints at x, ours is that of the drift to x.
+    assert mine < 4 * verlet
+    assert ours.degrees_of_freedom() == 6 * system.getNumParticles() // 4
+    kinetic = b.getState(energy=True).getKineticEnergy()
+    temperature = 2 * kinetic / (ours.degrees_of_freedom() * unit.MOLAR_GAS_CONSTANT_R)
+    assert ours.computeSystemTemperature() / temperature == pytest.approx(1, abs=0.01)
+
+
+def test_drude_particles_are_refused():
+    system, x, v = dumbbell()
+    system.addForce(openmm.DrudeForce())
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    with pytest.raises(UnsupportedError, match=r"DrudeForce.*DrudeLangevinIntegrator"):
+        integrator.step(1)
+    del context
+
+
+def test_rows_of_a_system():
+    """Triangles with two equal sides go to SETTLE, and only if nothing else holds their atoms."""
+    system = openmm.System()
+    for m in [16.0, 1.0, 1.0] * 3 + [12.0, 12.0, 0.0, 0.0]:
+        system.addParticle(m)
+    for first in (0, 3, 6):
+        system.addConstraint(first, first + 1, 0.1)
+        system.addConstraint(first, first + 2, 0.11 if first == 6 else 0.1)
+        system.addConstraint(first + 1, first + 2, 0.16)
+    system.addConstraint(5, 9, 0.2)
+    system.addConstraint(11, 12, 0.3)
+    rows = SystemRows.of(system)
+    assert rows.n_rows == 10
+    np.testing.assert_array_equal(rows.numbers, range(10))
+    np.testing.assert_array_equal(rows.settled, [True] * 3 + [False] * 7)
+    np.testing.assert_array_equal(rows.lengths[:3], np.float32([0.1, 0.1, 0.16]).astype(float))
+    np.testing.assert_array_equal(rows.lengths[3:], [0.1, 0.1, 0.16, 0.1, 0.11, 0.16, 0.2])
+    assert rows.name(9) == "constraint 9 of the System (particles 5 and 9, 0.2 nm)"
+    x = np.random.default_rng(0).normal(size=(13, 3))
+    assert rows.rank(x) == 10
+
+
+def test_rows_of_a_system_without_constraints():
+    system, x, v = dumbbell()
+    system.removeConstraint(0)
+    rows = SystemRows.of(system)
+    assert rows.n_rows == 0
+    assert rows.rank(x) == 0
+    assert rows.stretches(x).shape == rows.stretching_speeds(x, v).shape == (0,)
+
+
+def test_residuals_by_hand():
+    system, x, _ = dumbbell(length=0.1)
+    rows = SystemRows.of(system)
+    np.testing.assert_allclose(rows.stretches(x + np.array([[0, 0, 0], [0.001, 0, 0]])), [0.01])
+    np.testing.assert_allclose(rows.stretching_speeds(x, np.array([[1.0, 0, 0], [0, 1, 0]])), [-np.sqrt(3)])
+
+
+def test_motion_remover_beside_what_is_held_in_space():
+    system, _, _ = dumbbell()
+    refuse_motion_remover(system, "a plane")
+    system.addForce(openmm.CMMotionRemover())
+    with pytest.raises(UnsupportedError, match=r"a plane holds particles in space.*removeCMMotion=False"):
+        refuse_motion_remover(system, "a plane")
