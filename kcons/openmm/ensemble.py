@@ -41,6 +41,6 @@ class ConstantEnergy:
 
     def kick(self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None]) -> None:
         if impulse:
-            program.each("v", f"v+{impulse}+{h}*{force}/m", "impulse of the constraints, and kick")
+            program.each("v", f"v+{impulse}+{h}*{force}/m", "the constraint forces act, then the applied ones (kick)")
         else:
-            program.each("v", f"v+{h}*{force}/m", "kick")
+            program.each("v", f"v+{h}*{force}/m", "the applied forces act (kick)")

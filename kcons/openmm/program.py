@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 import openmm
 
+_GIVEN = "x, v, m, f, dt: positions, velocities, masses, applied forces, time step"
+
 
 class Program:
     """Writes the computations of a CustomIntegrator and their listing, line by line.
@@ -120,4 +122,4 @@ class Program:
         codes = ["    " * depth + code for depth, code, _ in self._lines]
         width = min(max((len(code) for code in codes), default=0), 60)
         steps = [f"  {code:<{width}}  # {words}" for code, (_, _, words) in zip(codes, self._lines, strict=True)]
-        return "\n".join(["variables", *(f"  {line}" for line in self.variables), "each step", *steps])
+        return "\n".join(["variables", *(f"  {line}" for line in (_GIVEN, *self.variables)), "each step", *steps])

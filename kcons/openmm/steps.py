@@ -55,13 +55,13 @@ class StepWriter:
     def _write_plain(self) -> None:
         p, drifts, kicks = self.program, self.drifts, self.kicks
         if kicks[0]:
-            self._kick(f"{kicks[0]!r}*dt")
+            self._kick(_of_dt(kicks[0]))
         if len(drifts) == 1:
             impulse = self._drift("dt")
             if kicks[1]:
-                self._kick(f"{kicks[1]!r}*dt", impulse)
+                self._kick(_of_dt(kicks[1]), impulse)
             else:
-                p.each("v", f"v+{impulse}", "impulse of the constraints")
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
         else:
             p.table("drift_share", drifts, "length of drift k as a fraction of the step")
             p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
@@ -71,7 +71,7 @@ class StepWriter:
             # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
             with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
                 p.let("h", "dt*drift_share(stage)", "length of this drift")
-                p.each("v", f"v+{self._drift('h')}", "impulse of the constraints")
+                p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
                 p.let("stage", "stage+1", "what follows")
                 with p.when("kick_share(stage) != 0", "a kick follows"):
                     self._kick("dt*kick_share(stage)")
@@ -135,7 +135,7 @@ class StepWriter:
         p.let("stage", "first_stage", "first drift")
         with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
             p.let("h", "dt*drift_share(stage)", "length of this drift")
-            p.each("v", f"v+{self._drift('h')}", "impulse of the constraints")
+            p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
             p.let("stage", "stage+1", "what follows")
             with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
                 if self.kept:
@@ -152,8 +152,8 @@ class StepWriter:
         p = self.program
         for part in self.parts:
             part.remember(p)
-        p.each("x", f"x+{h}*v", "fly")
-        p.each("xu", "x", "unconstrained")
+        p.each("x", f"x+{h}*v", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
         for part in self.parts:
             if not part.meets_system:
                 part.land(p, h)
@@ -161,9 +161,9 @@ class StepWriter:
         if together:
             together[0].land(p, h)
         else:
-            p.hold_positions("onto the constraints of the System")
+            p.hold_positions("back onto the constraints of the System")
         if self.scheme is None:
-            p.each("impulse", f"(x-xu)/{h}", "what the constraints did to v")
+            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
             return "impulse"
         return f"(x-xu)/{h}"
 
@@ -172,3 +172,7 @@ class StepWriter:
         p.hold_velocities("tangent to the constraints of the System")
         for part in self.parts:
             part.project(p)
+
+
+def _of_dt(share: float) -> str:
+    return "dt" if share == 1 else f"{share!r}*dt"

@@ -31,6 +31,7 @@ def test_computations_and_listing_go_together():
     assert p.integrator is integrator
     assert p.listing().splitlines() == [
         "variables",
+        "  x, v, m, f, dt: positions, velocities, masses, applied forces, time step",
         "  k: stiffness",
         "  old: positions before (each degree of freedom)",
         "  share(k): parts of the step",

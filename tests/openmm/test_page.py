@@ -1,0 +1,26 @@
+"""The page on OpenMM shows what the code does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.schemes import SCHEMES
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "openmm.md").read_text(encoding="utf-8")
+
+
+def test_listing_on_the_page_is_that_of_the_integrator():
+    (shown,) = re.findall(r"^```text\n(variables\n.*?)\n```", PAGE, re.MULTILINE | re.DOTALL)
+    assert shown == ProjectedIntegrator(0.002).listing()
+
+
+def test_table_of_schemes():
+    rows = re.findall(r"^\| (`.*?) \| (\d) \| ([\d, ]+) \|", PAGE, re.MULTILINE)
+    table = {}
+    for names, order, evaluations in rows:
+        keys = re.findall(r"`(.*?)`", names)
+        table |= {k: (int(order), int(e)) for k, e in zip(keys, evaluations.split(","), strict=True)}
+    assert table.pop("leapfrog") == (2, 1)
+    assert table == {name: (make().order, make().force_evaluations) for name, make in SCHEMES.items()}
