@@ -272,3 +272,27 @@ def test_one_force_evaluation_a_step():
         expected = 1 if scheme == "leapfrog" else SCHEMES[scheme]().force_evaluations
         assert len(calls) == 10 * expected, scheme
         del context
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+def test_a_protein_as_verlet_integrator(tolerance):
+    """Dihydrofolate reductase with 2523 bonds held, 50 steps: the same positions (nm) within the tolerance.
+
+    The forces of the CPU platform are single precision, which a much finer tolerance would show.
+    """
+    pdb = app.PDBFile(str(DATA / "5dfr_minimized.pdb"))
+    system = app.ForceField("amber99sb.xml").createSystem(pdb.topology, constraints=app.AllBonds, rigidWater=False)
+    dt = 1e-3
+    ours, theirs = ProjectedIntegrator(dt, tolerance=tolerance), openmm.VerletIntegrator(dt)
+    theirs.setConstraintTolerance(tolerance)
+    context = started(system, ours, pdb.positions, platform="CPU")
+    ours.applyConstraints(context, 1e-12)
+    ours.setVelocitiesToTemperature(context, 300, 1)
+    x, v = state_of(context)
+    other = started(system, theirs, x, platform="CPU")
+    other.setVelocities(v - 0.5 * dt * forces_at(other) / masses_of(system)[:, None])
+    ours.step(50)
+    theirs.step(50)
+    assert np.abs(state_of(context)[0] - state_of(other)[0]).max() <= tolerance
+    assert ours.degrees_of_freedom() == 3 * system.getNumParticles() - system.getNumConstraints() - 3
