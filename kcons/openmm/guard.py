@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 TIDY = 1e-4
 #: What rounding may add to a relative distance, near the origin.
 _ROUNDING = 1e-12
+_REMEDY = "let kcons hold these constraints: take them out of the System and hand them over as constraint objects"
 
 
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
@@ -108,8 +109,7 @@ class Guard:
             tolerance = self.integrator.getConstraintTolerance()
             raise ConvergenceError(
                 f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g}: the "
-                "solvers of OpenMM did not converge and do not tell. Take a smaller time step, or let kcons hold these "
-                "constraints: take them out of the System and hand them over as constraint objects",
+                f"solvers of OpenMM did not converge and do not tell. Take a smaller time step, or {_REMEDY}",
                 residual=float(miss[row]),
                 tolerance=tolerance,
                 row=int(self.rows.numbers[row]),
@@ -131,7 +131,7 @@ class Guard:
         """
         context, integrator = self.context, self.integrator
         x, v = positions_of(context), velocities_of(context)
-        _check_finite(x, v, context.getStepCount())
+        _check_finite(x, v, context.getStepCount(), False)
         if self.rows.n_rows:
             miss = np.abs(self.rows.stretches(x))
             row = int(np.argmax(miss))
@@ -202,7 +202,7 @@ class Guard:
         step = context.getStepCount()
         try:
             x = positions_of(context)
-            _check_finite(x, velocities_of(context), step)
+            _check_finite(x, velocities_of(context), step, self.rows.n_rows > 0)
             self.check_rows(x, step)
         except (ConvergenceError, NonFiniteError):
             self.put_back()
@@ -225,6 +225,16 @@ class Guard:
             self.since_check = 0
             self.integrator.refresh()
 
+    def explosion(self, words: str, step: int) -> NonFiniteError:
+        """The error for a NaN that OpenMM met after `step`, once the state is put back."""
+        solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if self.rows.n_rows else ""
+        return NonFiniteError(
+            f"{words} It appeared after step {step}; positions and velocities are those of step "
+            f"{self.context.getStepCount()}. Take a smaller time step, or minimise the energy first{solver}",
+            item="position",
+            step=step,
+        )
+
     # -- degrees of freedom ---------------------------------------------------------------------
 
     def degrees_of_freedom(self) -> int:
@@ -237,14 +247,15 @@ class Guard:
         return self._freedom
 
 
-def _check_finite(x: FloatArray, v: FloatArray, step: int) -> None:
+def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
     for array, item in ((x, "position"), (v, "velocity")):
         bad = ~np.isfinite(array).all(axis=1)
         if bad.any():
             atom = int(np.argmax(bad))
+            solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
             raise NonFiniteError(
                 f"the {item} of particle {atom} is not finite at step {step}; take a smaller time step, or minimise "
-                "the energy first",
+                f"the energy first{solver}",
                 item=item,
                 atom=atom,
                 step=step,

@@ -10,7 +10,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
@@ -174,12 +174,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             guard.put_back()
             if "NaN" not in str(error):
                 raise
-            raise NonFiniteError(
-                f"{error} It appeared after step {first}; positions and velocities are those of step "
-                f"{context.getStepCount()}. Take a smaller time step, or minimise the energy first",
-                item="position",
-                step=first,
-            ) from error
+            raise guard.explosion(str(error), first) from error
         code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
         done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
         # OpenMM's clock goes on with the first step size after setStepSize.
