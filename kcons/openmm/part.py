@@ -15,8 +15,15 @@ class Part(Protocol):
 
     A program is written once and calls each method where its computations belong. The variables at hand are x, v,
     m, dt; `xu`, positions as they were before anything brought them onto constraints; and `failed`, which a part
-    sets to its own `code` when a solve does not converge. The integrator then puts positions and velocities back
-    to what they were before the step and asks the part that has this code for the error to raise.
+    sets to its own `code` when a solve does not converge. The integrator then computes nothing more in this step,
+    puts positions and velocities back to what they were before it and asks the part that has this code for the
+    error to raise.
+
+    The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
+    is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
+
+    Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
+    `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.system_checks`.
 
     Attributes
     ----------

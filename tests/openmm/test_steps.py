@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import openmm
 import pytest
@@ -159,3 +161,29 @@ def test_changes_from_outside_reach_kept_forces(change):
         contexts.append(state_of(context))
         spring.setBondParameters(0, 0, 1, 0.2, 100.0)
     np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
+
+
+class Friction:
+    """An ensemble that is seen to be right: v falls by a constant factor with each kick."""
+
+    def declare(self, program):
+        program.number("factor", "what a kick leaves of v", 0.5)
+
+    def kick(self, program, h, force, impulse, project):
+        program.each("v", f"(v+{impulse or 0})*factor+{h}*{force}/m", "kick with friction")
+        project()
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_an_ensemble_writes_the_kicks(parts):
+    system, x, v = loose_alanine()
+    for k in reversed(range(system.getNumForces())):
+        system.removeForce(k)
+    integrator = ProjectedIntegrator(1e-6, parts=[holding()] if parts else [], ensemble=Friction(), tolerance=1e-12)
+    context = started(system, integrator, x, v)
+    integrator.applyVelocityConstraints(context)
+    before = state_of(context)[1]
+    integrator.step(1)
+    np.testing.assert_allclose(state_of(context)[1], 0.25 * before, atol=1e-4)
+    assert copy.copy(integrator).listing() == integrator.listing()
+    assert integrator.listing().count("constrain velocities") == 3
