@@ -18,6 +18,8 @@ class Ensemble(Protocol):
     def kick(self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None]) -> None:
         """Let the applied forces act for a time.
 
+        For h = 0 it must do nothing but add the impulse: so the constraints are applied alone.
+
         Parameters
         ----------
         program : Program

@@ -14,6 +14,7 @@ from openmm_systems import (
     dumbbell,
     holding,
     loose_alanine,
+    masses_of,
     residuals,
     started,
     state_of,
@@ -164,26 +165,27 @@ def test_changes_from_outside_reach_kept_forces(change):
 
 
 class Friction:
-    """An ensemble that is seen to be right: v falls by a constant factor with each kick."""
+    """An ensemble that is seen to be right: v falls exponentially during kicks."""
 
     def declare(self, program):
-        program.number("factor", "what a kick leaves of v", 0.5)
+        program.number("rate", "of the friction", 1e3 * np.log(4.0))
 
     def kick(self, program, h, force, impulse, project):
-        program.each("v", f"(v+{impulse or 0})*factor+{h}*{force}/m", "kick with friction")
+        program.each("v", f"(v+{impulse or 0})*exp(-rate*{h})", "kick with friction")
         project()
 
 
 @pytest.mark.parametrize("parts", [False, True])
 def test_an_ensemble_writes_the_kicks(parts):
     system, x, v = loose_alanine()
-    for k in reversed(range(system.getNumForces())):
-        system.removeForce(k)
-    integrator = ProjectedIntegrator(1e-6, parts=[holding()] if parts else [], ensemble=Friction(), tolerance=1e-12)
+    integrator = ProjectedIntegrator(1e-3, parts=[holding()] if parts else [], ensemble=Friction(), tolerance=1e-12)
     context = started(system, integrator, x, v)
     integrator.applyVelocityConstraints(context)
     before = state_of(context)[1]
     integrator.step(1)
-    np.testing.assert_allclose(state_of(context)[1], 0.25 * before, atol=1e-4)
+    mass = masses_of(system)
+    kinetic = [mass @ np.sum(u**2, axis=1) for u in (before, state_of(context)[1])]
+    # Of the bonds' curvature and the projection this knows nothing: they cost little.
+    assert kinetic[1] / kinetic[0] == pytest.approx(1 / 16, rel=0.02)
     assert copy.copy(integrator).listing() == integrator.listing()
     assert integrator.listing().count("constrain velocities") == 3
