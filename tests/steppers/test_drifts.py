@@ -1,0 +1,113 @@
+"""Drifts: constrained flight without forces, one piece at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Distance, FixedAtoms, LinearVelocity, MovingTarget, Sphere
+from kcons.errors import ConvergenceError
+from kcons.steppers.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
+from kcons.steppers.summation import Point
+from steppers.systems import growing_rod, rotor, skate, system_of
+
+
+def flown(drift, system, state, h: float, *, exact: bool = True):
+    """Positions and velocities after a drift of h."""
+    point = Point(state.positions, state.velocities, system.weights, exact=exact)
+    out = np.empty_like(point.x)
+    drift.move(point, out, state.time, state.time + h, h)
+    assert point.x is out
+    point.land()
+    return point.x, point.v
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_free_flight_meets_the_rows_at_its_end(exact) -> None:
+    system, state = growing_rod()
+    x, v = flown(FreeFlight(system.motion), system, state, 0.3, exact=exact)
+    assert np.linalg.norm(x[1]) == pytest.approx(1.15, abs=1e-14)
+    # The velocity is that of the straight way, impulse included.
+    np.testing.assert_allclose(x - state.positions, 0.3 * v, rtol=0, atol=1e-15)
+    # The impulse acts along the rod of the start.
+    assert (v - state.velocities)[1, 1:] == pytest.approx([0, 0], abs=1e-15)
+
+
+def test_free_flight_absorbs_velocities_along_the_gradients() -> None:
+    """Kicks need no projection between: M^-1 A^T times anything makes no difference."""
+    system, state = rotor(omega=1.0)
+    along = system.motion.constraint_set.jacobian(state.positions).toarray().reshape(2, 3)
+    pushed = type(state)(state.positions, state.velocities + 0.7 * along * system.inverse_masses)
+    drift = FreeFlight(system.motion)
+    for a, b in zip(flown(drift, system, state, 0.1), flown(drift, system, pushed, 0.1), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=5e-14)
+
+
+def test_which_drift_is_taken() -> None:
+    for make, kind in ((rotor, FreeFlight), (growing_rod, FreeFlight), (skate, NonholonomicFlight)):
+        system, _ = make()
+        assert type(rattle_drift(system.motion, system.inverse_masses)) is kind
+
+
+@pytest.mark.parametrize("h", [0.2, -0.2])
+def test_velocity_rows_hold_at_the_middle(h) -> None:
+    system, state = skate()
+    drift = NonholonomicFlight(system.motion, system.inverse_masses)
+    x, _ = flown(drift, system, state, h)
+    held = system.motion.constraint_set
+    middle, way = 0.5 * (state.positions + x), x - state.positions
+    slip = (held.jacobian(middle).toarray() @ way.ravel() / h)[~held.holonomic]
+    assert np.abs(slip).max() <= 1e-14
+    assert np.abs(held.value(x)[held.holonomic]).max() <= 1e-14
+
+
+def test_velocity_rows_leave_other_bodies_to_the_engine() -> None:
+    positions = np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0], [5.0, 1.2, 0], [9.0, 9, 9]])
+    rows = [LinearVelocity(0, [[0, 0, 1]], target=lambda t: 0.5), Distance([2, 3])]
+    system = system_of(rows, positions, np.ones(5))
+    drift = NonholonomicFlight(system.motion, system.inverse_masses)
+    assert drift.atoms.tolist() == [0]
+    rng = np.random.default_rng(1)
+    state = system.initial_state(positions, rng.normal(size=(5, 3)), project=True)
+    x, _ = flown(drift, system, state, 0.1)
+    assert x[0, 2] == pytest.approx(0.05, abs=1e-16)
+    assert np.linalg.norm(x[2] - x[3]) == pytest.approx(1.2, abs=1e-15)
+    np.testing.assert_allclose(x[[1, 4]], (positions + 0.1 * state.velocities)[[1, 4]], rtol=0, atol=1e-15)
+
+
+def test_velocity_row_that_cannot_be_met_names_itself() -> None:
+    """A skate that turns by more than it can in one step."""
+    system, state = skate()
+    drift = NonholonomicFlight(system.motion, system.inverse_masses)
+    with pytest.raises(ConvergenceError) as caught:
+        flown(drift, system, state, 40.0)
+    assert caught.value.atoms == (0, 1)
+
+
+def test_great_circles_only_where_every_row_allows_them() -> None:
+    x = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [5.0, 5.0, 5.0]])
+    unit, wide = Sphere(0, [0, 0, 0], 1.0), Sphere(1, [0, 0, 0], 2.0)
+    growing = Sphere(0, [0, 0, 0], MovingTarget(lambda t: 1 + t, lambda t: 1.0, lambda t: 0.0))
+
+    def circles(*rows):
+        return GreatCircles.of(system_of(rows, x, [1, 1, 1]).motion)
+
+    assert circles(unit).atoms.tolist() == [0]
+    assert circles(unit, wide, FixedAtoms([2])).resting.tolist() == [2]
+    for rows in ([FixedAtoms([2])], [growing], [unit, Distance([1, 2])], [unit, Sphere(0, [1, 1, 0], 1.0)], []):
+        assert circles(*rows) is None
+
+
+def test_great_circles_absorb_velocities_along_the_radius() -> None:
+    x = np.array([[1.0, 0.0, 0.0]])
+    system = system_of([Sphere(0, [0, 0, 0], 1.0)], x, [2.0])
+    state = system.initial_state(x, [[0.0, 3.0, 0.0]])
+    pushed = type(state)(x, state.velocities + np.array([[0.8, 0.0, 0.0]]))
+    circles = GreatCircles.of(system.motion)
+    for start in (state, pushed):
+        at, v = flown(circles, system, start, 1.5)
+        np.testing.assert_allclose(at[0], [np.cos(4.5), np.sin(4.5), 0.0], rtol=0, atol=1e-15)
+        # The part along the radius stays where it was: the projection at the end of the step removes the rest.
+        tangent = np.array([-np.sin(4.5), np.cos(4.5), 0.0])
+        assert v[0] @ tangent == pytest.approx(3.0, abs=1e-14)
+        assert abs(v[0] @ at[0]) <= 1e-14

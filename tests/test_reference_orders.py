@@ -1,0 +1,271 @@
+"""Every stepper on every reference case: its order by slope, and the round-off floor at every stored time.
+
+The slope is fitted where the error is 30 times above the floor max(1e-11, 100 cond eps) or more, cond being the
+sensitivity of the solution to its start. Isokinetic cases are run with the thermostat as a force that depends on
+the velocities, (f.v / v.m v) m v.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from reference import cases
+from reference.cases import Case, Snapshot
+
+from kcons.constraint_set import ConstraintSet
+from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
+from kcons.motion import Motion
+from kcons.steppers import (
+    Baumgarte,
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Geodesic,
+    KahanLi6,
+    ProjectedRungeKutta4,
+    ProjectedVerlet,
+    Rattle,
+    State,
+    Stepper,
+    Suzuki4,
+    System,
+    Yoshida4,
+    run,
+)
+
+EPS = float(np.finfo(float).eps)
+STEPPERS: list[Stepper] = [
+    Rattle(),
+    Geodesic(4),
+    Suzuki4(),
+    Yoshida4(),
+    KahanLi6(),
+    BlanesMoan4(),
+    BlanesMoan6(),
+    BlanesMoan6a(),
+    ProjectedVerlet(),
+    ProjectedVerlet(project=True),
+    ProjectedRungeKutta4(),
+    ProjectedRungeKutta4(project=True),
+    Baumgarte(1.0),
+]
+#: Run on all cases by every test run; all steppers by the long one.
+USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesMoan4()", "BlanesMoan6()"}
+#: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.
+START = {2: 3e-4, 4: 4e-9, 6: 0.0}
+#: From there on, these many times more steps each.
+FINER = (1.0, 1.12, 1.25, 1.4)
+#: So accurate that their leading term shows only below 30 times the floor of all others: for these the floor is
+#: what is really there, max(1e-13, cond eps), a hundredth of it. (Great circles leave almost nothing of the error.)
+FINEST = {
+    ("A02_spherical_pendulum_near_top", "BlanesMoan6a()"),
+    ("A02_spherical_pendulum_near_top_Lz", "BlanesMoan6a()"),
+    ("A03_planar_pendulum_150deg", "BlanesMoan6a()"),
+    ("A03_planar_pendulum_179deg", "BlanesMoan6a()"),
+    ("A03_planar_pendulum_90deg", "BlanesMoan6a()"),
+    ("A03_planar_pendulum_rotating", "BlanesMoan6a()"),
+    ("A05_two_dumbbells_lj", "BlanesMoan6()"),
+}
+#: Surfaces without compiled solvers: a projection takes a millisecond.
+SLOW = frozenset(name for name in cases.NAMES if name.startswith("A08"))
+#: Nothing is left of the error where atoms fly along great circles and no forces act.
+EXACT = {("A01_sphere_free", s) for s in ("Geodesic(substeps=4)", "BlanesMoan4()", "BlanesMoan6()", "BlanesMoan6a()")}
+
+#: Steps with which the floor is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
+FLOOR_STEPS = {
+    "A02_spherical_pendulum_near_top": 0.025,
+    "A02_spherical_pendulum_near_top_Lz": 0.025,
+    "A03_planar_pendulum_179deg": 0.03,
+    "A03_planar_pendulum_179p9deg": 0.03,
+    "A04_double_pendulum": 0.012,
+    "A04_double_spherical_pendulum": 0.03,
+    "A04_triple_pendulum": 0.008,
+    "A05_rotor_free": 0.03,
+    "A05_rotor_gravity": 0.03,
+    "A05_two_dumbbells_lj": 0.0045,
+    "A06_water_free3": 0.0025,
+    "A07_angle_only_flexible_bonds": 0.02,
+    "A07_butane_bonds_angles_fixed": 0.025,
+    "A08_bead_rotating_ellipse": 0.008,
+    "A08_bead_rotating_hoop": 0.015,
+    "A08_bead_vertical_ellipse": 0.02,
+    "A08_torus_geodesic": 0.015,
+    "A08_torus_inner_equator": 0.02,
+    "A09_catenary_relax": 0.012,
+    "A09_hanging_chain5_3d": 0.012,
+    "A09_ring6_planar": 0.02,
+    "A10_isokinetic_constant_force": 0.025,
+    "A10_isokinetic_dumbbell_quartic": 0.015,
+    "A10_isokinetic_harmonic2d": 0.01,
+    "A10_isokinetic_lj4": 0.0018,
+}
+
+
+def depends_on_velocities(case: Case) -> bool:
+    return case.isokinetic or case.velocity_dependent
+
+
+@functools.cache
+def system(name: str) -> System:
+    case = cases.load(name)
+    held = ConstraintSet(case.constraints, case.initial.positions, case.masses, time=case.initial.time)
+    motion = Motion(held, case.initial.positions, time=case.initial.time)
+    if case.isokinetic:
+
+        def thermostatted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+            f, p = case.force(x, v), case.masses[:, None] * v
+            return f - np.sum(f * v) / np.sum(p * v) * p
+
+        return System(motion, thermostatted, velocity_dependent=True)
+    if case.velocity_dependent:
+        return System(motion, lambda x, v, t: case.force(x, v), velocity_dependent=True)
+    nothing = np.zeros((len(case.masses), 3))
+    return System(motion, lambda x, t: case.force(x, nothing))
+
+
+def start(name: str) -> State:
+    first = cases.load(name).initial
+    return system(name).initial_state(first.positions, first.velocities, time=first.time)
+
+
+@functools.cache
+def sensitivities(name: str) -> tuple[float, ...]:
+    """Of the solution at each stored time to its start; by differences where the file has none (one pendulum)."""
+    case = cases.load(name)
+    known = [s.condition for s in case.solution]
+    if np.isfinite(known).all() or len(case.masses) > 1:
+        return tuple(float(c) for c in np.nan_to_num(known, nan=1.0))
+    setting, first, size = system(name), start(name), 1e-6
+    x, v = first.positions[0], first.velocities[0]
+    along = np.cross([0.0, 1.0, 0.0], x)  # in the plane of the pendulum
+    turned = State(first.positions * np.cos(size) + along * np.sin(size), first.velocities, first.time)
+    turned = setting.initial_state(turned.positions, turned.velocities, project=True)
+    pushed = State(first.positions, (v + size * along)[None], first.time)
+    largest = []
+    for s in case.solution:
+        n = int(np.ceil((s.time - first.time) / 0.1))
+        ends = [run(setting, state, s.time / n, n, stepper=BlanesMoan6()) for state in (first, turned, pushed)]
+        flat = [np.concatenate([e.positions.ravel(), e.velocities.ravel()]) for e in ends]
+        largest.append(float(np.linalg.norm(np.array(flat[1:]) - flat[0]) / size))
+    return tuple(largest)
+
+
+def floor(name: str, index: int) -> float:
+    return max(1e-11, 100 * sensitivities(name)[index] * EPS)
+
+
+def telling_time(name: str, latest: float = 20.0) -> int:
+    """Where errors stand highest above the floor: once the sensitivity sets it, or as late as can be."""
+    times = [s.time for s in cases.load(name).solution]
+    for k, sensitivity in enumerate(sensitivities(name)):
+        if 100 * sensitivity * EPS >= 1e-11:
+            return k
+    return max(k for k, t in enumerate(times) if t <= latest)
+
+
+def error(name: str, stepper: Stepper, reference: Snapshot, n: int) -> float:
+    first = start(name)
+    end = run(system(name), first, (reference.time - first.time) / n, n, stepper=stepper)
+    return float(np.hypot(*deviations(end, reference)))
+
+
+def deviations(end: State, reference: Snapshot) -> tuple[float, float]:
+    """Of positions and velocities: norms, relative to the largest component where that is more than 1."""
+    return tuple(
+        float(np.linalg.norm(a - b)) / max(1.0, float(np.abs(b).max()))
+        for a, b in ((end.positions, reference.positions), (end.velocities, reference.velocities))
+    )
+
+
+def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tuple[int, float]]]:
+    """Observed order at one stored time, and the numbers of steps and errors it was fitted to."""
+    reference, lowest = cases.load(name).solution[index], 30 * floor(name, index)
+    if (name, repr(stepper)) in FINEST:
+        lowest /= 100
+    first = max(START[stepper.order], 8 * lowest)
+    n = 1
+    while True:
+        assert n < 1e6, "the error does not go down"
+        try:
+            e = error(name, stepper, reference, n)
+            if e <= first:
+                break
+        except (ConvergenceError, NonFiniteError):
+            pass  # the step is too large
+        n *= 2
+    base = n * (e / first) ** (1 / stepper.order)
+    points = []
+    for factor in FINER:
+        try:
+            points.append((round(base * factor), error(name, stepper, reference, round(base * factor))))
+        except ConvergenceError:
+            continue
+    points = [(n, e) for n, e in dict(points).items() if e >= lowest]
+    assert len(points) >= 3, f"too few points above {lowest:.1e}: {points}"
+    counts, errors = np.array(points).T
+    return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0]), points
+
+
+def check_order(name: str, stepper: Stepper, index: int) -> None:
+    if (name, repr(stepper)) in EXACT:
+        reference = cases.load(name).solution[index]
+        assert error(name, stepper, reference, 3) <= floor(name, index)
+        return
+    if isinstance(stepper, BlanesMoan4 | BlanesMoan6 | BlanesMoan6a) and depends_on_velocities(cases.load(name)):
+        before = start(name)
+        with pytest.raises(UnsupportedError, match="use Suzuki4 or KahanLi6"):
+            stepper.step(system(name), before, 0.01)
+        return
+    measured, points = slope(name, stepper, index)
+    assert measured == pytest.approx(stepper.order, abs=0.15), points
+
+
+PAIRS = [(name, stepper) for name in cases.NAMES for stepper in STEPPERS]
+
+
+def order_time(name: str, stepper: Stepper) -> int:
+    """The first stored time where that will do."""
+    if name in SLOW or not isinstance(stepper, KahanLi6 | BlanesMoan4 | BlanesMoan6 | BlanesMoan6a):
+        return 0
+    return telling_time(name, 20.0 if stepper.order == 6 else 5.0)
+
+
+QUICK = [p for p in PAIRS if repr(p[1]) in USUAL and not (p[0] in SLOW and repr(p[1]) == "BlanesMoan6()")]
+
+
+@pytest.mark.parametrize(("name", "stepper"), QUICK, ids=lambda p: p if isinstance(p, str) else repr(p))
+def test_order(name: str, stepper: Stepper) -> None:
+    check_order(name, stepper, order_time(name, stepper))
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize(("name", "stepper"), PAIRS, ids=lambda p: p if isinstance(p, str) else repr(p))
+def test_order_of_every_stepper(name: str, stepper: Stepper) -> None:
+    check_order(name, stepper, telling_time(name, 5.0) if name in SLOW else telling_time(name))
+
+
+def check_floor(name: str, latest: float) -> None:
+    case, setting, state = cases.load(name), system(name), start(name)
+    stepper: Stepper = KahanLi6() if name in SLOW or depends_on_velocities(case) else BlanesMoan6()
+    for k, reference in enumerate(case.solution):
+        if k and reference.time > latest:
+            return
+        n = int(np.ceil((reference.time - state.time) / FLOOR_STEPS.get(name, 0.05)))
+        state = run(setting, state, (reference.time - state.time) / n, n, stepper=stepper)
+        allowed = floor(name, k)
+        for item, off in zip(("positions", "velocities"), deviations(state, reference), strict=True):
+            assert off <= allowed, f"{item} at t = {reference.time}: {off:.1e}, allowed {allowed:.1e}"
+
+
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_round_off_floor(name: str) -> None:
+    check_floor(name, 1.0 if name in SLOW or depends_on_velocities(cases.load(name)) else 5.0)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_round_off_floor_at_every_stored_time(name: str) -> None:
+    check_floor(name, np.inf)
