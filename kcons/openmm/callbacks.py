@@ -1,0 +1,274 @@
+"""The constraint objects of kcons in OpenMM: PythonForces that carry positions to the engine and corrections back.
+
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
+them, each in a force group of its own, serve one set of rows:
+
+* `remember`: the positions at the start of a drift, where gradients are taken. Returns no force.
+* `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
+* `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x.
+
+Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
+error is kept and the integrator told to take the step back. Outside of steps all three return nothing to speak of:
+rows that are fulfilled need no correction.
+"""
+
+from __future__ import annotations
+
+import pickle
+import weakref
+from collections.abc import Callable
+from typing import Any, Literal, cast
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError, KconsError
+from kcons.motion import Motion
+from kcons.steppers.drifts import NonholonomicFlight
+from kcons.steppers.summation import Point
+
+#: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
+#: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
+#: no digit.
+SPEED_SCALE = 1024.0
+#: Corrections are carried multiplied by this: on GPUs forces are whole multiples of 2^-32.
+CARRY_SCALE = 2.0**20
+
+PHASES = ("remember", "land", "project")
+PREFIX = "kcons rows"
+LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
+
+
+class Engine:
+    """What the three callbacks share: the engine, where the particles are, and how far the step is."""
+
+    def __init__(
+        self,
+        key: str,
+        constraints: tuple[Constraint, ...],
+        positions: FloatArray,
+        masses: FloatArray,
+        cell: FloatArray | None,
+        degenerate: Literal["convert", "raise"],
+        time: float,
+    ) -> None:
+        self.key = key
+        held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
+        self.motion = Motion(held, positions, degenerate=degenerate, time=time)
+        self.masses, self.cell = masses, cell
+        #: What it takes to build this again; targets taken from the positions are in the set.
+        self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
+        self.atoms: IntArray = held.touched
+        self.whole = len(self.atoms) == len(masses)
+        n, local = masses.shape[0], (len(self.atoms), 3)
+        self._nothing = np.zeros(local)
+        #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
+        self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
+        self._x, self._read = np.zeros(local), np.zeros(local)
+        if self.whole:
+            self._x = self._start
+        rows = self.motion.constraint_set.n_rows
+        self._impulse, self._push, self._push_before = np.zeros(rows), np.zeros(rows), np.full(rows, np.nan)
+        self._timed = self.motion.constraint_set.moving
+        self._flight: NonholonomicFlight | None = None
+        if not self.motion.constraint_set.holonomic.all():
+            with np.errstate(divide="ignore"):
+                weights = (1 / masses)[:, None]
+            fixed = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
+            weights[np.concatenate([*fixed, np.zeros(0, np.int64)])] = 0.0
+            self._flight = NonholonomicFlight(self.motion, weights)
+            self._weights = np.repeat(weights, 3, axis=1)
+            self._timed = True
+        self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
+        self._fractions: tuple[float, ...] = (1.0,)
+        self._nodes: tuple[float, ...] = (0.0, 1.0)
+        self._error: BaseException | None = None
+        self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        LIVE[key] = self
+
+    def follow(self, integrator: openmm.CustomIntegrator) -> None:
+        """Take times and step sizes from this integrator."""
+        self._integrator = weakref.ref(integrator)
+        scheme = getattr(integrator, "scheme", None)
+        if scheme is not None:
+            self._fractions = tuple(a * w for a in scheme.drifts for w in scheme.flight)
+            sums = np.cumsum(self._fractions)[:-1].tolist()
+            self._nodes = (0.0, *sums, 1.0)
+
+    # -- callbacks ------------------------------------------------------------------------------
+
+    def remember(self, state: openmm.State) -> FloatArray:
+        began = (_time(state), state.getStepCount()) if self._timed else (0.0, 0)
+        if self._between_steps or began != self._began:
+            self._between_steps, self._began, self._stage, self._error = False, began, 0, None
+            if self.cell is not None:
+                self.follow_cell(state)
+        if self.whole:
+            _positions(state, self._start)
+        else:
+            _positions(state, self._x)
+            self._start[self.atoms] = self._x
+        return self._nothing
+
+    def land(self, state: openmm.State) -> FloatArray:
+        there, read = self._there, self._read
+        _positions(state, read)
+        there[self.atoms] = read
+        then, now, h = self._times(self._stage)
+        self._stage += 1
+        if self._flight is None:
+            self.motion.project_positions(
+                there, self._start, time=now, reference_time=then, out=there, multipliers=self._impulse
+            )
+        else:
+            point = Point(self._start.copy(), (there - self._start) / h, self._weights, exact=False)
+            self._flight.move(point, there, then, now, h)
+        change = (there if self.whole else there[self.atoms]) - read
+        np.add(read, change, out=self._x)
+        change *= CARRY_SCALE
+        return change
+
+    def project(self, state: openmm.State) -> FloatArray:
+        self._between_steps = True
+        read, v = self._read, self._v
+        _positions(state, read)
+        read -= self._x
+        read *= SPEED_SCALE
+        if self.whole:
+            np.copyto(v, read)
+            x = self._x
+        else:
+            v[self.atoms] = read
+            x = self._start
+            x[self.atoms] = self._x
+        now = self._times(len(self._nodes) - 2)[1]
+        self._push, self._push_before = self._push_before, self._push
+        self.motion.project_velocities(x, v, time=now, out=v, multipliers=self._push)
+        change = (v if self.whole else v[self.atoms]) - read
+        change *= CARRY_SCALE
+        return change
+
+    def _times(self, stage: int) -> tuple[float, float, float]:
+        """Beginning, end and length of a drift."""
+        if not self._timed:
+            return 0.0, 0.0, 0.0
+        integrator = self._integrator()
+        dt = 0.0 if integrator is None else _number(integrator.getStepSize())
+        start = self._began[0]
+        stage = min(stage, len(self._fractions) - 1)
+        return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = cell_of(state.getPeriodicBoxVectors())
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+    def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
+        """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
+        try:
+            change = self.remember(state) if phase == "remember" else None
+            if self._error is None:
+                if phase == "land":
+                    change = self.land(state)
+                elif phase == "project":
+                    change = self.project(state)
+            elif phase == "project":
+                self._between_steps = True
+        except BaseException as error:
+            self._error, change = error, None
+        return (0.0 if self._error is None else 1.0), (self._nothing if change is None else change)
+
+    # -- afterwards -----------------------------------------------------------------------------
+
+    def step_multipliers(self) -> FloatArray:
+        integrator = self._integrator()
+        if integrator is None or len(self._fractions) != 1 or np.isnan(self._push_before).any():
+            raise InputError(
+                "multipliers of a step need two steps of a scheme with one drift; multipliers(context) gives those of "
+                "any state",
+                item="scheme",
+            )
+        dt = _number(integrator.getStepSize())
+        return np.asarray(self._impulse / dt**2 - self._push_before / dt)
+
+    def explained_error(self, step: int) -> KconsError:
+        error = self._error
+        self._error = None
+        if error is None:
+            return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
+        cause = ""
+        if isinstance(error, ConvergenceError):
+            cause = f"{self._cause()}. "
+        if isinstance(error, KconsError):
+            error.args = (f"step {step}: {cause}{error}", *error.args[1:])
+            error.step = step  # type: ignore[attr-defined]
+        elif isinstance(error, Exception):
+            error.add_note(f"in step {step}, from the function of a constraint; the step was taken back")
+        return cast(KconsError, error)
+
+    def _cause(self) -> str:
+        held = self.motion.constraint_set
+        time = self._times(max(self._stage - 1, 0))[0]
+        miss = np.abs(held.value(self._start, time))
+        allowed = np.maximum(1e-6 * held.scale, 4 * held.tolerance(self._start, time))
+        off = np.flatnonzero(~(miss <= allowed))
+        if not len(off):
+            return "time step too large"
+        row = int(off[np.argmax(miss[off])])
+        return (
+            f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
+            "call apply_positions(context) first"
+        )
+
+
+class Callback:
+    """The function of one PythonForce; survives pickling together with its engine."""
+
+    def __init__(self, engine: Engine, phase: str) -> None:
+        self.engine, self.phase = engine, phase
+
+    def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
+        return self.engine.answer(self.phase, state)
+
+    def __reduce__(self) -> tuple[Callable[..., Callback], tuple[Any, ...]]:
+        # The first of the three brings the engine along; the others find it by its key.
+        recipe = self.engine.recipe if self.phase == PHASES[0] else None
+        return _restored, (self.engine.key, self.phase, recipe)
+
+
+def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
+    engine = LIVE.get(key) if recipe is None else Engine(key, *recipe)
+    if engine is None:
+        raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
+    return Callback(engine, phase)
+
+
+# -- what OpenMM gives ----------------------------------------------------------------------------
+
+
+def _positions(state: openmm.State, out: FloatArray) -> None:
+    # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
+    state._getVectorAsNumpy(openmm.State.Positions, out)
+
+
+def _number(quantity: unit.Quantity) -> float:
+    return float(quantity.value_in_unit(unit.picosecond))
+
+
+def _time(state: openmm.State) -> float:
+    return _number(state.getTime())
+
+
+def cell_of(vectors: Any) -> FloatArray:
+    return np.array([[edge[k] for k in range(3)] for edge in vectors.value_in_unit(unit.nanometer)])
+
+
+def force_name(phase: str, key: str) -> str:
+    return f"{PREFIX}: {phase} {key}"

@@ -1,0 +1,104 @@
+"""What a System must be like for rows of kcons to be carried in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint, FixedAtoms
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+
+
+def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
+    """Positions as an array of shape (n, 3), nm."""
+    plain: Any = positions
+    if unit.is_quantity(plain):
+        plain = plain.value_in_unit(unit.nanometer)
+    try:
+        x = np.array(plain, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"positions are no array of numbers: {error}", item="positions") from None
+    if x.shape != (n, 3):
+        raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
+    return x
+
+
+def masses_of(system: openmm.System) -> FloatArray:
+    """Masses in dalton, shape (n_particles,)."""
+    return np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
+
+
+def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
+    """What OpenMM does not move is fixed."""
+    if not all(isinstance(item, Constraint) for item in given):
+        return given  # ConstraintSet says what is wrong
+    used = [item.atoms.ravel() for item in given]
+    touched = np.unique(np.concatenate(used))
+    still = touched[touched < len(masses)]
+    still = still[masses[still] == 0]
+    fixed = [item.atoms.ravel() for item in given if item.family == "FixedAtoms"]
+    still = np.setdiff1d(still, np.concatenate([*fixed, np.zeros(0, np.int64)]))
+    return (*given, FixedAtoms(still)) if len(still) else given
+
+
+def free_groups(system: openmm.System, count: int) -> list[int]:
+    taken = {force.getForceGroup() for force in system.getForces()}
+    free = [g for g in reversed(range(32)) if g not in taken]
+    if len(free) < count:
+        raise UnsupportedError(f"rows need {count} force groups, and {len(free)} are free; use fewer groups for forces")
+    return free[:count]
+
+
+def refuse_virtual_sites(system: openmm.System, atoms: IntArray) -> None:
+    for atom in atoms.tolist():
+        if system.isVirtualSite(atom):
+            raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
+
+
+def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
+    """Barostats and others that move particles between steps must not move them off the rows."""
+    bound = next((item for item in held.constraints if not item.translation_invariant), None)
+    for force in system.getForces():
+        name = type(force).__name__
+        if isinstance(force, openmm.CMMotionRemover) and bound is not None:
+            raise UnsupportedError(
+                f"{name} shifts all velocities, but {bound!r} ties atoms to a place, and momentum is not conserved; "
+                "remove that force (createSystem(..., removeCMMotion=False))"
+            )
+        if "Barostat" not in name:
+            continue
+        if bound is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules, but {bound!r} ties atoms to a place; run at constant volume, or hold "
+                "differences of positions only"
+            )
+        rigid = getattr(force, "getScaleMoleculesAsRigid", None)
+        if rigid is not None and not rigid():
+            raise UnsupportedError(f"{name} scales molecules; call setScaleMoleculesAsRigid(True)")
+        row = _row_between(held, molecules())
+        if row is not None:
+            raise UnsupportedError(
+                f"{name} moves molecules apart, but row {held.row_name(row)} holds atoms of two of them; let them "
+                "count as one molecule by hold(system, ..., join=True), or run at constant volume"
+            )
+
+
+def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
+    """A row with atoms of several molecules."""
+    label = np.zeros(held.n_atoms, dtype=np.int64)
+    for k, atoms in enumerate(molecules):
+        label[list(atoms)] = k
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        of = label[item.atoms]
+        apart = (of != of[:, :1]).any(axis=1)
+        if apart.any():
+            return int(start + np.argmax(apart))
+    return None
