@@ -106,9 +106,10 @@ class Engine:
     def remember(self, state: openmm.State) -> FloatArray:
         began = (_time(state), state.getStepCount()) if self._timed else (0.0, 0)
         if self._between_steps or began != self._began:
-            self._between_steps, self._began, self._stage, self._error = False, began, 0, None
+            self._between_steps, self._began, self._stage, self._error = False, began, -1, None
             if self.cell is not None:
                 self.follow_cell(state)
+        self._stage += 1
         if self.whole:
             _positions(state, self._start)
         else:
@@ -121,7 +122,6 @@ class Engine:
         _positions(state, read)
         there[self.atoms] = read
         then, now, h = self._times(self._stage)
-        self._stage += 1
         if self._flight is None:
             self.motion.project_positions(
                 there, self._start, time=now, reference_time=then, out=there, multipliers=self._impulse
@@ -161,7 +161,7 @@ class Engine:
         integrator = self._integrator()
         dt = 0.0 if integrator is None else _number(integrator.getStepSize())
         start = self._began[0]
-        stage = min(stage, len(self._fractions) - 1)
+        stage = min(max(stage, 0), len(self._fractions) - 1)
         return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
 
     def follow_cell(self, state: openmm.State) -> None:
@@ -215,7 +215,7 @@ class Engine:
 
     def _cause(self) -> str:
         held = self.motion.constraint_set
-        time = self._times(max(self._stage - 1, 0))[0]
+        time = self._times(self._stage)[0]
         miss = np.abs(held.value(self._start, time))
         allowed = np.maximum(1e-6 * held.scale, 4 * held.tolerance(self._start, time))
         off = np.flatnonzero(~(miss <= allowed))
@@ -267,7 +267,13 @@ def _time(state: openmm.State) -> float:
 
 
 def cell_of(vectors: Any) -> FloatArray:
-    return np.array([[edge[k] for k in range(3)] for edge in vectors.value_in_unit(unit.nanometer)])
+    """Box vectors of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
+    plain = (
+        vectors.value_in_unit(unit.nanometer)
+        if unit.is_quantity(vectors)
+        else [edge.value_in_unit(unit.nanometer) for edge in vectors]
+    )
+    return np.array([[edge[0], edge[1], edge[2]] for edge in plain], dtype=np.float64)
 
 
 def force_name(phase: str, key: str) -> str:

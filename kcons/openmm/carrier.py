@@ -155,6 +155,8 @@ class CarriedConstraints:
 
     def declare(self, program: Program) -> None:
         self._engine.follow(program.integrator)
+        #: Without a projection at the end of the step, the solve for positions must tell of failures itself.
+        self._leapfrog = getattr(program.integrator, "scheme", None) is None
 
     def _guard(self, program: Program, phase: str, words: str) -> None:
         group = self._groups[phase]
@@ -164,8 +166,12 @@ class CarriedConstraints:
         self._guard(program, "remember", "carried rows: positions whose gradients are taken")
 
     def land(self, program: Program, h: str) -> None:
-        self._guard(program, "land", "carried rows: solve for positions")
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{self._groups['land']}", "onto the carried rows")
+        # Where a computation changes x by a force, OpenMM does not take force and energy from one evaluation: failures
+        # wait for the next call of the other phases.
+        if self._leapfrog:
+            self._guard(program, "land", "carried rows: try to solve for positions")
+        change = f"f{self._groups['land']}"
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: solve for positions")
 
     def project(self, program: Program) -> None:
         change = f"f{self._groups['project']}"

@@ -58,8 +58,9 @@ def free_groups(system: openmm.System, count: int) -> list[int]:
 
 
 def refuse_virtual_sites(system: openmm.System, atoms: IntArray) -> None:
+    is_site = system.isVirtualSite
     for atom in atoms.tolist():
-        if system.isVirtualSite(atom):
+        if is_site(atom):
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 

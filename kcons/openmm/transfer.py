@@ -74,7 +74,7 @@ def take_constraints(
         Unknown choice or atoms; nothing was changed.
     """
     table = _table(system)
-    chosen = _chosen(table, which, keep_water)
+    chosen = _chosen(system, table, which, keep_water)
     rows = _as_rows(table, chosen, angles)
     _release(system, table, chosen)
     return rows
@@ -132,7 +132,7 @@ def hold(
             raise InputError(f"{item!r} is no kcons constraint", item="constraints")
     n = system.getNumParticles()
     table = _table(system)
-    chosen = _chosen(table, () if take == "touched" else take, keep_water)
+    chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
     touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
     chosen |= _sharing(table, touched[touched < n])
     taken = _as_rows(table, chosen, angles)
@@ -152,11 +152,10 @@ def hold(
 
 @dataclass
 class _Table:
-    """The constraints of a System: pairs (n, 2), lengths in nm (n,), hydrogens and cluster number of each particle."""
+    """The constraints of a System: pairs (n, 2), lengths in nm (n,), and cluster number of each particle."""
 
     pairs: IntArray
     lengths: FloatArray
-    light: NDArray[np.bool_]
     clusters: IntArray
 
     @property
@@ -176,20 +175,21 @@ def _table(system: openmm.System) -> _Table:
     n = system.getNumParticles()
     parameters = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     pairs = np.array([[i, j] for i, j, _ in parameters], dtype=np.int64).reshape(-1, 2)
-    lengths = np.array([d.value_in_unit(unit.nanometer) for _, _, d in parameters], dtype=np.float64)
-    masses = masses_of(system)
+    # OpenMM gives nanometers; converting a Quantity takes longer than all else here.
+    lengths = np.array([d._value for _, _, d in parameters], dtype=np.float64)
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     clusters = connected_components(links, directed=False)[1].astype(np.int64)
-    return _Table(pairs, lengths, (masses > 0) & (masses < _HYDROGEN), clusters)
+    return _Table(pairs, lengths, clusters)
 
 
-def _chosen(table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
+def _chosen(system: openmm.System, table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
     """Which constraints to take, in whole clusters."""
     if isinstance(which, str):
         if which == "all":
             chosen = np.ones(len(table.pairs), dtype=bool)
         elif which == "hbonds":
-            with_hydrogen = table.light[table.pairs].any(axis=1)
+            masses = masses_of(system)[table.pairs]
+            with_hydrogen = ((masses > 0) & (masses < _HYDROGEN)).any(axis=1)
             chosen = np.isin(table.cluster, table.cluster[with_hydrogen])
         else:
             raise InputError(f"no choice {which!r}; give 'all', 'hbonds' or the numbers of atoms", item="which")
