@@ -71,10 +71,8 @@ class Engine:
         self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
         self._x, self._read = np.zeros(local), np.zeros(local)
-        if self.whole:
-            self._x = self._start
         rows = self.motion.constraint_set.n_rows
-        self._impulse, self._push, self._push_before = np.zeros(rows), np.zeros(rows), np.full(rows, np.nan)
+        self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
         self._timed = self.motion.constraint_set.moving
         self._flight: NonholonomicFlight | None = None
         if not self.motion.constraint_set.holonomic.all():
@@ -104,31 +102,40 @@ class Engine:
     # -- callbacks ------------------------------------------------------------------------------
 
     def remember(self, state: openmm.State) -> FloatArray:
-        began = (_time(state), state.getStepCount()) if self._timed else (0.0, 0)
+        began = _time(state), state.getStepCount()
         if self._between_steps or began != self._began:
             self._between_steps, self._began, self._stage, self._error = False, began, -1, None
             if self.cell is not None:
                 self.follow_cell(state)
         self._stage += 1
+        _positions(state, self._x)
         if self.whole:
-            _positions(state, self._start)
+            np.copyto(self._start, self._x)
         else:
-            _positions(state, self._x)
             self._start[self.atoms] = self._x
         return self._nothing
 
     def land(self, state: openmm.State) -> FloatArray:
         there, read = self._there, self._read
         _positions(state, read)
-        there[self.atoms] = read
+        if not self._timed and np.array_equal(read, self._x):
+            return self._nothing  # at rest, or forces are asked for between steps
+        if self.whole:
+            np.copyto(there, read)
+        else:
+            there[self.atoms] = read
         then, now, h = self._times(self._stage)
         if self._flight is None:
+            impulse = self._impulse if len(self._fractions) == 1 else None
             self.motion.project_positions(
-                there, self._start, time=now, reference_time=then, out=there, multipliers=self._impulse
+                there, self._start, time=now, reference_time=then, out=there, multipliers=impulse
             )
         else:
             point = Point(self._start.copy(), (there - self._start) / h, self._weights, exact=False)
             self._flight.move(point, there, then, now, h)
+        # What the velocity stage before found belongs to the same positions as this impulse.
+        self._push, self._push_before = self._push_before, self._push
+        self._push.fill(0.0)
         change = (there if self.whole else there[self.atoms]) - read
         np.add(read, change, out=self._x)
         change *= CARRY_SCALE
@@ -139,6 +146,8 @@ class Engine:
         read, v = self._read, self._v
         _positions(state, read)
         read -= self._x
+        if not self._timed and not read.any():
+            return self._nothing
         read *= SPEED_SCALE
         if self.whole:
             np.copyto(v, read)
@@ -148,8 +157,8 @@ class Engine:
             x = self._start
             x[self.atoms] = self._x
         now = self._times(len(self._nodes) - 2)[1]
-        self._push, self._push_before = self._push_before, self._push
-        self.motion.project_velocities(x, v, time=now, out=v, multipliers=self._push)
+        push = self._push if len(self._fractions) == 1 else None
+        self.motion.project_velocities(x, v, time=now, out=v, multipliers=push)
         change = (v if self.whole else v[self.atoms]) - read
         change *= CARRY_SCALE
         return change

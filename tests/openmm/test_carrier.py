@@ -193,6 +193,26 @@ def test_same_trajectory_as_openmm_with_its_own_constraints():
     assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
 
 
+def test_leapfrog_is_verlet_of_openmm():
+    part, integrator, context = peptide(rows=False, scheme="leapfrog")
+    system = app.ForceField("amber14-all.xml").createSystem(
+        PEPTIDE.topology, constraints=app.AllBonds, rigidWater=False, removeCMMotion=False
+    )
+    verlet = openmm.VerletIntegrator(0.001)
+    verlet.setConstraintTolerance(1e-12)
+    own = context_of(system, verlet)
+    x, v = state_of(context)
+    own.setPositions(x)
+    own.setVelocities(v)
+    verlet.step(100)
+    integrator.step(100)
+    assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
+    with pytest.raises(ConvergenceError, match="step 101"):
+        integrator.setStepSize(0.1)
+        integrator.step(1)
+    assert part.step_multipliers.shape == (21,)
+
+
 # -- closed forms ---------------------------------------------------------------------------------
 
 
@@ -385,6 +405,7 @@ def test_multipliers_of_a_step_are_of_second_order():
         part, integrator, context = peptide(dt=0.008 / count)
         integrator.step(count)
         exact = part.multipliers(context)
+        context.getState(energy=True, forces=True)  # evaluates all groups between steps
         integrator.step(1)
         errors.append(np.abs(part.step_multipliers - exact).max())
     slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
