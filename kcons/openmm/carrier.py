@@ -24,6 +24,7 @@ from kcons.openmm.requirements import (
     masses_of,
     nanometers,
     refuse_agents,
+    refuse_single_precision,
     refuse_virtual_sites,
     with_massless_atoms,
 )
@@ -198,6 +199,7 @@ class CarriedConstraints:
             Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
         """
         system = context.getSystem()
+        refuse_single_precision(context)
         self._check_system(system)
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)

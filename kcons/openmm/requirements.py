@@ -64,6 +64,19 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray) -> None:
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 
+def refuse_single_precision(context: openmm.Context) -> None:
+    """GPUs hand positions to PythonForces as they keep them: exact in double precision only."""
+    platform = context.getPlatform()
+    if "Precision" not in platform.getPropertyNames():
+        return
+    precision = platform.getPropertyValue(context, "Precision")
+    if precision != "double":
+        raise UnsupportedError(
+            f"the {platform.getName()} platform carries positions in {precision} precision, too coarse for rows; make "
+            "the Context with {'Precision': 'double'}"
+        )
+
+
 def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
     """Barostats and others that move particles between steps must not move them off the rows."""
     bound = next((item for item in held.constraints if not item.translation_invariant), None)

@@ -30,6 +30,7 @@ from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.carrier import CarriedConstraints
+from kcons.openmm.requirements import refuse_single_precision
 from kcons.openmm.transfer import hold
 from kcons.steppers import BlanesMoan6, Rattle, System
 
@@ -521,6 +522,28 @@ def test_nothing_to_hold_is_refused(rows):
 def test_wrong_positions_are_refused():
     with pytest.raises(InputError, match=r"shape \(2, 3\)"):
         CarriedConstraints(free([1.0, 1.0]), Distance([[0, 1]]), [[0, 0, 0]])
+
+
+@pytest.mark.parametrize("precision", ["single", "mixed", "double"])
+def test_gpus_carry_positions_in_double_precision_only(precision):
+    class Context:
+        def getPlatform(self):
+            return self
+
+        def getPropertyNames(self):
+            return ("DeviceIndex", "Precision")
+
+        def getPropertyValue(self, context, name):
+            return precision
+
+        def getName(self):
+            return "CUDA"
+
+    if precision == "double":
+        refuse_single_precision(Context())
+        return
+    with pytest.raises(UnsupportedError, match=f"CUDA platform carries positions in {precision} precision"):
+        refuse_single_precision(Context())
 
 
 def test_no_free_groups():
