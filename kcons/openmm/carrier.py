@@ -87,7 +87,7 @@ class CarriedConstraints:
         wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
         cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
         engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
-        refuse_virtual_sites(system, engine.atoms)
+        refuse_virtual_sites(system, engine.atoms, masses)
         self._bind(engine, free_groups(system, len(PHASES)))
 
     def _bind(self, engine: Engine, groups: list[int]) -> None:
@@ -270,7 +270,7 @@ class CarriedConstraints:
         now = masses_of(system)
         if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
             raise InputError("masses have changed since the rows were built; build them again", item="masses")
-        refuse_virtual_sites(system, engine.atoms)
+        refuse_virtual_sites(system, engine.atoms, now)
         touched = set(engine.atoms.tolist())
         for k in range(system.getNumConstraints()):
             i, j, _ = system.getConstraintParameters(k)

@@ -57,10 +57,9 @@ def free_groups(system: openmm.System, count: int) -> list[int]:
     return free[:count]
 
 
-def refuse_virtual_sites(system: openmm.System, atoms: IntArray) -> None:
-    is_site = system.isVirtualSite
-    for atom in atoms.tolist():
-        if is_site(atom):
+def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatArray) -> None:
+    for atom in atoms[masses[atoms] == 0].tolist():
+        if system.isVirtualSite(atom):
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 

@@ -173,10 +173,14 @@ class _Table:
 
 def _table(system: openmm.System) -> _Table:
     n = system.getNumParticles()
-    parameters = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    pairs = np.array([[i, j] for i, j, _ in parameters], dtype=np.int64).reshape(-1, 2)
-    # OpenMM gives nanometers; converting a Quantity takes longer than all else here.
-    lengths = np.array([d._value for _, _, d in parameters], dtype=np.float64)
+    first, second, long = [], [], []
+    for k in range(system.getNumConstraints()):
+        i, j, length = system.getConstraintParameters(k)
+        first.append(i)
+        second.append(j)
+        long.append(length._value)  # nm; converting a Quantity takes longer than all else here
+    pairs = np.array([first, second], dtype=np.int64).T
+    lengths = np.array(long, dtype=np.float64)
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     clusters = connected_components(links, directed=False)[1].astype(np.int64)
     return _Table(pairs, lengths, clusters)
