@@ -35,7 +35,8 @@ from kcons.openmm.transfer import hold
 from kcons.steppers import BlanesMoan6, Rattle, System
 
 NM, PS = unit.nanometer, unit.picosecond
-PEPTIDE = app.PDBFile(str(Path(__file__).parent.parent / "data" / "alanine-dipeptide-implicit.pdb"))
+PEPTIDE_FILE = Path(__file__).parent.parent / "data" / "alanine-dipeptide-implicit.pdb"
+PEPTIDE = app.PDBFile(str(PEPTIDE_FILE))
 PSI = [[6, 8, 14, 16]]
 
 
@@ -192,6 +193,44 @@ def test_same_trajectory_as_openmm_with_its_own_constraints():
     own.getIntegrator().step(100)
     integrator.step(100)
     assert np.abs(state_of(own)[0] - state_of(context)[0]).max() <= 1e-9
+
+
+@pytest.mark.parametrize(("steps", "bound"), [(100, 1e-12), (4000, 1e-9)])
+def test_one_bond_runs_as_openmms_own(steps, bound):
+    x = np.array([[-0.5, 0, 0], [0.5, 0, 0]])
+    v = np.array([[0.1, -0.5, 0.2], [0.1, 0.5, 0.1]])
+    part = hold(system := free([1.0, 3.0], pull(3.0, 1)), Distance([[0, 1]], 1.0), x)
+    carried = context_of(system, ProjectedIntegrator(0.002, parts=[part]))
+    built_in = free([1.0, 3.0], pull(3.0, 1))
+    built_in.addConstraint(0, 1, 1.0)
+    own = context_of(built_in, ProjectedIntegrator(0.002, tolerance=1e-15))
+    for context in (carried, own):
+        context.setPositions(x)
+        context.setVelocities(v)
+        context.getIntegrator().step(steps)
+    assert np.abs(state_of(carried)[0] - state_of(own)[0]).max() <= bound
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-10])
+def test_a_protein_runs_as_with_ccma_within_its_tolerance(tolerance):
+    pdb = app.PDBFile(str(PEPTIDE_FILE.parent / "5dfr_minimized.pdb"))
+    system = app.ForceField("amber99sb.xml").createSystem(
+        pdb.topology, constraints=app.AllBonds, rigidWater=False, removeCMMotion=False
+    )
+    nonbonded = next(k for k in range(system.getNumForces()) if isinstance(system.getForce(k), openmm.NonbondedForce))
+    system.removeForce(nonbonded)
+    moved = openmm.XmlSerializer.clone(system)
+    part = hold(moved, [], pdb.positions, take="all")
+    carried = context_of(moved, ProjectedIntegrator(0.001, parts=[part]))
+    start(carried, part, pdb.positions)
+    x, v = state_of(carried)
+    own = context_of(system, ProjectedIntegrator(0.001, tolerance=tolerance))
+    own.setPositions(x)
+    own.setVelocities(v)
+    for context in (carried, own):
+        context.getIntegrator().step(10)
+    assert np.abs(state_of(carried)[0] - state_of(own)[0]).max() <= tolerance
 
 
 def test_leapfrog_is_verlet_of_openmm():
