@@ -74,6 +74,19 @@ SLOW = frozenset(name for name in cases.NAMES if name.startswith("A08"))
 #: Nothing is left of the error where atoms fly along great circles and no forces act.
 EXACT = {("A01_sphere_free", s) for s in ("Geodesic(substeps=4)", "BlanesMoan4()", "BlanesMoan6()", "BlanesMoan6a()")}
 
+#: Take three seconds and more.
+LONG = {
+    ("A04_double_pendulum", "BlanesMoan4()"),
+    ("A04_triple_pendulum", "BlanesMoan4()"),
+    ("A05_two_dumbbells_lj", "BlanesMoan4()"),
+    ("A05_two_dumbbells_lj", "BlanesMoan6()"),
+    ("A06_water_free3", "BlanesMoan4()"),
+    ("A07_angle_only_flexible_bonds", "BlanesMoan4()"),
+    ("A10_isokinetic_dumbbell_quartic", "KahanLi6()"),
+    ("A10_isokinetic_harmonic2d", "KahanLi6()"),
+    ("A10_isokinetic_lj4", "Suzuki4()"),
+    ("A10_isokinetic_lj4", "KahanLi6()"),
+}
 #: Steps with which the floor is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
 FLOOR_STEPS = {
     "A02_spherical_pendulum_near_top": 0.025,
@@ -233,7 +246,14 @@ def order_time(name: str, stepper: Stepper) -> int:
     return telling_time(name, 20.0 if stepper.order == 6 else 5.0)
 
 
-QUICK = [p for p in PAIRS if repr(p[1]) in USUAL and not (p[0] in SLOW and repr(p[1]) == "BlanesMoan6()")]
+def is_quick(name: str, stepper: Stepper) -> bool:
+    """Whether it takes about two seconds at most; everything else waits for the long run."""
+    if name in SLOW:
+        return not isinstance(stepper, BlanesMoan4 | BlanesMoan6)
+    return (name, repr(stepper)) not in LONG
+
+
+QUICK = [p for p in PAIRS if repr(p[1]) in USUAL and is_quick(*p)]
 
 
 @pytest.mark.parametrize(("name", "stepper"), QUICK, ids=lambda p: p if isinstance(p, str) else repr(p))
