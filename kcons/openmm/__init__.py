@@ -4,6 +4,8 @@ Swap the integrator of a Simulation, and what the System constrains is held to o
 collective variables, surfaces and the constraint objects of kcons.
 """
 
+from kcons.openmm.carrier import CarriedConstraints
 from kcons.openmm.projected import ProjectedIntegrator
+from kcons.openmm.transfer import hold, take_constraints
 
-__all__ = ["ProjectedIntegrator"]
+__all__ = ["CarriedConstraints", "ProjectedIntegrator", "hold", "take_constraints"]
