@@ -66,6 +66,7 @@ class CarriedConstraints:
 
     evaluates = True
     meets_system = False
+    solves_alone = False
 
     def __init__(
         self,

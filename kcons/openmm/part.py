@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import openmm
 
@@ -35,6 +35,9 @@ class Part(Protocol):
     meets_system : bool
         Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
         within its own `land`; at most one part of an integrator may.
+    solves_alone : bool
+        Whether the program also brings a state onto the rows outside of steps. Where a part does not, all parts are
+        asked to do so by `apply_positions` and `apply_velocities`.
     groups : frozenset of int
         Force groups that carry rows, not forces.
     """
@@ -42,6 +45,7 @@ class Part(Protocol):
     code: int
     evaluates: bool
     meets_system: bool
+    solves_alone: bool
     groups: frozenset[int]
 
     def declare(self, program: Program) -> None:
@@ -62,6 +66,14 @@ class Part(Protocol):
 
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
+        ...
+
+    def apply_positions(self, context: openmm.Context) -> Any:
+        """Bring the positions of the context onto the rows; velocities stay as they are."""
+        ...
+
+    def apply_velocities(self, context: openmm.Context) -> Any:
+        """Make the velocities of the context tangent to the rows."""
         ...
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:

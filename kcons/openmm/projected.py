@@ -233,7 +233,10 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
         try:
             context.applyConstraints(tolerance)
-            if self.parts:
+            if not all(part.solves_alone for part in self.parts):
+                for part in self.parts:
+                    part.apply_positions(context)
+            elif self.parts:
                 context.setVelocities(np.zeros_like(velocities))
                 self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
             guard.check_rows(positions_of(context), None)
@@ -253,11 +256,14 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """
         guard = self._watch(context)
         context = guard.context
-        if not self.parts:
-            context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
-            return
         velocities = velocities_of(context)
+        by_program = bool(self.parts) and all(part.solves_alone for part in self.parts)
         try:
+            if not by_program:
+                context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+                for part in self.parts:
+                    part.apply_velocities(context)
+                return
             self._run_alone(guard, self._plan.alone, self._plan.alone)
         except KconsError:
             context.setVelocities(velocities)

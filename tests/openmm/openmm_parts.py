@@ -16,6 +16,7 @@ class HeldCoordinates:
 
     code = 0
     meets_system = False
+    solves_alone = True
 
     def __init__(self, particles, axis, value, n, *, evaluates=False, steepest=np.inf, groups=()):
         self.mask = np.zeros((n, 3))

@@ -418,7 +418,7 @@ def test_a_box_too_small_stops_the_step():
     start(context, part, x)
     context.setPeriodicBoxVectors([0.7, 0, 0], [0, 2, 0], [0, 0, 2])
     before = state_of(context)
-    with pytest.raises(InputError, match=r"step 1: .*half the box"):
+    with pytest.raises(InputError, match="half the box"):
         integrator.step(1)
     assert all(np.array_equal(a, b) for a, b in zip(before, state_of(context), strict=True))
 
