@@ -1,0 +1,446 @@
+"""Collective variables as rows of an OpenMM integrator: held, the same as other solvers, refused."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from collective_cases import (
+    CHAIN,
+    FORCES,
+    MASSES,
+    PLATFORMS,
+    angle,
+    bond,
+    chain_system,
+    context_of,
+    cosine,
+    dihedral,
+    energy_of,
+    held_chain,
+    some_velocities,
+    spring_forces,
+    state_of,
+    with_variable,
+)
+
+from kcons import ConstraintSet
+from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration
+from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError, UnsupportedError
+from kcons.motion import Motion
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.collective import CollectiveRows
+from kcons.openmm.row_forces import Row, each_term
+from kcons.steppers import Rattle, System, run
+
+# -- held to rounding -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
+@pytest.mark.parametrize("kind", FORCES)
+def test_rows_hold_in_positions_and_velocities(kind, constrained, platform):
+    context, integrator, part = held_chain(FORCES[kind](), platform=platform, constrained=constrained)
+    start = energy_of(context, integrator)
+    for _ in range(10):
+        integrator.step(20)
+        assert np.abs(part.residuals(context)).max() <= 1e-12
+        assert np.abs(part.rates(context)).max() <= 1e-12
+    assert part.meets_system == constrained
+    assert abs(energy_of(context, integrator) - start) < 0.02 * abs(start)
+
+
+def test_energies_are_the_coordinates():
+    context, _, part = held_chain(FORCES["three"]())
+    d = np.linalg.norm(CHAIN[0] - CHAIN[3])
+    expected = ConstraintSet([Distance([0, 3]), Dihedral([0, 1, 2, 3]), Angle([2, 3, 4])], CHAIN, MASSES)
+    assert part.values(context) == pytest.approx(expected.measure(CHAIN), abs=1e-13)
+    assert part.values(context)[0] == pytest.approx(d, abs=1e-15)
+    assert part.targets(context) == pytest.approx(part.values(context), abs=1e-15)
+
+
+# -- the same trajectories as other solvers -------------------------------------------------------------
+
+
+def test_a_bond_as_row_moves_like_a_constraint_of_the_system():
+    d = float(np.linalg.norm(CHAIN[0] - CHAIN[3]))
+    builtin = chain_system()
+    builtin.addConstraint(0, 3, d)
+    reference = ProjectedIntegrator(0.002, tolerance=1e-14)
+    first = context_of(builtin, reference, CHAIN, some_velocities())
+    first.applyVelocityConstraints(1e-14)
+    context, integrator, _ = held_chain([bond(0, 3)])
+    context.setVelocities(first.getState(velocities=True).getVelocities())
+    reference.step(100)
+    integrator.step(100)
+    assert np.abs(state_of(context)[0] - state_of(first)[0]).max() < 1e-12
+
+
+CORE = {
+    "bond": lambda: Distance([0, 3]),
+    "angle": lambda: Angle([1, 2, 4]),
+    "dihedral": lambda: Dihedral([0, 1, 2, 3]),
+    "centres": lambda: CenterDistance([0, 1], [3, 4, 5]),
+    "gyration": lambda: RadiusOfGyration([0, 1, 2, 3, 4], mass_weighted=False),
+}
+
+
+@pytest.mark.parametrize("kind", CORE)
+def test_same_trajectory_and_multipliers_as_the_core(kind):
+    context, integrator, part = held_chain(FORCES[kind]())
+    held = ConstraintSet([CORE[kind]()], CHAIN, MASSES)
+    motion = Motion(held, CHAIN)
+    system = System(motion, spring_forces)
+    x, v = state_of(context)
+    state = system.initial_state(x, v)
+    state = run(system, state, 0.002, 50, stepper=Rattle())
+    integrator.step(50)
+    assert np.abs(state_of(context)[0] - state.positions).max() < 2e-12
+    x, v = state_of(context)
+    expected = motion.multipliers(x, v, spring_forces(x))
+    assert part.multipliers_at(context) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+    # The integrator's own, at the start of its last step.
+    integrator.step(1)
+    errors = abs(part.multipliers(integrator)[0] - expected[0])
+    assert errors < 2e-3 * abs(expected[0]) + 1e-2
+
+
+# -- periodic coordinates -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", [math.pi, -math.pi, 3 * math.pi])
+def test_dihedral_held_across_its_jump(target):
+    x = np.array([[0.0, 0.1, 0.0], [0.0, 0, 0], [0.15, 0, 0], [0.15, -0.1, 0.0]])
+    system = openmm.System()
+    for mass in (1.0, 12.0, 12.0, 1.0):
+        system.addParticle(mass)
+    for i, j in ((0, 1), (1, 2), (2, 3), (0, 2), (1, 3)):
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    part = CollectiveRows(system, [Row(dihedral(0, 1, 2, 3), target)])
+    assert part.periods == (2 * math.pi,)
+    integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
+    context = context_of(system, integrator, x, np.random.default_rng(3).normal(size=x.shape))
+    part.restore(context)
+    for _ in range(20):
+        integrator.step(5)
+        assert abs(part.residuals(context)[0]) <= 1e-12
+        assert abs(part.values(context)[0]) == pytest.approx(math.pi, abs=1e-11)
+
+
+# -- failures -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
+@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_a_step_too_large_is_taken_back(platform, constrained, scheme):
+    context, integrator, part = held_chain(
+        [Row(bond(0, 3), name="my bond")], scheme, platform=platform, constrained=constrained
+    )
+    integrator.step(3)
+    x, v = state_of(context)
+    integrator.setStepSize(1.0)
+    with pytest.raises(ConvergenceError, match=r"step 4: row 0 \(my bond\) is off by .* iterations") as caught:
+        integrator.step(2)
+    assert caught.value.row == 0
+    assert caught.value.iterations > 1
+    assert caught.value.residual > part.tolerance
+    assert np.array_equal(state_of(context)[0], x)
+    assert np.array_equal(state_of(context)[1], v)
+    integrator.setStepSize(0.002)
+    integrator.step(3)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+
+
+def test_dependent_rows_are_named():
+    context, integrator, part = _held_without_check([bond(0, 3), Row(bond(0, 3), name="again")])
+    assert part.rank(context) == 1
+    with pytest.raises(SingularGeometryError, match="row 1 \\(again\\)") as caught:
+        part.check(context)
+    assert caught.value.rows == (1,)
+    with pytest.raises(SingularGeometryError, match="again"):
+        integrator.step(1)
+
+
+def test_row_that_repeats_a_constraint_of_the_system_is_named():
+    context, integrator, part = _held_without_check([bond(1, 2), bond(0, 1)], constrained=True)
+    assert part.rank(context) == 1
+    with pytest.raises(SingularGeometryError, match="row 1"):
+        part.check(context)
+    with pytest.raises(SingularGeometryError, match="row 1"):
+        integrator.step(1)
+
+
+def _held_without_check(rows, constrained=False):
+    system = chain_system()
+    if constrained:
+        system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
+    part = CollectiveRows(system, rows, positions=CHAIN)
+    integrator = ProjectedIntegrator(0.001, parts=[part], tolerance=1e-13)
+    return context_of(system, integrator, CHAIN, some_velocities()), integrator, part
+
+
+def test_row_without_gradient_is_named():
+    context, integrator, part = _held_without_check([openmm.RMSDForce(CHAIN, list(range(6)))])
+    with pytest.raises((SingularGeometryError, ConstraintError), match="row 0"):
+        part.check(context)
+    with pytest.raises((SingularGeometryError, ConstraintError), match="row 0"):
+        integrator.step(1)
+
+
+def test_rows_that_become_singular_within_a_step_are_named_by_the_program():
+    # The gradient of (r - 0.3)^2 vanishes as r goes to 0.3.
+    system = openmm.System()
+    system.addParticle(1.0)
+    system.addParticle(1.0)
+    force = openmm.CustomBondForce("(r-0.3)^2")
+    force.addBond(0, 1)
+    part = CollectiveRows(system, [Row(force, 0.01, rate=-0.5)])
+    integrator = ProjectedIntegrator(0.001, parts=[part])
+    context = context_of(system, integrator, [[0, 0, 0], [0.4, 0, 0]], np.zeros((2, 3)))
+    part.restore(context)
+    with pytest.raises((SingularGeometryError, ConvergenceError), match="row 0"):
+        integrator.step(40)
+    assert np.isfinite(state_of(context)[0]).all()
+
+
+def test_velocities_that_are_no_numbers_are_refused():
+    context, integrator, _ = held_chain([bond(0, 3)])
+    integrator.step(1)
+    x, v = state_of(context)
+    broken = v.copy()
+    broken[2, 1] = math.nan
+    context.setVelocities(broken)
+    with pytest.raises((FloatingPointError, ArithmeticError)):
+        integrator.step(1)
+    assert np.isfinite(state_of(context)[0]).all()
+    context.setPositions(x)
+    context.setVelocities(v)
+    integrator.step(1)
+
+
+def test_a_start_off_the_rows_is_refused_and_can_be_restored():
+    system = chain_system()
+    part = CollectiveRows(system, [Row(bond(0, 3), 0.3)])
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator, CHAIN, some_velocities())
+    with pytest.raises(ConstraintError, match="restore"):
+        integrator.step(1)
+    v = state_of(context)[1]
+    assert part.apply_positions(context) > 0
+    assert np.array_equal(state_of(context)[1], v)
+    part.apply_velocities(context)
+    part.check(context)
+    integrator.step(10)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+
+
+def test_positions_that_cannot_be_restored_stay():
+    system = chain_system()
+    part = CollectiveRows(system, [Row(cosine(0, 2, 5), 1.5, name="impossible")])
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    context = context_of(system, integrator, CHAIN, some_velocities())
+    x, v = state_of(context)
+    with pytest.raises((ConvergenceError, SingularGeometryError), match="impossible"):
+        part.apply_positions(context)
+    assert np.array_equal(state_of(context)[0], x)
+    assert np.array_equal(state_of(context)[1], v)
+
+
+def test_velocity_projection_is_the_nearest_in_the_mass_metric():
+    context, _, part = held_chain([bond(0, 3), angle(2, 3, 4)])
+    v = some_velocities(seed=9)
+    context.setVelocities(v)
+    part.apply_velocities(context)
+    held = ConstraintSet([Distance([0, 3]), Angle([2, 3, 4])], CHAIN, MASSES)
+    expected = Motion(held, CHAIN).project_velocities(CHAIN, v)
+    assert state_of(context)[1] == pytest.approx(expected, abs=1e-13)
+
+
+# -- how many rows, and which ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [8, 12])
+def test_many_rows(count):
+    rows = [bond(i, j) for i, j in list(itertools.combinations(range(6), 2))[:count]]
+    context, integrator, part = held_chain(rows, dt=0.001)
+    assert part.rank(context) == len(rows) <= 12
+    integrator.step(20)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+    assert np.abs(part.rates(context)).max() <= 1e-12
+
+
+def test_thirty_one_rows_fit_into_the_force_groups():
+    system, x = _pairs(32)
+    CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(31)], positions=x)
+    system, x = _pairs(32)
+    part = CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(31)], positions=x)
+    assert part.groups == frozenset(range(1, 32))
+    integrator = ProjectedIntegrator(0.002, "suzuki4", parts=[part])
+    context = context_of(system, integrator, x, np.random.default_rng(0).normal(size=x.shape))
+    part.restore(context)
+    integrator.step(5)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+
+
+def _pairs(n):
+    system = openmm.System()
+    for _ in range(2 * n):
+        system.addParticle(1.0)
+    x = np.array([[0.5 * (k // 2), 0.1 * (k % 2), 0.0] for k in range(2 * n)])
+    return system, x
+
+
+def test_too_many_rows_are_refused_before_the_system_changes():
+    system, x = _pairs(32)
+    system.addForce(openmm.HarmonicBondForce())
+    with pytest.raises(UnsupportedError, match="31 are free"):
+        CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(32)], positions=x)
+    assert system.getNumForces() == 1
+
+
+def test_two_parts_of_rows_in_one_integrator():
+    system = chain_system()
+    system.addConstraint(0, 1, float(np.linalg.norm(CHAIN[0] - CHAIN[1])))
+    one = CollectiveRows(system, [bond(0, 3)], positions=CHAIN)
+    two = CollectiveRows(system, [bond(4, 5)], positions=CHAIN)
+    assert (one.meets_system, two.meets_system) == (True, False)
+    integrator = ProjectedIntegrator(0.002, parts=[one, two], tolerance=1e-13)
+    context = context_of(system, integrator, CHAIN, some_velocities())
+    one.apply_velocities(context)
+    two.apply_velocities(context)
+    integrator.step(50)
+    for part in (one, two):
+        assert np.abs(part.residuals(context)).max() <= 1e-12
+        assert np.abs(part.rates(context)).max() <= 1e-12
+
+
+def test_pushes_are_summed_only_where_rows_meet():
+    system, x = _pairs(4)
+    part = CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(4)], positions=x)
+    integrator = ProjectedIntegrator(0.002, parts=[part])
+    sums = [k for k in range(integrator.getNumComputations()) if integrator.getComputationStep(k)[0] == 2]
+    # Whether x was moved; the sizes at the start; for each row its rate and its size.
+    assert len(sums) == 1 + 4 + 8
+
+
+def test_terms_of_a_force_as_rows():
+    many = openmm.CustomBondForce("r")
+    for pair in ((0, 3), (1, 4), (2, 5)):
+        many.addBond(*pair)
+    variables = with_variable("a+b", a=bond(0, 3), b=dihedral(0, 1, 2, 3))
+    context, integrator, part = held_chain([*each_term(many), each_term(variables)[1]])
+    assert part.n_rows == 4
+    assert part.periods == (0.0, 0.0, 0.0, 2 * math.pi)
+    integrator.step(20)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+    with pytest.raises(UnsupportedError, match="no terms"):
+        each_term(openmm.RGForce([0, 1]))
+
+
+def test_listing_names_the_rows():
+    _, integrator, _ = held_chain([Row(bond(0, 3), name="end to end")])
+    assert "end to end" in integrator.listing()
+    assert "push along the rows" in integrator.listing()
+
+
+# -- as part of an integrator and its System ----------------------------------------------------------------
+
+
+def test_copies_and_pickles_go_on_alike():
+    rows = [Row(bond(0, 3), None, rate=0.2), angle(2, 3, 4)]
+    context, integrator, part = held_chain(rows, constrained=True)
+    integrator.step(20)
+    x, v = state_of(context)
+    ends = [state_of(context)]
+    for other in (copy.deepcopy(integrator), pickle.loads(pickle.dumps(integrator))):
+        again = context_of(context.getSystem(), other, x, v)
+        assert other.parts[0].targets(again) == pytest.approx(part.targets(context), abs=1e-14)
+        other.step(20)
+        ends.append(state_of(again))
+    integrator.step(20)
+    ends[0] = state_of(context)
+    for end in ends[1:]:
+        assert np.abs(end[0] - ends[0][0]).max() <= 1e-12
+
+
+def test_xml_leads_back_to_the_class():
+    _, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], "suzuki4")
+    read = ProjectedIntegrator.from_xml(openmm.XmlSerializer.serialize(integrator), parts=[copy.deepcopy(part)])
+    assert read.listing() == integrator.listing()
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_checkpoints_go_on_alike(platform):
+    context, integrator, _ = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True, platform=platform)
+    integrator.step(10)
+    saved = context.createCheckpoint()
+    integrator.step(10)
+    first = state_of(context)
+    context.loadCheckpoint(saved)
+    integrator.step(10)
+    again = state_of(context)
+    assert np.array_equal(first[0], again[0])
+    assert np.array_equal(first[1], again[1])
+
+
+def test_degrees_of_freedom_and_force_groups():
+    context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True)
+    assert integrator.degrees_of_freedom(context) == 18 - 2 - 2
+    assert set(part.groups) == {1, 2}
+    groups = integrator.getIntegrationForceGroups()
+    assert {g for g in range(32) if groups >> g & 1} == set(range(32)) - {1, 2}
+
+
+def test_constraints_applied_by_the_integrator():
+    context, integrator, part = held_chain([bond(0, 3), angle(2, 3, 4)], constrained=True)
+    rng = np.random.default_rng(4)
+    context.setPositions(state_of(context)[0] + 0.002 * rng.normal(size=CHAIN.shape))
+    context.setVelocities(rng.normal(size=CHAIN.shape))
+    integrator.applyConstraints(context)
+    integrator.applyVelocityConstraints(context)
+    assert np.abs(part.residuals(context)).max() <= 1e-12
+    assert np.abs(part.rates(context)).max() <= 1e-12
+    part.check(context)
+
+
+def test_a_barostat_that_moves_the_ends_of_a_row_apart_is_refused():
+    system = chain_system()
+    for force in list(range(system.getNumForces()))[::-1]:
+        system.removeForce(force)
+    system.setDefaultPeriodicBoxVectors(*(3 * np.eye(3)))
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
+    periodic = bond(4, 5)
+    periodic.setUsesPeriodicBoundaryConditions(True)
+    system.addForce(periodic)
+    # OpenMM counts atoms as one molecule that a bond joins, also the bond of a row, but not those of an RGForce.
+    part = CollectiveRows(system, [openmm.RGForce([0, 1, 2])], positions=CHAIN)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
+    context = context_of(system, integrator, CHAIN, np.zeros((6, 3)))
+    with pytest.raises(UnsupportedError, match="MonteCarloBarostat"):
+        part.check(context)
+
+
+def test_rows_in_space_are_refused_beside_a_motion_remover():
+    system = chain_system()
+    system.addForce(openmm.CMMotionRemover())
+    force = openmm.CustomExternalForce("x")
+    force.addParticle(2)
+    part = CollectiveRows(system, [force], positions=CHAIN)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
+    context = context_of(system, integrator, CHAIN, np.zeros((6, 3)))
+    with pytest.raises(UnsupportedError, match="CMMotionRemover"):
+        part.check(context)
+
+
+def test_a_context_of_another_system_is_refused():
+    _, _, part = held_chain([bond(0, 3)])
+    other = chain_system()
+    context = context_of(other, openmm.VerletIntegrator(0.001), CHAIN, some_velocities())
+    with pytest.raises(InputError, match="no part of this System"):
+        part.check(context)
