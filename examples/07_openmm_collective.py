@@ -23,8 +23,7 @@ from openmm import app, unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.collective import CollectiveRows
+from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 

@@ -5,7 +5,22 @@ collective variables, surfaces and the constraint objects of kcons.
 """
 
 from kcons.openmm.carrier import CarriedConstraints
+from kcons.openmm.collective import CollectiveRows
+from kcons.openmm.implicit_rows import ExpressionSurface
 from kcons.openmm.projected import ProjectedIntegrator
+from kcons.openmm.row_forces import Row, each_term
+from kcons.openmm.surface import SurfaceIntegrator, surface_parts
 from kcons.openmm.transfer import hold, take_constraints
 
-__all__ = ["CarriedConstraints", "ProjectedIntegrator", "hold", "take_constraints"]
+__all__ = [
+    "CarriedConstraints",
+    "CollectiveRows",
+    "ExpressionSurface",
+    "ProjectedIntegrator",
+    "Row",
+    "SurfaceIntegrator",
+    "each_term",
+    "hold",
+    "surface_parts",
+    "take_constraints",
+]

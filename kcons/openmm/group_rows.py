@@ -23,6 +23,7 @@ class GroupRows:
 
     evaluates = True
     stays_finite = True
+    solves_alone = True
     code = 1
     meets_system: bool
     groups: frozenset[int]

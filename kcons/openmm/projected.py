@@ -61,6 +61,9 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
     """
 
+    #: What writes the program.
+    _writer: type[StepWriter] = StepWriter
+
     def __init__(
         self,
         timestep: unit.Quantity | float,
@@ -90,7 +93,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if self.row_groups:
             self.setIntegrationForceGroups(-1)
         self.program = Program(self)
-        self._plan = StepWriter(self.program, self.scheme, self.parts, self.ensemble)
+        self._plan = self._writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
 
     def __repr__(self) -> str:

@@ -1,0 +1,122 @@
+"""Particles on surfaces of every kind in a smooth potential, for OpenMM and for kcons' own steppers."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
+from kcons.motion import Motion
+from kcons.openmm.implicit_rows import ExpressionSurface
+from kcons.openmm.surface import SurfaceIntegrator
+from kcons.steppers import State
+from kcons.steppers import System as CoreSystem
+
+PLATFORMS = ("Reference", "CPU")
+#: Neither a multiple of the identity nor along an axis.
+TURN = np.linalg.qr(np.array([[1.0, 0.4, -0.3], [0.2, 1.0, 0.5], [-0.6, 0.1, 1.0]]))[0]
+CENTER = np.array([0.3, -0.2, 0.5])
+FORMULA = "b*x^2 + y^2 + 2*z^2 + 0.3*x*y*z - 1; b = 1.5"
+
+
+def _formula(atoms, x):
+    # Each particle on a level of its own.
+    level = 1.5 * x[:, 0] ** 2 + x[:, 1] ** 2 + 2 * x[:, 2] ** 2 + 0.3 * x.prod(axis=1)
+    return ExpressionSurface(atoms, "b*x^2 + y^2 + 2*z^2 + 0.3*x*y*z - level; b = 1.5", {"level": level}, length=0.5)
+
+
+KINDS = {
+    "sphere": lambda atoms, x: Sphere(atoms, CENTER),
+    "cylinder": lambda atoms, x: Cylinder(atoms, CENTER, [0, 0, 1]),
+    "tilted cylinder": lambda atoms, x: Cylinder(atoms, CENTER, [1, -2, 2]),
+    "plane": lambda atoms, x: Plane(atoms, [2, 1, -1]),
+    "ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], target=None),
+    "rotated ellipsoid": lambda atoms, x: Ellipsoid(atoms, CENTER, [0.9, 1.2, 1.6], TURN, target=None),
+    "torus": lambda atoms, x: Torus(atoms, CENTER, TURN[0], 1.2),
+    "formula": _formula,
+}
+QUADRICS = [kind for kind in KINDS if kind not in ("torus", "formula")]
+
+MASSES = np.array([1.0, 2.5, 40.0])
+POSITIONS = np.array([[1.2, 0.3, 0.8], [-0.5, 0.7, 0.1], [0.6, -1.0, 1.3]])
+VELOCITIES = np.array([[0.4, 0.9, -0.2], [-0.3, 0.5, 0.8], [0.1, -0.2, 0.15]])
+POTENTIAL = "0.8*x + 0.5*y^2 + 0.7*x*z + 0.1*z^4"
+
+
+def force_of(x, t=0.0):
+    """Minus the gradient of POTENTIAL and of springs of strength 0.3 between all pairs."""
+    X, Y, Z = x.T
+    f = -np.stack([0.8 + 0.7 * Z, Y, 0.7 * X + 0.4 * Z**3], axis=1)
+    return f - 0.3 * (len(x) * x - x.sum(axis=0))
+
+
+def system_of(masses=MASSES, potential=POTENTIAL, springs=0.3):
+    system = openmm.System()
+    field = openmm.CustomExternalForce(potential)
+    bonds = openmm.CustomBondForce(f"0.5*{springs}*r^2")
+    for k, mass in enumerate(masses):
+        system.addParticle(mass)
+        field.addParticle(k)
+        for j in range(k):
+            bonds.addBond(j, k)
+    system.addForce(field)
+    if springs:
+        system.addForce(bonds)
+    return system
+
+
+def started(system, integrator, x, v, platform="Reference"):
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+    context.setPositions(x)
+    context.setVelocities(v)
+    integrator.apply_velocities(context)
+    return context
+
+
+def on_surface(kind, scheme, dt, platform="Reference", *, atoms=(0, 1, 2), **arguments):
+    """Integrator and context of the three particles, those of `atoms` on surfaces of one kind."""
+    atoms = np.array(atoms)
+    system = system_of()
+    integrator = SurfaceIntegrator(
+        dt, scheme, surfaces=KINDS[kind](atoms, POSITIONS[atoms]), system=system, positions=POSITIONS, **arguments
+    )
+    return integrator, started(system, integrator, POSITIONS, VELOCITIES, platform)
+
+
+def state_of(context):
+    state = context.getState(positions=True, velocities=True)
+    x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+    v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
+    return np.array(x), np.array(v)
+
+
+def energy_of(context, integrator):
+    """kJ/mol, without the energies that carry surfaces."""
+    state = context.getState(energy=True, groups=set(range(32)) - integrator.row_groups)
+    return (state.getPotentialEnergy() + state.getKineticEnergy()).value_in_unit(unit.kilojoule_per_mole)
+
+
+def worst(integrator, context):
+    """Largest distance from a surface (nm), and velocity across one relative to the speed."""
+    x, v = state_of(context)
+    off = max(np.abs(part.distances(x)).max() for part in integrator.surfaces)
+    across = max(
+        (np.abs(np.einsum("ij,ij->i", part.normals(x), v[part.atoms])) / np.linalg.norm(v[part.atoms], axis=1)).max()
+        for part in integrator.surfaces
+    )
+    return off, across
+
+
+def core_run(kind, stepper, dt, steps, atoms=(0, 1, 2)):
+    """The same motion by kcons' own steppers: positions and velocities."""
+    atoms = np.array(atoms)
+    rows = KINDS[kind](atoms, POSITIONS[atoms])
+    rows = rows.rows() if isinstance(rows, ExpressionSurface) else rows
+    motion = Motion(ConstraintSet(rows, POSITIONS, MASSES), POSITIONS)
+    system = CoreSystem(motion, force_of)
+    state: State = system.initial_state(POSITIONS, VELOCITIES, project=True)
+    for _ in range(steps):
+        state = stepper.step(system, state, dt)
+    return state.positions, state.velocities

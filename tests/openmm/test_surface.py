@@ -1,0 +1,365 @@
+"""SurfaceIntegrator: what it takes and refuses, checks, errors, multipliers, copies."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from surface_cases import (
+    CENTER,
+    KINDS,
+    MASSES,
+    PLATFORMS,
+    POSITIONS,
+    VELOCITIES,
+    force_of,
+    on_surface,
+    started,
+    state_of,
+    system_of,
+    worst,
+)
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Cylinder, Distance, Ellipsoid, Line, MovingTarget, Plane, Sphere, Torus
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.motion import Motion
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.implicit_rows import ExpressionSurface
+from kcons.openmm.surface import SurfaceIntegrator, surface_parts
+
+# -- what is refused --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "error", "words"),
+    [
+        ([], InputError, "no surface"),
+        (Sphere([7], [0, 0, 0], 1.0), InputError, "particles 7 to 7"),
+        (Sphere([0], [0, 0, 0]), InputError, "positions="),
+        (Sphere([0], [0, 0, 0], -1.0), InputError, "not positive"),
+        (Torus([0], [0, 0, 0], [0, 0, 1], 1.0, 0.0), InputError, "not positive"),
+        (Ellipsoid([0], [0, 0, 0], [1, 1, 1], target=-2.0), InputError, "not positive"),
+        ([Sphere([0], [0, 0, 0], 1.0), Plane([0], [0, 0, 1], 0.0)], UnsupportedError, "particle 0 is on two"),
+        (Sphere([0], [0, 0, 0], lambda t: 1 + t), UnsupportedError, "moves with time"),
+        (Sphere([0], [0, 0, 0], MovingTarget(lambda t: 1.0)), UnsupportedError, "moves with time"),
+        (Line([0], [0, 0, 0], [0, 0, 1]), UnsupportedError, "carrier"),
+        (Distance([0, 1], 1.0), UnsupportedError, "carrier"),
+        (ExpressionSurface([0], "x+"), InputError, "cannot read"),
+        (ExpressionSurface([0], "x-q"), InputError, "cannot read"),
+    ],
+)
+def test_refused(surfaces, error, words):
+    system = system_of()
+    forces = system.getNumForces()
+    with pytest.raises(error, match=words):
+        SurfaceIntegrator(0.001, surfaces=surfaces, system=system)
+    assert system.getNumForces() == forces
+
+
+def test_refused_parameters_of_a_formula():
+    for values in ([1.0, 2.0], np.nan):
+        with pytest.raises(InputError, match="one finite number"):
+            ExpressionSurface([0], "x-a", {"a": values})
+
+
+def test_needs_the_number_of_particles_and_for_formulas_the_system():
+    with pytest.raises(InputError, match="number of its particles"):
+        SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0))
+    with pytest.raises(InputError, match="system="):
+        SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), n_particles=3)
+    with pytest.raises(InputError, match="system="):
+        SurfaceIntegrator(0.001, surfaces=Sphere([0], [0, 0, 0], 1.0), n_particles=3, compiled=True)
+    with pytest.raises(UnsupportedError, match="alone"):
+        SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), system=system_of(), compiled=True)
+
+
+def bonded(system):
+    system.addConstraint(1, 0, 1.0)
+
+
+def barostat(system):
+    forces = openmm.NonbondedForce()
+    for _ in range(3):
+        forces.addParticle(0, 0.1, 0)
+    forces.setNonbondedMethod(forces.CutoffPeriodic)
+    forces.setCutoffDistance(0.9)
+    system.addForce(forces)
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0))
+
+
+def centre_remover(system):
+    system.addForce(openmm.CMMotionRemover())
+
+
+def massless(system):
+    system.setParticleMass(0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (bonded, r"particle 0 is on a surface and in the System's constraint \(1, 0\)"),
+        (barostat, "MonteCarloBarostat"),
+        (centre_remover, "CMMotionRemover"),
+        (massless, "particle 0 has no mass"),
+    ],
+)
+def test_systems_that_surfaces_do_not_go_with(spoil, words):
+    surface = Sphere([0], [0, 0, 0], np.linalg.norm(POSITIONS[0]))
+    system = system_of()
+    spoil(system)
+    with pytest.raises(UnsupportedError, match=words):
+        SurfaceIntegrator(0.001, surfaces=surface, system=system)
+    # Also where the System was not given.
+    integrator = SurfaceIntegrator(0.001, surfaces=surface, n_particles=3)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(POSITIONS)
+    with pytest.raises(UnsupportedError, match=words):
+        integrator.surfaces[0].check(context)
+
+
+def test_no_force_groups_left():
+    system = system_of()
+    for group in range(32):
+        force = openmm.CustomExternalForce("0")
+        force.setForceGroup(group)
+        system.addForce(force)
+    with pytest.raises(UnsupportedError, match="force groups"):
+        SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), system=system)
+
+
+def test_leaves_room_for_the_groups_of_the_user():
+    system = system_of()
+    system.getForce(0).setForceGroup(31)
+    integrator = SurfaceIntegrator(0.001, surfaces=ExpressionSurface([0], "x"), system=system)
+    assert integrator.row_groups == {29, 30}
+    assert integrator.getIntegrationForceGroups() & 0xFFFFFFFF == 0xFFFFFFFF ^ (1 << 30 | 1 << 29)
+
+
+# -- the start --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_positions_and_velocities_are_checked_and_can_be_put_right(kind):
+    integrator, context = on_surface(kind, "rattle", 0.01)
+    integrator.check(context)
+    context.setPositions(POSITIONS + np.array([[0, 0, 0], [0.05, 0.02, -0.03], [0, 0, 0]]))
+    with pytest.raises(InputError, match=r"particle 1 is .* nm from its surface") as caught:
+        integrator.check(context)
+    assert caught.value.atoms == (1,)
+    integrator.apply_positions(context)
+    context.setVelocities(VELOCITIES)
+    assert worst(integrator, context)[0] <= 1e-13
+    with pytest.raises(InputError, match="across its surface"):
+        integrator.check(context)
+    integrator.apply_velocities(context)
+    integrator.check(context)
+    assert worst(integrator, context)[1] <= 1e-14
+    integrator.step(3)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus", "formula", "rotated ellipsoid"])
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4"])
+def test_constraints_applied_by_the_program_itself(kind, scheme):
+    integrator, context = on_surface(kind, scheme, 0.01)
+    context.setPositions(POSITIONS + np.array([[0, 0, 0], [0.005, 0.002, -0.003], [0, 0, 0]]))
+    context.setVelocities(VELOCITIES)
+    integrator.applyConstraints(context)
+    integrator.applyVelocityConstraints(context)
+    off, across = worst(integrator, context)
+    assert off <= 1e-13
+    assert across <= 1e-14
+    integrator.check(context)
+
+
+def test_open_targets_are_those_of_the_start():
+    held = [Sphere([0], CENTER), Plane([2], [0, 0, 1]), Torus([1], CENTER, [0, 0, 1], 2.0)]
+    quantity = unit.Quantity(POSITIONS * 10, unit.angstrom)
+    parts = surface_parts(held, n_particles=3, positions=quantity)
+    assert max(np.abs(part.distances(POSITIONS)).max() for part in parts) <= 1e-14
+
+
+# -- failures ---------------------------------------------------------------------------------------
+
+
+def too_fast(scheme, platform, compiled=False, kind="sphere"):
+    """Particle 2 flies past its surface within a step; the others do not."""
+    system = system_of(potential="0", springs=0)
+    surfaces = {
+        "sphere": [Sphere([0, 2], [0, 0, 0], 1.0)],
+        "torus": [Torus([0, 2], [0, 0, 0], [0, 0, 1], 0.7, 0.3)],
+        "formula": [ExpressionSurface([0, 2], "x^2+y^2+z^2-1")],
+        "both": [Sphere([0], [0, 0, 0], 1.0), Torus([2], [0, 0, 0], [0, 0, 1], 0.7, 0.3)],
+    }[kind]
+    integrator = SurfaceIntegrator(0.1, scheme, surfaces=surfaces, system=system, compiled=compiled)
+    x = np.array([[1.0, 0, 0], [5, 5, 5], [0, 1.0, 0]])
+    return integrator, started(system, integrator, x, [[0, 0.5, 0], [1, 2, 3], [0, 0, 0.8]], platform)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize(
+    ("scheme", "kind", "compiled"),
+    [
+        ("rattle", "sphere", False),
+        ("rattle", "sphere", True),
+        ("suzuki4", "sphere", False),
+        ("suzuki4", "sphere", True),
+        ("rattle", "torus", False),
+        ("suzuki4", "torus", False),
+        ("rattle", "formula", False),
+        ("suzuki4", "formula", False),
+        ("suzuki4", "both", False),
+    ],
+)
+def test_a_step_without_solution_is_taken_back(scheme, kind, compiled, platform):
+    integrator, context = too_fast(scheme, platform, compiled, kind)
+    integrator.step(3)
+    x, v = state_of(context)
+    v[2] *= 40
+    context.setVelocities(v)
+    with pytest.raises(ConvergenceError, match=r"step 4: particle 2 finds no position .*time step too large") as caught:
+        integrator.step(5)
+    assert caught.value.atoms == (2,)
+    assert caught.value.step == 4
+    there, velocity = state_of(context)
+    assert np.array_equal(there, x)
+    assert np.abs(velocity - v).max() <= 1e-14
+    assert context.getStepCount() == 3
+    assert context.getTime()._value == pytest.approx(0.3)
+    v[2] /= 40
+    context.setVelocities(v)
+    integrator.step(5)
+    assert max(worst(integrator, context)) <= 1e-13
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "rotated ellipsoid", "torus", "formula"])
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4"])
+def test_forces_that_are_not_finite(kind, scheme):
+    atoms = np.array([0, 1, 2])
+    # The root of a negative number once particle 1 has moved.
+    system = system_of(potential="1e-30*sqrt(10+y-1e6*step(0.9-x)*step(y-0.72))", springs=0)
+    surfaces = KINDS[kind](atoms, POSITIONS)
+    integrator = SurfaceIntegrator(0.05, scheme, surfaces=surfaces, system=system, positions=POSITIONS)
+    context = started(system, integrator, POSITIONS, VELOCITIES)
+    with pytest.raises(NonFiniteError) as caught:
+        integrator.step(200)
+    assert caught.value.step is not None
+    x, v = state_of(context)
+    assert np.isfinite(x).all()
+    assert np.isfinite(v).all()
+
+
+# -- multipliers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_constraint_forces(kind, compiled):
+    if compiled and kind in ("torus", "formula"):
+        compiled = False
+    integrator, context = on_surface(kind, "rattle", 0.01, compiled=compiled)
+    integrator.step(10)
+    x, v = state_of(context)
+    rows = [item for part in integrator.surfaces for item in part.rows]
+    motion = Motion(ConstraintSet(rows, x, MASSES), x)
+    expected = motion.constraint_force(x, v, force_of(x))
+    assert integrator.constraint_forces(context) == pytest.approx(expected, abs=1e-11)
+    assert integrator.multipliers(context) == pytest.approx(motion.multipliers(x, v, force_of(x)), abs=1e-11)
+    assert integrator.rank(context) == 3
+    assert integrator.degrees_of_freedom(context) == 6
+
+
+def test_centripetal_force():
+    system = system_of(potential="0", springs=0)
+    integrator = SurfaceIntegrator(0.01, surfaces=Sphere([1], [0, 0, 0], 2.0), system=system)
+    context = started(system, integrator, [[9, 9, 9], [2, 0, 0], [8, 8, 8]], [[1, 1, 1], [0, 3, 0], [0, 0, 0]])
+    forces = integrator.constraint_forces(context)
+    assert forces[1] == pytest.approx([-MASSES[1] * 9 / 2, 0, 0], abs=1e-13)
+    assert not forces[[0, 2]].any()
+    assert integrator.multipliers(context) == pytest.approx([-MASSES[1] * 9 / 2])
+    assert integrator.surface_atoms.tolist() == [1]
+
+
+# -- a citizen of OpenMM ----------------------------------------------------------------------------
+
+
+def test_parts_in_a_projected_integrator():
+    """The general program holds surfaces as well; velocities are those of differences there."""
+    for kind in ("rotated ellipsoid", "cylinder", "torus", "formula"):
+        atoms = np.arange(3)
+        system = system_of()
+        parts = surface_parts(KINDS[kind](atoms, POSITIONS), system=system, positions=POSITIONS)
+        integrator = ProjectedIntegrator(0.01, "suzuki4", parts=parts)
+        context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions(POSITIONS)
+        context.setVelocities(VELOCITIES)
+        integrator.applyVelocityConstraints(context)
+        integrator.step(50)
+        other, other_context = on_surface(kind, "suzuki4", 0.01)
+        other.step(50)
+        assert np.abs(state_of(context)[0] - state_of(other_context)[0]).max() <= 1e-12
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus", "formula", "compiled"])
+def test_copies_and_pickles(kind):
+    compiled = kind == "compiled"
+    integrator, context = on_surface("sphere" if compiled else kind, "rattle", 0.01, compiled=compiled)
+    others = [pickle.loads(pickle.dumps(integrator)), copy.deepcopy(integrator)]
+    xml = openmm.XmlSerializer.serialize(integrator)
+    others.append(SurfaceIntegrator.from_xml(xml, parts=integrator.parts))
+    system = pickle.loads(pickle.dumps(context.getSystem()))
+    integrator.step(20)
+    for other in others:
+        assert isinstance(other, SurfaceIntegrator)
+        there = started(system, other, POSITIONS, VELOCITIES)
+        other.step(20)
+        assert np.array_equal(state_of(there)[0], state_of(context)[0])
+
+
+def test_in_a_simulation(tmp_path):
+    system = system_of()
+    integrator = SurfaceIntegrator(
+        2 * unit.femtoseconds, surfaces=Sphere([0, 1], CENTER), system=system, positions=POSITIONS
+    )
+    topology = app.Topology()
+    chain = topology.addChain()
+    for _ in range(3):
+        topology.addAtom("A", None, topology.addResidue("A", chain))
+    simulation = app.Simulation(topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(POSITIONS)
+    integrator.setVelocitiesToTemperature(simulation.context, 300 * unit.kelvin, 7)
+    log = tmp_path / "log"
+    simulation.reporters.append(app.StateDataReporter(str(log), 5, step=True, temperature=True, totalEnergy=True))
+    simulation.step(20)
+    assert max(worst(integrator, simulation.context)) <= 1e-14
+    table = np.loadtxt(log, delimiter=",")
+    v = state_of(simulation.context)[1]
+    kinetic = 0.5 * MASSES @ (v**2).sum(axis=1)
+    assert table[-1, 2] == pytest.approx(2 * kinetic / (7 * 8.31446261815324e-3), rel=1e-9)
+
+
+def test_listing_tells_the_steps():
+    for kind, words in (("sphere", "a landing exists"), ("torus", "Newton step"), ("formula", "Newton's method")):
+        integrator, _ = on_surface(kind, "rattle", 0.01)
+        assert words in integrator.listing()
+        assert str(integrator).endswith(integrator.listing())
+
+
+def test_periodic_boxes_do_not_repeat_surfaces():
+    system = system_of(potential="0", springs=0)
+    system.setDefaultPeriodicBoxVectors([2, 0, 0], [0, 2, 0], [0, 0, 2])
+    bonds = openmm.CustomBondForce("0")
+    bonds.setUsesPeriodicBoundaryConditions(True)
+    system.addForce(bonds)
+    integrator = SurfaceIntegrator(0.1, surfaces=Cylinder([0], [0, 0, 0], [0, 0, 1], 0.5), system=system)
+    context = started(system, integrator, [[0.5, 0, 0], [1, 1, 1], [1, 0, 1]], [[0, 0, 1], [0, 0, 0], [0, 0, 0]])
+    integrator.step(30)
+    assert state_of(context)[0][0] == pytest.approx([0.5, 0, 3.0], abs=1e-12)
+    context.setPositions([[2.5, 0, 0], [1, 1, 1], [1, 0, 1]])
+    with pytest.raises(InputError, match="not repeated in periodic boxes"):
+        integrator.check(context)

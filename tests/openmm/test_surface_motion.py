@@ -1,0 +1,360 @@
+"""Motion on surfaces: on them to rounding, reversible, of the order of the scheme, equal to independent solutions."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import openmm
+import pytest
+from reference import cases
+from surface_cases import (
+    FORMULA,
+    KINDS,
+    PLATFORMS,
+    POSITIONS,
+    QUADRICS,
+    core_run,
+    energy_of,
+    on_surface,
+    started,
+    state_of,
+    system_of,
+    worst,
+)
+
+from kcons.constraints import Ellipsoid, Plane, Sphere, Torus
+from kcons.openmm.implicit_rows import ExpressionSurface
+from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.surface import SurfaceIntegrator
+
+#: Order, and numbers of steps in TIME where the leading error rules and rounding does not.
+ORDERS = {
+    "rattle": (2, (24, 32, 48)),
+    "geodesic": (2, (24, 32, 48)),
+    "suzuki4": (4, (24, 32, 48)),
+    "yoshida4": (4, (32, 48, 64)),
+    "kahan-li6": (6, (24, 32, 48)),
+    "blanes-moan4": (4, (24, 32, 48)),
+    "blanes-moan6": (6, (12, 16, 24)),
+    "blanes-moan6a": (6, (12, 16, 20)),
+}
+TIME = 2.0
+assert set(ORDERS) == set(SCHEMES)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "blanes-moan6a"])
+def test_on_the_surface_and_along_it(kind, scheme, platform):
+    integrator, context = on_surface(kind, scheme, 0.02, platform)
+    for _ in range(3):
+        integrator.step(20)
+        off, across = worst(integrator, context)
+        assert off <= 1e-14
+        assert across <= 1e-14
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4", "blanes-moan6a"])
+def test_reversible(kind, scheme):
+    integrator, context = on_surface(kind, scheme, 0.02, atoms=(0, 2))
+    x0, v0 = state_of(context)
+    integrator.step(60)
+    context.setVelocities(-state_of(context)[1])
+    integrator.step(60)
+    x, v = state_of(context)
+    assert np.abs(x - x0).max() <= 1e-12
+    assert np.abs(v + v0).max() <= 1e-12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "blanes-moan6a"])
+def test_the_steps_are_those_of_the_core(kind, scheme):
+    integrator, context = on_surface(kind, scheme, 0.04, atoms=(0, 2))
+    integrator.step(20)
+    x, v = state_of(context)
+    x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, 20, atoms=(0, 2))
+    assert np.abs(x - x_core).max() <= 1e-12
+    assert np.abs(v - v_core).max() <= 1e-12
+
+
+@cache
+def solution(kind):
+    # Far finer than what it is compared with; that the steps are right is tested above.
+    integrator, context = on_surface(kind, "blanes-moan6", TIME / 96)
+    integrator.step(96)
+    return state_of(context)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "rotated ellipsoid", "cylinder", "torus", "formula"])
+@pytest.mark.parametrize("scheme", ORDERS)
+def test_observed_order(kind, scheme):
+    order, numbers = ORDERS[scheme]
+    x, v = solution(kind)
+    errors = []
+    for steps in numbers:
+        integrator, context = on_surface(kind, scheme, TIME / steps)
+        integrator.step(steps)
+        there, velocity = state_of(context)
+        errors.append(max(np.abs(there - x).max(), np.abs(velocity - v).max()))
+    slope = -np.polyfit(np.log(numbers), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize("kind", QUADRICS)
+@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
+def test_compiled_landing_is_the_same(kind, scheme):
+    pair = [on_surface(kind, scheme, 0.02, atoms=(2, 0), compiled=compiled) for compiled in (False, True)]
+    for integrator, _ in pair:
+        integrator.step(50)
+    (x, v), (x2, v2) = (state_of(context) for _, context in pair)
+    assert np.abs(x - x2).max() <= 1e-13
+    assert np.abs(v - v2).max() <= 1e-13
+    assert max(worst(*pair[1])) <= 1e-14
+
+
+def test_several_steps_at_once_are_the_same_as_one_by_one():
+    together, alone = (on_surface("sphere", "rattle", 0.02) for _ in range(2))
+    together[0].step(40)
+    for _ in range(40):
+        alone[0].step(1)
+    for a, b in zip(state_of(together[1]), state_of(alone[1]), strict=True):
+        assert np.abs(a - b).max() <= 1e-14
+
+
+# -- reference solutions ----------------------------------------------------------------------------
+
+
+def reference_context(name, scheme, dt):
+    case = cases.load(name)
+    system = openmm.System()
+    field = openmm.CustomExternalForce("fx*x+fy*y+fz*z")
+    for axis in "xyz":
+        field.addPerParticleParameter(f"f{axis}")
+    for k, mass in enumerate(case.masses):
+        system.addParticle(mass)
+        field.addParticle(k, (-case.force(case.initial.positions, case.initial.velocities)[k]).tolist())
+    system.addForce(field)
+    integrator = SurfaceIntegrator(dt, scheme, surfaces=case.constraints, system=system)
+    start = case.initial
+    return case, integrator, started(system, integrator, start.positions, start.velocities)
+
+
+@pytest.mark.parametrize(
+    ("name", "dt", "allowed"),
+    [
+        ("A01_sphere_free", 1 / 64, 2e-13),
+        ("A02_spherical_pendulum_generic", 1 / 256, 1e-11),
+        ("A02_spherical_pendulum_near_conical", 1 / 256, 1e-11),
+        ("A02_spherical_pendulum_near_top_Lz", 1 / 256, 1e-10),
+        ("A03_planar_pendulum_150deg", 1 / 256, 1e-10),
+        ("A08_torus_geodesic", 1 / 128, 1e-10),
+        ("A08_torus_inner_equator", 1 / 128, 1e-10),
+    ],
+)
+def test_reference_solution(name, dt, allowed):
+    scheme = "geodesic" if "free" in name else "blanes-moan6"
+    case, integrator, context = reference_context(name, scheme, dt)
+    for there in [s for s in case.solution if (s.time / dt).is_integer()][:2]:
+        integrator.step(round(there.time / dt) - context.getStepCount())
+        x, v = state_of(context)
+        assert np.abs(x - there.positions).max() <= max(allowed, there.tolerance)
+        assert np.abs(v - there.velocities).max() <= 10 * max(allowed, there.tolerance)
+    assert context.getStepCount() > 0
+
+
+@pytest.mark.parametrize("name", ["A02_spherical_pendulum_generic", "A08_torus_geodesic"])
+def test_constraint_force_of_the_reference(name):
+    case, integrator, context = reference_context(name, "rattle", 0.01)
+    for there in case.solution:
+        context.setPositions(there.positions)
+        context.setVelocities(there.velocities)
+        assert integrator.constraint_forces(context) == pytest.approx(there.constraint_forces, abs=1e-11)
+
+
+# -- closed forms -----------------------------------------------------------------------------------
+
+
+def free_on_sphere(scheme, dt, radius=2.0, center=(0.0, 0.0, 0.0), speed=1.0, platform="Reference", **arguments):
+    """One particle without forces; turns by speed/radius in the xy plane."""
+    system = openmm.System()
+    system.addParticle(3.0)
+    integrator = SurfaceIntegrator(dt, scheme, surfaces=Sphere([0], center, radius), system=system, **arguments)
+    start = np.array([[radius, 0.0, 0.0]]) + center
+    return integrator, started(system, integrator, start, [[0.0, speed, 0.0]], platform)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_rattle_turns_by_asin(platform, compiled):
+    for speed in (0.1, 1.0, 1.9, 1.999):
+        integrator, context = free_on_sphere("rattle", 1.0, speed=speed, platform=platform, compiled=compiled)
+        integrator.step(50)
+        angle = 50 * np.arcsin(speed / 2)
+        x, v = state_of(context)
+        assert x == pytest.approx(2 * np.array([[np.cos(angle), np.sin(angle), 0]]), abs=1e-11)
+        assert v == pytest.approx(speed * np.array([[-np.sin(angle), np.cos(angle), 0]]), abs=1e-11)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_geodesic_flies_great_circles_at_any_time_step(platform):
+    for dt in (0.1, 3.0, 50.0):
+        integrator, context = free_on_sphere("geodesic", dt, platform=platform)
+        integrator.step(40)
+        angle = 40 * dt / 2
+        x, v = state_of(context)
+        assert x == pytest.approx(2 * np.array([[np.cos(angle), np.sin(angle), 0]]), abs=2e-16 * 40 * angle + 1e-14)
+        assert np.linalg.norm(v) == pytest.approx(1.0, abs=1e-13)
+
+
+def test_great_circles_leave_resting_and_free_particles_alone():
+    system = system_of(potential="0", springs=0)
+    integrator = SurfaceIntegrator(0.1, "geodesic", surfaces=Sphere([0, 1], [0, 0, 0], 1.0), system=system)
+    x = np.array([[1.0, 0, 0], [0, 1.0, 0], [5.0, 0, 0]])
+    context = started(system, integrator, x, [[0, 0, 0], [0, 0, 0.5], [0.1, 0.2, 0.3]])
+    integrator.step(10)
+    there, v = state_of(context)
+    assert there[0] == pytest.approx([1, 0, 0], abs=1e-15)
+    assert there[1] == pytest.approx([0, np.cos(0.5), np.sin(0.5)], abs=1e-14)
+    assert there[2] == pytest.approx([5.1, 0.2, 0.3], abs=1e-14)
+    assert v[2] == pytest.approx([0.1, 0.2, 0.3], abs=1e-15)
+
+
+def test_plane_and_cylinder_need_no_constraint_in_free_flight():
+    integrator, context = on_surface("cylinder", "rattle", 0.01)
+    free = system_of(potential="0", springs=0)
+    held = KINDS["cylinder"](np.arange(3), POSITIONS)
+    integrator = SurfaceIntegrator(0.01, "suzuki4", surfaces=held, system=free, positions=POSITIONS)
+    context = started(free, integrator, POSITIONS, [[0, 0, 0.7]] * 3)
+    integrator.step(100)
+    assert state_of(context)[0] == pytest.approx(POSITIONS + np.array([0, 0, 0.7]), abs=1e-13)
+
+
+@pytest.mark.parametrize("radius", [1e-4, 1e4])
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "suzuki4"])
+def test_small_and_large_radii(radius, scheme):
+    integrator, context = free_on_sphere(scheme, 0.01, radius=radius, speed=radius)
+    integrator.step(100)
+    off, across = worst(integrator, context)
+    assert off <= 1e-14 * radius
+    assert across <= 1e-14
+    angle = 100 * (np.arcsin(0.01) if scheme == "rattle" else 0.01)
+    x, _ = state_of(context)
+    assert np.arctan2(x[0, 1], x[0, 0]) == pytest.approx(angle, abs=1e-13 if scheme != "suzuki4" else 1e-8)
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
+@pytest.mark.parametrize("far", [1e3, 1e6])
+def test_far_from_the_origin(far, scheme):
+    integrator, context = free_on_sphere(scheme, 0.05, center=(far, -far, far))
+    integrator.step(200)
+    x, v = state_of(context)
+    # As near as numbers of this size come; the velocity does not suffer.
+    assert abs(np.linalg.norm(x - [far, -far, far]) - 2) <= 4 * np.spacing(far)
+    assert abs(np.linalg.norm(v) - 1) <= 1e-12 + 200 * np.spacing(far)
+
+
+# -- energies ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus"])
+def test_energy_has_no_slope(kind):
+    integrator, context = on_surface(kind, "rattle", 0.01)
+    energies = []
+    for _ in range(400):
+        integrator.step(20)
+        energies.append(energy_of(context, integrator))
+    times = 0.2 * np.arange(len(energies))
+    slope = np.polyfit(times, energies, 1)[0]
+    spread = np.std(energies)
+    assert spread <= 1e-3
+    # Consistent with none: the error of a slope fitted to numbers that scatter like this.
+    assert abs(slope) <= 5 * spread / np.std(times) / np.sqrt(40)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_lennard_jones_particles_on_one_sphere(platform, compiled):
+    n = 60
+    k = np.arange(n) + 0.5
+    height, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    directions = np.stack(
+        [np.cos(turn) * np.sqrt(1 - height**2), np.sin(turn) * np.sqrt(1 - height**2), height], axis=1
+    )
+    radius = np.sqrt(n * 0.42**2 / (4 * np.pi))
+    system, forces = openmm.System(), openmm.NonbondedForce()
+    for _ in range(n):
+        system.addParticle(39.948)
+        forces.addParticle(0, 0.34, 0.996)
+    system.addForce(forces)
+    center = np.array([1.0, 2.0, 3.0])
+    sphere = Sphere(np.arange(n), center, radius)
+    integrator = SurfaceIntegrator(0.005, surfaces=sphere, system=system, compiled=compiled)
+    context = started(
+        system, integrator, center + radius * directions, np.random.default_rng(5).normal(size=(n, 3)) * 0.15, platform
+    )
+    before = energy_of(context, integrator)
+    integrator.step(500)
+    assert max(worst(integrator, context)) <= 1e-14
+    kinetic = context.getState(energy=True).getKineticEnergy()._value
+    assert abs(energy_of(context, integrator) - before) <= 2e-3 * kinetic
+    assert integrator.degrees_of_freedom(context) == 2 * n
+
+
+# -- company ----------------------------------------------------------------------------------------
+
+
+def test_surfaces_free_particles_and_bonds_do_not_disturb_each_other():
+    """All in one System, and each kind alone: the same motion."""
+    dt, steps = 0.01, 100
+    x = np.array([[1.2, 0, 0], [0, 2.5, 0], [1, 1, 1], [0.5, 0, 0], [3, 3, 3], [5, 0, 0], [5, 1, 0], [0, 0, 0.5]])
+    v = np.array([[0, 1, 0.5], [1, 0, 1], [1, -1, 0], [0, 0.3, 1], [1, 2, 3], [0, 0, 1], [0, 0, -1], [0.3, 0.7, 0]])
+    surfaces = {
+        0: Sphere([0], [0, 0, 0], 1.2),
+        1: Torus([1], [0, 0, 0], [0, 0, 1], 2.0, 0.5),
+        2: Plane([2], [0, 0, 1], 1.0),
+        3: ExpressionSurface([3], "4*x^2+y^2+z^2-1"),
+        7: Ellipsoid([7], [0, 0, 0], [0.3, 0.4, 0.5]),
+    }
+    masses = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+
+    def run(held, scheme):
+        system = system_of(masses, potential="0.5*(x^2+y*z)", springs=0)
+        system.addConstraint(5, 6, 1.0)
+        integrator = SurfaceIntegrator(dt, scheme, surfaces=[surfaces[k] for k in held], system=system)
+        context = started(system, integrator, x, v)
+        integrator.step(steps)
+        assert max(worst(integrator, context)) <= 1e-13
+        there, velocity = state_of(context)
+        assert abs(np.linalg.norm(there[5] - there[6]) - 1) <= 1e-10
+        assert abs((there[5] - there[6]) @ (velocity[5] - velocity[6])) <= 1e-9
+        return there
+
+    for scheme in ("rattle", "suzuki4"):
+        together = run(surfaces, scheme)
+        for k in surfaces:
+            alone = run([k], scheme)
+            assert np.abs(together[[k, 4]] - alone[[k, 4]]).max() <= 1e-13
+            assert np.abs(together[5:7] - alone[5:7]).max() <= 1e-9
+
+
+def test_leapfrog():
+    integrator, context = on_surface("sphere", "leapfrog", 0.01)
+    integrator.step(100)
+    off, _ = worst(integrator, context)
+    assert off <= 1e-14
+
+
+def test_formula_with_intermediate_values_and_parameters():
+    x = np.array([[0.8164965809277261, 0, 0], [0, 1.0, 0], [0, 0, 3.0]])
+    system = system_of()
+    integrator = SurfaceIntegrator(
+        0.01, surfaces=[ExpressionSurface([0, 1], FORMULA), ExpressionSurface(2, "z-a", {"a": 3.0})], system=system
+    )
+    context = started(system, integrator, x, [[0, 1, 0], [1, 0, 0], [1, 1, 0]])
+    integrator.step(100)
+    there, _ = state_of(context)
+    X, Y, Z = there[:2].T
+    assert np.abs(1.5 * X**2 + Y**2 + 2 * Z**2 + 0.3 * X * Y * Z - 1).max() <= 1e-14
+    assert there[2, 2] == pytest.approx(3.0, abs=1e-14)
