@@ -48,6 +48,8 @@ class State:
         size of what is held (see `System.initial_state`).
     time_remainder : float
         What rounding took from the time, so that a million steps of dt are a million dt.
+    thermostat : ndarray or None
+        Variables of the thermostat, if there is one.
     """
 
     positions: FloatArray
@@ -57,6 +59,7 @@ class State:
     step: int = 0
     remainder: FloatArray | None = None
     time_remainder: float = 0.0
+    thermostat: FloatArray | None = None
 
     def later(self, dt: float) -> tuple[float, float]:
         """Time after `dt`, and what its rounding leaves over (Knuth's exact sum)."""

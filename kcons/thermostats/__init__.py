@@ -1,0 +1,9 @@
+"""Thermostats on constraints. Each is a stepper: a pure function from one state to the next."""
+
+from kcons.thermostats.freedom import Freedom, freedom
+from kcons.thermostats.isokinetic import Isokinetic
+from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.velocities import thermal_velocities
+
+__all__ = ["Freedom", "Isokinetic", "Langevin", "NoseHooverChain", "freedom", "thermal_velocities"]

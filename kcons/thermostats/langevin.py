@@ -1,0 +1,174 @@
+"""Langevin dynamics on constraints: the geodesic BAOAB scheme."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.steppers import State, System
+from kcons.steppers.state import check_finite
+from kcons.steppers.stepper import explained, stays
+from kcons.steppers.summation import Point
+from kcons.thermostats.velocities import drift_velocity
+
+
+class Langevin:
+    """Canonical sampling on constraints: kick, drift, friction and noise, drift, kick (g-BAOAB).
+
+    Friction and noise act on velocities in the tangent plane, v = M_par^+ M (e^{-gamma dt} v + noise), exactly; the
+    drifts follow the constraints in `substeps` RATTLE substeps each (great circles where possible), which cost no
+    force evaluation. Sampling errors are of order dt^2 with a constant far below that of other schemes for
+    configurations; velocities are less accurate.
+
+    A step is a function of the state alone, also its noise: it is drawn for (seed, number of the step), so that a
+    run continued from a saved state is the same to the last bit.
+
+    Parameters
+    ----------
+    thermal_energy : float
+        k_B T in the units of energy in use.
+    friction : float
+        gamma, in inverse units of time.
+    seed : int
+    substeps : int
+        RATTLE substeps in each of the two drifts.
+    conserve_momentum : bool
+        Friction and noise act relative to the centre of mass; three degrees of freedom less take part.
+
+    Raises
+    ------
+    InputError
+        Temperature not positive, friction negative, substeps below 1.
+
+    Notes
+    -----
+    `State.thermostat` holds the heat that has flowed in: total energy less it is conserved (`conserved_energy`) to the
+    order of the scheme.
+
+    References
+    ----------
+    Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
+    """
+
+    order = 2
+    reversible = False
+    symplectic = False
+    force_evaluations = 1
+
+    def __init__(
+        self,
+        thermal_energy: float,
+        friction: float,
+        seed: int,
+        *,
+        substeps: int = 3,
+        conserve_momentum: bool = False,
+    ) -> None:
+        if not (math.isfinite(thermal_energy) and thermal_energy > 0):
+            raise InputError(f"thermal_energy is {thermal_energy}; give a positive number", item="thermal_energy")
+        if not (math.isfinite(friction) and friction >= 0):
+            raise InputError(f"friction is {friction}; give a number >= 0", item="friction")
+        if int(substeps) != substeps or substeps < 1:
+            raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
+        if int(seed) != seed or seed < 0:
+            raise InputError(f"seed is {seed}; give a whole number >= 0", item="seed")
+        self.thermal_energy = float(thermal_energy)
+        self.friction = float(friction)
+        self.seed = int(seed)
+        self.substeps = int(substeps)
+        self.conserve_momentum = bool(conserve_momentum)
+
+    def __repr__(self) -> str:
+        return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` for velocity-dependent forces, or where momentum cannot be conserved."""
+        if system.velocity_dependent:
+            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
+        if self.conserve_momentum:
+            drift_velocity(system, np.zeros((system.n_atoms, 3)))
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        InputError
+            A negative time step: noise cannot be taken back.
+        ConvergenceError, NonFiniteError, InputError, UnsupportedError
+            As for all splittings.
+        """
+        self.check(system)
+        still = stays(state, dt)
+        if still is not None:
+            return still
+        if dt < 0:
+            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+        start = system.with_forces(state)
+        number = state.step + 1
+        time, time_remainder = state.later(dt)
+        middle = state.time + (0.5 * dt + state.time_remainder)
+        motion = system.motion
+        shift = None
+        x = start.positions
+        if start.remainder is not None:
+            shift = x[system.anchor]
+            x = (x - shift) + start.remainder
+        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
+            try:
+                assert start.forces is not None
+                v = start.velocities + (0.5 * dt) * (start.forces * system.inverse_masses)
+                x, v = self._fly(system, x, v, state.time, middle, 0.5 * dt)
+                v, heat = self._exchange(system, x, v, middle, dt, number)
+                x, v = self._fly(system, x, v, middle, time, 0.5 * dt)
+                check_finite(x, "position", number)
+                positions = x if shift is None else x + shift
+                forces = system.forces(positions, v, time, number)
+                v += (0.5 * dt) * (forces * system.inverse_masses)
+                check_finite(v, "velocity", number)
+                motion.project_velocities(x, v, time=time, out=v)
+            except ConvergenceError as error:
+                raise explained(error, system, state, dt, number) from error
+        before = 0.0 if state.thermostat is None else float(state.thermostat[0])
+        remainder = None if shift is None else x - (positions - shift)
+        return State(positions, v, time, forces, number, remainder, time_remainder, np.array([before + heat]))
+
+    def _fly(
+        self, system: System, x: FloatArray, v: FloatArray, start: float, end: float, h: float
+    ) -> tuple[FloatArray, FloatArray]:
+        circles = system.great_circles
+        flight, count = (system.drift, self.substeps) if circles is None else (circles, 1)
+        point = Point(x, v, system.weights, exact=count > 1 or circles is not None)
+        now = start
+        for k in range(1, count + 1):
+            then, now = now, end if k == count else start + k * (end - start) / count
+            flight.move(point, np.empty_like(x), then, now, h / count)
+        point.land()
+        return point.x, point.v
+
+    def _exchange(
+        self, system: System, x: FloatArray, v: FloatArray, time: float, dt: float, number: int
+    ) -> tuple[FloatArray, float]:
+        """Friction and noise in the tangent plane at x, and the heat they bring."""
+        motion = system.motion
+        v = motion.project_velocities(x, v, time=time)
+        drive = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else np.zeros_like(v)
+        keep = math.exp(-self.friction * dt)
+        spread = math.sqrt(-math.expm1(-2 * self.friction * dt) * self.thermal_energy)
+        # A generator for each step: noise is a function of seed and number.
+        noise = np.random.Generator(np.random.Philox(key=[self.seed, number])).standard_normal(v.shape)
+        noise *= spread * np.sqrt(system.inverse_masses)
+        kept = drive
+        if self.conserve_momentum:
+            noise -= drift_velocity(system, noise)
+            kept = drive + drift_velocity(system, v - drive)
+        before = system.kinetic_energy(v)
+        after = motion.project_velocities(x, kept + keep * (v - kept) + noise, time=time)
+        return after, system.kinetic_energy(after) - before
+
+    def conserved_energy(self, system: System, state: State) -> float:
+        """Total energy less the heat that has flowed in."""
+        return system.total_energy(state) - (0.0 if state.thermostat is None else float(state.thermostat[0]))

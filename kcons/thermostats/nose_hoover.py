@@ -1,0 +1,159 @@
+"""Nose-Hoover chains on constraints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle, State, System
+from kcons.steppers.splitting import Splitting
+from kcons.steppers.stepper import stays
+from kcons.thermostats.freedom import Momentum, freedom
+
+#: Suzuki's fractions of order 4 for the motion of the chain.
+_SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
+FRACTIONS = (_SHARE, _SHARE, 1.0 - 4.0 * _SHARE, _SHARE, _SHARE)
+
+
+class NoseHooverChain:
+    """Canonical dynamics without noise: half a step of the chain, a step on the constraints, half a step of the chain.
+
+    The chain scales velocities, which stay tangent to rows that rest. Degrees of freedom are counted by rank, less
+    three where total momentum is conserved.
+
+    Parameters
+    ----------
+    thermal_energy : float
+        k_B T in the units of energy in use.
+    period : float
+        Time in which the temperature oscillates; a few times the slowest vibration, at least 20 time steps.
+    length : int
+        Links of the chain.
+    stepper : Splitting, optional
+        Of order 2; `Rattle` by default.
+    momentum : {'auto', 'conserved', 'free'}
+        See `kcons.thermostats.freedom`.
+
+    Raises
+    ------
+    InputError
+        Temperature or period not positive, no links.
+
+    Notes
+    -----
+    `State.thermostat` holds positions and velocities of the links, and g.
+
+    References
+    ----------
+    Martyna, Tuckerman, Tobias and Klein, Mol. Phys. 87, 1117 (1996).
+    """
+
+    order = 2
+    reversible = True
+    symplectic = False
+
+    def __init__(
+        self,
+        thermal_energy: float,
+        period: float,
+        *,
+        length: int = 3,
+        stepper: Splitting | None = None,
+        momentum: Momentum = "auto",
+    ) -> None:
+        for item, value in (("thermal_energy", thermal_energy), ("period", period)):
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"{item} is {value}; give a positive number", item=item)
+        if int(length) != length or length < 1:
+            raise InputError(f"length is {length}; give a whole number, 1 or more", item="length")
+        self.thermal_energy = float(thermal_energy)
+        self.period = float(period)
+        self.length = int(length)
+        self.stepper: Splitting = Rattle() if stepper is None else stepper
+        if self.stepper.order != 2:
+            raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
+        self.momentum: Momentum = momentum
+        self.force_evaluations = self.stepper.force_evaluations
+
+    def __repr__(self) -> str:
+        return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` for rows whose targets demand velocities, or velocity-dependent forces."""
+        if system.velocity_dependent:
+            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use Langevin")
+        if system.motion.plan.driven:
+            raise UnsupportedError("targets move, and scaled velocities would not follow them; use Langevin")
+        self.stepper.check(system)
+
+    def start(self, system: System, state: State) -> State:
+        """The state with its forces and a chain at rest."""
+        state = system.with_forces(state)
+        if state.thermostat is not None:
+            return state
+        assert state.forces is not None
+        count = freedom(system, state, state.forces, None, self.momentum).count
+        return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [count]]))
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        ConvergenceError, NonFiniteError, InputError, UnsupportedError
+            As for the stepper.
+        """
+        self.check(system)
+        still = stays(state, dt)
+        if still is not None:
+            return still
+        begin = self.start(system, state)
+        v, chain = self._half(system, begin.velocities, begin.thermostat, dt)
+        after = self.stepper.step(system, replace(begin, velocities=v), dt)
+        v, chain = self._half(system, after.velocities, chain, dt)
+        return replace(after, velocities=v, thermostat=chain)
+
+    def _masses(self, count: float) -> FloatArray:
+        """Q = k_B T (period/2 pi)^2, times g for the first link."""
+        q = np.full(self.length, self.thermal_energy * (self.period / (2 * math.pi)) ** 2)
+        q[0] *= count
+        return q
+
+    def _half(
+        self, system: System, v: FloatArray, thermostat: FloatArray | None, dt: float
+    ) -> tuple[FloatArray, FloatArray]:
+        assert thermostat is not None
+        n, kt = self.length, self.thermal_energy
+        place, speed, count = thermostat[:n].copy(), thermostat[n : 2 * n].copy(), float(thermostat[2 * n])
+        q = self._masses(count)
+        twice = 2 * system.kinetic_energy(v)
+        scale = 1.0
+
+        def push(k: int) -> float:
+            driving = twice * scale**2 - count * kt if k == 0 else q[k - 1] * speed[k - 1] ** 2 - kt
+            return float(driving / q[k])
+
+        for fraction in FRACTIONS:
+            h = 0.5 * dt * fraction
+            for k in reversed(range(n)):
+                damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < n else 1.0
+                speed[k] = (speed[k] * damp + 0.5 * h * push(k)) * damp
+            scale *= math.exp(-h * speed[0])
+            place += h * speed
+            for k in range(n):
+                damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < n else 1.0
+                speed[k] = (speed[k] * damp + 0.5 * h * push(k)) * damp
+        return v * scale, np.concatenate([place, speed, [count]])
+
+    def conserved_energy(self, system: System, state: State) -> float:
+        """Total energy of system and chain; needs `System.potential`."""
+        state = self.start(system, state)
+        assert state.thermostat is not None
+        n, kt = self.length, self.thermal_energy
+        place, speed, count = state.thermostat[:n], state.thermostat[n : 2 * n], float(state.thermostat[2 * n])
+        chain = 0.5 * float(self._masses(count) @ speed**2) + kt * (count * float(place[0]) + float(place[1:].sum()))
+        return system.total_energy(state) + chain
