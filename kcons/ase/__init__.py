@@ -10,14 +10,19 @@ Importing this package registers the object with ASE, which makes files that con
 from kcons.ase.calculator import ConstrainedCalculator
 from kcons.ase.constraint import Constraints, constrain
 from kcons.ase.dynamics import ConstrainedDynamics
+from kcons.ase.thermostats import ConstrainedLangevin, ConstrainedNoseHoover, IsokineticDynamics, draw_velocities
 from kcons.ase.translation import from_ase_constraints
 from kcons.ase.water import rigid_water
 
 __all__ = [
     "ConstrainedCalculator",
     "ConstrainedDynamics",
+    "ConstrainedLangevin",
+    "ConstrainedNoseHoover",
     "Constraints",
+    "IsokineticDynamics",
     "constrain",
+    "draw_velocities",
     "from_ase_constraints",
     "rigid_water",
 ]

@@ -195,7 +195,8 @@ class ConstrainedDynamics(MolecularDynamics):
             # Velocities always come from the momenta, as after a restart from a file.
             v = p / self._weights[1] if self._resumed is None else self._resumed
             remainder = last.time_remainder if last.time == self.time else 0.0
-            return State(last.positions, v, self.time, last.forces, self.nsteps, last.remainder, remainder)
+            keeps = (last.remainder, remainder, last.thermostat)
+            return State(last.positions, v, self.time, last.forces, self.nsteps, *keeps)
         masses, divisors = self._weights
         v = p / divisors
         self._resumed = None
@@ -205,7 +206,10 @@ class ConstrainedDynamics(MolecularDynamics):
         self._forces = None
         if not np.array_equal(state.positions, x):
             forces = None
-        state = State(state.positions, state.velocities, self.time, forces, self.nsteps, state.remainder)
+        thermostat = self._thermostat_after_change(last)
+        state = State(
+            state.positions, state.velocities, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat
+        )
         moved = not np.array_equal(state.velocities, v)
         self._momenta = state.velocities * masses if moved else p.copy()
         self._put(state.positions, self._momenta)
@@ -228,6 +232,10 @@ class ConstrainedDynamics(MolecularDynamics):
         self._put(x, self._momenta)
         self._state, self._resumed = state, v
         self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
+
+    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
+        """What a thermostat goes on with where somebody moved the atoms."""
+        return None
 
     # -- the system -----------------------------------------------------------------------------
 

@@ -8,14 +8,12 @@ that a kick at fixed positions has the closed form it has without constraints.
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
@@ -24,12 +22,24 @@ from kcons.steppers.splitting import Piece
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
-from kcons.thermostats.freedom import AT_REST, Freedom, Momentum, freedom, total_momentum_share
+from kcons.thermostats import kick as closed_form
+from kcons.thermostats.freedom import (
+    Freedom,
+    Momentum,
+    atom_numbers,
+    carried,
+    freedom,
+    positive,
+    warn_of_conserved_momenta,
+)
 
 Convention = Literal["exact", "notes"]
 
 #: Kinetic energy below which v.f/2K may overflow.
 SMALLEST = 1e-290
+#: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
+ROUNDING = 1e-12
+_MAX_ITERATIONS = 50
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
 _S6_OTHER = (0.209515106613362, -0.143851773179818)
@@ -63,11 +73,15 @@ class Isokinetic(Splitting):
 
     Kicks follow the closed form at fixed forces; drifts fly along the constraints, after which the velocities are
     brought back to the length they had. Configurations are canonical at temperature T for
-    2K = (g - 1) kT, g being the independent momenta: 3 n less the rank of the rows, less 3 where total momentum is
-    conserved and zero. That is the default ('exact'). Velocities are spread over a sphere, not by Maxwell and
+    2K = (g - 1) kT, g being the independent momenta: 3 n less the rank of the rows, less 1 for each direction in which
+    total momentum is conserved. That is the default ('exact'). Velocities are spread over a sphere, not by Maxwell and
     Boltzmann: the kinetic temperature 2K/(g k) reads (g - 1)/g T.
 
-    Symplectic it cannot be: the flow compresses phase space at the rate -(g - 1) alpha.
+    Symplectic it cannot be: the flow compresses phase space at the rate -(g - 1) alpha. It follows the exact motion
+    backwards, with a negative time step, to the order of the scheme.
+
+    Where targets move, they and K are kept together: v is what the targets demand at least, plus the rest, which has
+    the length that is left.
 
     Parameters
     ----------
@@ -78,8 +92,9 @@ class Isokinetic(Splitting):
     order : {2, 4, 6}
         1, 6 and 10 force evaluations a step.
     convention : {'exact', 'notes'}
-        2K = (g - 1) k_B T, or 2K = 3 n k_B T of the notes (eq. 112), whose configurations are hotter than T.
-    atoms : array_like of int, optional
+        2K = (g - 1) k_B T, or 2K = 3 n k_B T of the notes (eq. 112), n atoms that can move; their configurations are
+        hotter than T.
+    atoms : array_like of int or bool, optional
         Thermostat these only. No row may couple them to others.
     momentum : {'auto', 'conserved', 'free'}
         See `kcons.thermostats.freedom`.
@@ -89,10 +104,16 @@ class Isokinetic(Splitting):
     InputError
         Temperature or energy not positive; an unknown order or convention.
 
+    Warns
+    -----
+    UserWarning
+        At the start of a run: total momentum is conserved but for a factor exp(U/2K), and not zero; or a temperature is
+        asked for and forces exert no torque, so that the same holds of angular momentum. Neither samples a temperature.
+
     Notes
     -----
-    `State.thermostat` holds 2K and the integral of alpha over time; U + 2K int(alpha) is conserved
-    (`conserved_energy`).
+    `State.thermostat` holds 2K, the integral of alpha over time, f.M_par^+ f and g. U + 2K int(alpha) is conserved
+    where targets rest (`conserved_energy`).
 
     References
     ----------
@@ -119,16 +140,14 @@ class Isokinetic(Splitting):
             raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
         if thermal_energy is not None and kinetic_energy is not None:
             raise InputError("give thermal_energy or kinetic_energy, not both", item="thermal_energy")
-        for item, value in (("thermal_energy", thermal_energy), ("kinetic_energy", kinetic_energy)):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"{item} is {value}; give a positive number", item=item)
         super().__init__(*SCHEMES[order])
         self.order = order
-        self.thermal_energy = thermal_energy
-        self.kinetic_energy = kinetic_energy
+        self.thermal_energy = None if thermal_energy is None else positive(thermal_energy, "thermal_energy")
+        self.kinetic_energy = None if kinetic_energy is None else positive(kinetic_energy, "kinetic_energy")
         self.convention: Convention = convention
-        self.atoms = None if atoms is None else np.asarray(atoms, dtype=np.int64)
+        self.atoms = None if atoms is None else np.asarray(atoms)
         self.momentum: Momentum = momentum
+        self._shares: tuple[System, _Share] | None = None
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -154,45 +173,60 @@ class Isokinetic(Splitting):
     def start(self, system: System, state: State) -> State:
         """The state with its forces, and with the kinetic energy that the thermostat keeps.
 
+        Velocities off the constraints are projected, then scaled; those that are right to rounding stay as they are to
+        the last bit.
+
         Raises
         ------
         InputError
-            All velocities are zero; velocities off the constraints.
+            All velocities are zero; the state carries variables of another thermostat; bad atom numbers.
         OverdeterminedError
             g is 1 (a temperature asked for), or 0.
+        UnsupportedError
+            A row couples the thermostatted atoms to others.
         """
         self.check(system)
-        state = system.with_forces(state)
-        if state.thermostat is not None:
+        share = self._share(system)
+        if carried(state, 4, "Isokinetic"):
+            if state.forces is None and state.thermostat is not None:
+                state = system.with_forces(state)
+                variables = np.array(state.thermostat)
+                variables[2] = share.push_square(system, state)
+                state = replace(state, thermostat=variables)
             return state
+        state = system.with_forces(state)
         assert state.forces is not None
-        free = freedom(system, state, state.forces, self.atoms, self.momentum)
-        drive, tangent = _split(system, state.positions, state.velocities, state.time)
-        speeds = Speeds(system, self.atoms)
-        twice = speeds.square(tangent) + speeds.square(drive)
-        if not twice > SMALLEST:
+        drive, rest = _split(system, state.positions, state.velocities, state.time)
+        driven = 0.0 if drive is None else share.square(drive)
+        found = share.square(rest) + driven
+        if not found > SMALLEST:
             raise InputError(
                 "the isokinetic thermostat needs non-zero kinetic energy: draw velocities first "
                 "(kcons.thermostats.thermal_velocities)",
                 item="velocities",
             )
-        wanted = self._twice_kinetic(system, free, twice)
-        if free.momentum_conserved and total_momentum_share(system, state.velocities) > AT_REST**2:
-            warnings.warn(
-                "total momentum is not zero and is scaled by exp(U/2K) instead of being conserved: no temperature "
-                "is sampled; remove it from the velocities first",
-                stacklevel=3,
-            )
-        velocities = drive + speeds.scaled(tangent, wanted - speeds.square(drive), state.step)
-        return replace(state, velocities=velocities, thermostat=np.array([wanted, 0.0]))
+        free = freedom(system, state, state.forces, self.atoms, self.momentum)
+        twice = self._twice_kinetic(share, free, found)
+        if self.thermal_energy is None:
+            free = replace(free, turns=False)
+        warn_of_conserved_momenta(system, state.velocities, free, stacklevel=5)
+        velocities = rest if drive is None else drive + rest
+        off = float(np.abs(velocities - state.velocities).max())
+        if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
+            velocities = state.velocities
+        else:
+            rest = share.scaled(rest, _left(twice, driven, state.step))
+            velocities = rest if drive is None else drive + rest
+        variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
+        return replace(state, velocities=velocities, thermostat=variables)
 
-    def _twice_kinetic(self, system: System, free: Freedom, found: float) -> float:
+    def _twice_kinetic(self, share: _Share, free: Freedom, found: float) -> float:
         if self.kinetic_energy is not None:
             return 2 * self.kinetic_energy
         if self.thermal_energy is None:
             return found
         if self.convention == "notes":
-            return 3 * (system.n_atoms if free.atoms is None else len(free.atoms)) * self.thermal_energy
+            return 3 * share.n_moving * self.thermal_energy
         if free.count < 2:
             raise OverdeterminedError(
                 "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
@@ -200,20 +234,26 @@ class Isokinetic(Splitting):
             )
         return (free.count - 1) * self.thermal_energy
 
+    def _share(self, system: System) -> _Share:
+        known = self._shares
+        if known is None or known[0] is not system:
+            known = self._shares = (system, _Share(system, self.atoms))
+        return known[1]
+
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
 
         Raises
         ------
         ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for all splittings.
+            As for all splittings, and at the start of a run as for `start`.
         """
         still = stays(state, dt)
         if still is not None:
             return still
         begin = self.start(system, state)
-        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            run = _Step(self, system, begin, dt)
+        with np.errstate(all="ignore"):  # checked, with the step's number
+            run = _Step(system, self._share(system), begin, dt)
             try:
                 return run.through(self.kicks, self._pieces)
             except ConvergenceError as error:
@@ -222,78 +262,103 @@ class Isokinetic(Splitting):
     # -- what can be read -----------------------------------------------------------------------
 
     def friction(self, system: System, state: State) -> float:
-        """alpha = v.f/(2K) at the state (notes, eq. 113)."""
+        """alpha = v.f/(2K) at the state (notes, eq. 113); where targets move, without the part that they demand."""
         state = self.start(system, state)
         assert state.forces is not None
-        tangent = _split(system, state.positions, state.velocities, state.time)[1]
-        speeds = Speeds(system, self.atoms)
-        return speeds.product(tangent, state.forces) / speeds.square(tangent)
+        share = self._share(system)
+        rest = _split(system, state.positions, state.velocities, state.time)[1]
+        return float(closed_form.aligned_sum(rest, state.forces, share.masses)) / share.square(rest)
 
     def compression_rate(self, system: System, state: State) -> float:
         """Divergence of the flow in phase space, -(g - 1) alpha."""
         state = self.start(system, state)
-        assert state.forces is not None
-        count = freedom(system, state, state.forces, self.atoms, self.momentum).count
-        return -(count - 1) * self.friction(system, state)
+        assert state.thermostat is not None
+        return -(float(state.thermostat[3]) - 1) * self.friction(system, state)
 
     def conserved_energy(self, system: System, state: State) -> float:
-        """U + 2K int(alpha dt), which the exact motion conserves; needs `System.potential`."""
+        """U + 2K int(alpha dt), which the exact motion conserves where targets rest and all atoms are thermostatted.
+
+        Needs `System.potential`.
+        """
         state = self.start(system, state)
         assert state.thermostat is not None
         potential = system.total_energy(state) - system.kinetic_energy(state.velocities)
         return potential + float(state.thermostat[0] * state.thermostat[1])
 
 
-def _split(system: System, x: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-    """v as the slowest velocities that the targets demand (zero unless they move) and the rest, projected."""
+def _split(system: System, x: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray | None, FloatArray]:
+    """v, projected, as the slowest velocities that the targets demand (None where they rest) and the rest."""
     motion = system.motion
     whole = motion.project_velocities(x, v, time=time)
     if not motion.plan.driven:
-        return np.zeros_like(v), whole
+        return None, whole
     drive = motion.project_velocities(x, np.zeros_like(v), time=time)
     return drive, whole - drive
 
 
-class Speeds:
-    """Kinetic energy of the thermostatted atoms."""
+def _left(twice: float, driven: float, step: int) -> float:
+    """What moving targets leave of 2K."""
+    left = twice - driven
+    if not left > SMALLEST:
+        raise InputError(
+            f"moving targets alone have more kinetic energy than the thermostat allows at step {step}: raise the "
+            "temperature, or move them slower",
+            item="kinetic_energy",
+        )
+    return left
 
-    def __init__(self, system: System, atoms: IntArray | None) -> None:
-        self.inside = system.inverse_masses[:, 0] > 0
+
+class _Share:
+    """The thermostatted atoms."""
+
+    def __init__(self, system: System, atoms: ArrayLike | None) -> None:
+        inside = system.inverse_masses[:, 0] > 0
         if atoms is not None:
             chosen = np.zeros(system.n_atoms, dtype=bool)
-            chosen[atoms] = True
-            self.inside = self.inside & chosen
-        #: Masses of the thermostatted atoms, shape (n_atoms, 1); 0 for the others.
-        self.masses = np.where(self.inside, system.masses, 0.0)[:, None]
-        self.everywhere = bool(self.inside.all())
+            chosen[atom_numbers(atoms, system.n_atoms)] = True
+            inside = inside & chosen
+        self.n_moving = int(inside.sum())
+        #: Masses of the thermostatted atoms for each coordinate; 0 for the others.
+        self.masses: FloatArray = np.repeat(np.where(inside, system.masses, 0.0)[:, None], 3, axis=1)
+        #: Coordinates of other atoms that move, None if there are none.
+        others = (self.masses == 0) & (system.weights > 0)
+        self.others = others if others.any() else None
 
     def square(self, v: FloatArray) -> float:
         """v^T M v."""
-        return float(np.vdot(self.masses * v, v))
+        return float(closed_form.square_sum(v, self.masses))
 
-    def product(self, v: FloatArray, f: FloatArray) -> float:
-        """v . f."""
-        return float(np.vdot(v, f)) if self.everywhere else float(np.vdot(v[self.inside], f[self.inside]))
-
-    def scaled(self, v: FloatArray, square: float, step: int) -> FloatArray:
+    def scaled(self, v: FloatArray, square: float) -> FloatArray:
         """v with the length that v^T M v = `square` demands, other atoms as they are."""
         has = self.square(v)
-        if not square > SMALLEST:
-            raise InputError(
-                f"moving targets alone have more kinetic energy than the thermostat allows at step {step}: raise "
-                "the temperature, or move them slower",
-                item="kinetic_energy",
-            )
         factor = math.sqrt(square / has) if has > 0 else math.nan
-        return v * factor if self.everywhere else np.where(self.inside[:, None], v * factor, v)
+        return np.where(self.masses > 0, v * factor, v)
+
+    def push_square(self, system: System, state: State) -> float:
+        """f . M_par^+ f at the state."""
+        assert state.forces is not None
+        x = state.positions
+        if state.remainder is not None:
+            x = (x - x[system.anchor]) + state.remainder
+        pace = paced(system, x, state.forces, state.time)
+        return float(closed_form.square_sum(pace, self.masses))
+
+
+def paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
+    """M_par^+ f."""
+    motion = system.motion
+    if motion.plan.driven:
+        return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
+    pace = forces * system.weights
+    return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
 
 
 class _Step:
-    """The arrays of one step on its way."""
+    """The arrays of one step on its way: velocities v = drive + u, the drive None where targets rest."""
 
-    def __init__(self, method: Isokinetic, system: System, start: State, dt: float) -> None:
+    def __init__(self, system: System, share: _Share, start: State, dt: float) -> None:
         assert start.thermostat is not None and start.forces is not None
-        self.method, self.system, self.dt = method, system, dt
+        self.system, self.share, self.dt = system, share, dt
         self.begin = start
         self.number = start.step + 1
         self.time, self.time_remainder = start.later(dt)
@@ -303,74 +368,151 @@ class _Step:
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
-        self.speeds = Speeds(system, method.atoms)
-        self.twice, self.integral = (float(value) for value in start.thermostat)
+        self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
         self.x = x
         self.forces = start.forces
-        self.drive, self.tangent = _split(system, x, start.velocities, self.now)
-        self.drive_square = self.speeds.square(self.drive)
+        self.drive: FloatArray | None = None
+        self.u = start.velocities
+        self.left = self.twice
+        if system.motion.plan.driven:
+            self.drive, self.u = _split(system, x, start.velocities, self.now)
+            self._settle()
 
     def through(self, kicks: tuple[float, ...], pieces: list[list[Piece]]) -> State:
-        self.kick(kicks[0])
+        self.first_kick(kicks[0] * self.dt)
         for fraction, stage in zip(kicks[1:], pieces, strict=True):
-            self.drift(stage)
-            self.forces = self.system.forces(self.positions, self.drive + self.tangent, self.now, self.number)
-            self.kick(fraction)
-        v = self.drive + self.tangent
+            if self.drive is None:
+                self.drift(stage)
+            else:
+                for piece in stage:
+                    self.driven_drift(piece)
+            if self.system.force is not None:
+                self.forces = self.system.forces(self.positions, self.velocities, self.now, self.number)
+            self.kick(fraction * self.dt)
+        v = self.velocities
         check_finite(v, "velocity", self.number)
         positions, remainder = self.positions, None
         if self.shift is not None:
             remainder = self.x - (positions - self.shift)
-        thermostat = np.array([self.twice, self.integral])
+        thermostat = np.array([self.twice, self.integral, self.push_square, self.count])
         return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder, thermostat)
 
     @property
     def positions(self) -> FloatArray:
         return self.x if self.shift is None else self.x + self.shift
 
-    def kick(self, fraction: float) -> None:
-        """dv/dt = M_par^+ f - alpha v for a time at fixed forces, in closed form.
+    @property
+    def velocities(self) -> FloatArray:
+        return self.u if self.drive is None else self.drive + self.u
 
-        v becomes (v + s F)/s' with F = M_par^+ f, a = v.f/2K, c^2 = F.f/2K and
-        s = (a/c^2)(cosh ct - 1) + sinh(ct)/c; all divided by e^{ct}, which overflows for ct > 710.
-        """
-        system, speeds = self.system, self.speeds
+    def _settle(self) -> None:
+        """How long u must be."""
+        assert self.drive is not None
+        self.left = _left(self.twice, self.share.square(self.drive), self.number)
+
+    # -- kicks ----------------------------------------------------------------------------------
+
+    def first_kick(self, t: float) -> None:
+        """The kick before the first drift, which takes out what the forces would do across the constraints."""
+        system, share = self.system, self.share
         if system.force is None:
             return
-        t = fraction * self.dt
-        push = system.motion.project_forces(self.x, self.forces, time=self.now)
-        pace = push * system.inverse_masses
-        square = self.twice - self.drive_square
-        a = speeds.product(self.tangent, push) / square
-        c = math.sqrt(max(speeds.product(pace, push) / square, 0.0))
-        z = abs(c * t)
-        decay = math.exp(-z)
-        # sinh z/z, (cosh z - 1)/z^2 and cosh z, times e^-z.
-        sinh = -0.5 * math.expm1(-2 * z) / z if z > 0 else 1.0
-        cosh_less = 0.5 * (math.expm1(-z) / z) ** 2 if z > 0 else 0.5
-        cosh = 0.5 * (1 + decay * decay)
-        growth = a * t * sinh + cosh
-        s = t * (a * t * cosh_less + sinh)
-        after = (decay * self.tangent + s * pace) / growth
-        if not speeds.everywhere:
-            after = np.where(speeds.inside[:, None], after, self.tangent + t * pace)
-        self.tangent = speeds.scaled(after, square, self.number)
-        self.integral += z + math.log(growth)
+        aligned = float(closed_form.aligned_sum(self.u, self.forces, share.masses))
+        w = closed_form.weights(aligned, self.push_square, self.left, t)
+        if w.cancels:
+            self._turn(paced(system, self.x, self.forces, self.now), 1.0, t)
+            return
+        u = np.empty_like(self.u)
+        closed_form.combine(self.u, w.keep, self.forces, w.push, system.weights, u)
+        if share.others is not None:
+            u = np.where(share.others, self.u + t * system.weights * self.forces, u)
+        self.u = u
+        self.integral += w.log_growth
+
+    def kick(self, t: float) -> None:
+        """Bring u, projected, to its length, and follow the closed form."""
+        system, share = self.system, self.share
+        if system.force is None:
+            factor = math.sqrt(self.left / share.square(self.u))
+            self.u = self.u * factor if share.others is None else np.where(share.others, self.u, self.u * factor)
+            self.integral -= math.log(factor)
+            return
+        pace = paced(system, self.x, self.forces, self.now)
+        uu, aligned, self.push_square = closed_form.sums(self.u, pace, share.masses)
+        factor = math.sqrt(self.left / uu) if uu > 0 else math.nan
+        aligned *= factor
+        self.integral -= math.log(factor)
+        w = closed_form.weights(aligned, self.push_square, self.left, t)
+        if w.cancels:
+            self._turn(pace, factor, t)
+            return
+        # What rounding has left to correct.
+        got = w.keep * (w.keep * self.left + 2 * w.push * aligned) + w.push * w.push * self.push_square
+        right = math.sqrt(self.left / got) if got > 0 else math.nan
+        u = np.empty_like(pace)
+        closed_form.mix(self.u, right * factor * w.keep, pace, right * w.push, u)
+        if share.others is not None:
+            u = np.where(share.others, self.u + t * pace, u)
+        self.u = u
+        self.integral += w.log_growth
+
+    def _turn(self, pace: FloatArray, factor: float, t: float) -> None:
+        share = self.share
+        u, growth = closed_form.turned(factor * self.u, pace, share.masses, self.push_square, self.left, t)
+        if share.others is not None:
+            u = np.where(share.others, self.u + t * pace, u)
+        self.u = share.scaled(u, self.left)
+        self.integral += growth
+
+    # -- drifts ---------------------------------------------------------------------------------
 
     def drift(self, stage: list[Piece]) -> None:
-        system, start = self.system, self.begin
-        point = Point(self.x, self.drive + self.tangent, system.weights, exact=len(stage) > 1)
+        system = self.system
+        point = Point(self.x, self.u, system.weights, exact=len(stage) > 1)
         for fraction, end in stage:
-            then = self.now
-            self.now = self.time if end == 1.0 else start.time + (end * self.dt + start.time_remainder)
+            then, self.now = self.now, self._time_at(end)
             system.drift.move(point, np.empty_like(self.x), then, self.now, fraction * self.dt)
         point.land()
         check_finite(point.x, "position", self.number)
         self.x = point.x
-        drive, tangent = _split(system, self.x, point.v, self.now)
-        drive_square = self.speeds.square(drive)
-        has = self.speeds.square(tangent)
-        wanted = self.twice - drive_square
-        self.tangent = self.speeds.scaled(tangent, wanted, self.number)
-        self.integral -= 0.5 * math.log(wanted / has) if has > 0 else math.nan
-        self.drive, self.drive_square = drive, drive_square
+        self.u = system.motion.project_velocities(self.x, point.v, time=self.now, out=point.v)
+
+    def driven_drift(self, piece: Piece) -> None:
+        """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
+
+        So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
+        """
+        system, share = self.system, self.share
+        assert self.drive is not None
+        fraction, end = piece
+        then, now = self.now, self._time_at(end)
+        log_factor, last = 0.0, math.inf
+        for _ in range(_MAX_ITERATIONS):
+            point = Point(self.x, self.drive + self._times(math.exp(log_factor), self.u), system.weights, exact=False)
+            system.drift.move(point, np.empty_like(self.x), then, now, fraction * self.dt)
+            check_finite(point.x, "position", self.number)
+            drive, u = _split(system, point.x, point.v, now)
+            assert drive is not None
+            left = _left(self.twice, share.square(drive), self.number)
+            u = self._times(math.exp(log_factor), u)
+            miss = 0.5 * math.log(left / share.square(u))
+            if abs(miss) <= 1e-15 or (abs(miss) < 1e-12 and abs(miss) >= last):
+                break
+            last = abs(miss)
+            log_factor += 0.5 * miss
+        else:
+            raise ConvergenceError(
+                "kinetic energy and moving targets cannot be kept together; time step too large",
+                residual=last,
+                tolerance=1e-12,
+                iterations=_MAX_ITERATIONS,
+            )
+        self.x, self.now, self.drive, self.u, self.left = point.x, now, drive, u, left
+        self.integral -= 2 * log_factor
+
+    def _times(self, factor: float, u: FloatArray) -> FloatArray:
+        return u * factor if self.share.others is None else np.where(self.share.others, u, u * factor)
+
+    def _time_at(self, end: float) -> float:
+        start = self.begin
+        return self.time if end == 1.0 else start.time + (end * self.dt + start.time_remainder)

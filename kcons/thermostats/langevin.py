@@ -12,7 +12,7 @@ from kcons.steppers import State, System
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
-from kcons.thermostats.velocities import drift_velocity
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive
 
 
 class Langevin:
@@ -36,7 +36,8 @@ class Langevin:
     substeps : int
         RATTLE substeps in each of the two drifts.
     conserve_momentum : bool
-        Friction and noise act relative to the centre of mass; three degrees of freedom less take part.
+        Friction and noise act relative to the centre of mass, in the directions in which no row knows a place in
+        space; so many degrees of freedom less take part.
 
     Raises
     ------
@@ -67,29 +68,26 @@ class Langevin:
         substeps: int = 3,
         conserve_momentum: bool = False,
     ) -> None:
-        if not (math.isfinite(thermal_energy) and thermal_energy > 0):
-            raise InputError(f"thermal_energy is {thermal_energy}; give a positive number", item="thermal_energy")
-        if not (math.isfinite(friction) and friction >= 0):
-            raise InputError(f"friction is {friction}; give a number >= 0", item="friction")
+        self.thermal_energy = positive(thermal_energy, "thermal_energy")
+        if np.ndim(friction) or not (math.isfinite(friction) and friction >= 0):
+            raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
         if int(substeps) != substeps or substeps < 1:
             raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
         if int(seed) != seed or seed < 0:
             raise InputError(f"seed is {seed}; give a whole number >= 0", item="seed")
-        self.thermal_energy = float(thermal_energy)
         self.friction = float(friction)
         self.seed = int(seed)
         self.substeps = int(substeps)
         self.conserve_momentum = bool(conserve_momentum)
+        self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces, or where momentum cannot be conserved."""
+        """Raise `UnsupportedError` for velocity-dependent forces."""
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
-        if self.conserve_momentum:
-            drift_velocity(system, np.zeros((system.n_atoms, 3)))
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.
@@ -97,7 +95,9 @@ class Langevin:
         Raises
         ------
         InputError
-            A negative time step: noise cannot be taken back.
+            A negative time step: noise cannot be taken back. The state carries variables of another thermostat.
+        UnsupportedError
+            Momentum is to be conserved where rows hold atoms in space.
         ConvergenceError, NonFiniteError, InputError, UnsupportedError
             As for all splittings.
         """
@@ -107,6 +107,7 @@ class Langevin:
             return still
         if dt < 0:
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+        carried(state, 1, "Langevin")
         start = system.with_forces(state)
         number = state.step + 1
         time, time_remainder = state.later(dt)
@@ -163,11 +164,17 @@ class Langevin:
         noise *= spread * np.sqrt(system.inverse_masses)
         kept = drive
         if self.conserve_momentum:
-            noise -= drift_velocity(system, noise)
-            kept = drive + drift_velocity(system, v - drive)
+            directions = self._directions(system, x, time)
+            noise -= drift_velocity(noise, system.masses, directions)
+            kept = drive + drift_velocity(v - drive, system.masses, directions)
         before = system.kinetic_energy(v)
         after = motion.project_velocities(x, kept + keep * (v - kept) + noise, time=time)
         return after, system.kinetic_energy(after) - before
+
+    def _directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
+        if self._open is None or self._open[0] is not system:
+            self._open = (system, open_directions(system.motion, x, time))
+        return self._open[1]
 
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy less the heat that has flowed in."""

@@ -12,7 +12,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.stepper import stays
-from kcons.thermostats.freedom import Momentum, freedom
+from kcons.thermostats.freedom import Momentum, carried, freedom, positive, warn_of_conserved_momenta
 
 #: Suzuki's fractions of order 4 for the motion of the chain.
 _SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -23,7 +23,7 @@ class NoseHooverChain:
     """Canonical dynamics without noise: half a step of the chain, a step on the constraints, half a step of the chain.
 
     The chain scales velocities, which stay tangent to rows that rest. Degrees of freedom are counted by rank, less
-    three where total momentum is conserved.
+    one for each direction in which total momentum is conserved.
 
     Parameters
     ----------
@@ -42,6 +42,12 @@ class NoseHooverChain:
     ------
     InputError
         Temperature or period not positive, no links.
+
+    Warns
+    -----
+    UserWarning
+        At the start of a run: total momentum is conserved but for a factor, and not zero; or the forces exert no
+        torque, so that the same holds of angular momentum.
 
     Notes
     -----
@@ -65,13 +71,10 @@ class NoseHooverChain:
         stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        for item, value in (("thermal_energy", thermal_energy), ("period", period)):
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"{item} is {value}; give a positive number", item=item)
         if int(length) != length or length < 1:
             raise InputError(f"length is {length}; give a whole number, 1 or more", item="length")
-        self.thermal_energy = float(thermal_energy)
-        self.period = float(period)
+        self.thermal_energy = positive(thermal_energy, "thermal_energy")
+        self.period = positive(period, "period")
         self.length = int(length)
         self.stepper: Splitting = Rattle() if stepper is None else stepper
         if self.stepper.order != 2:
@@ -92,12 +95,14 @@ class NoseHooverChain:
 
     def start(self, system: System, state: State) -> State:
         """The state with its forces and a chain at rest."""
+        known = carried(state, 2 * self.length + 1, "this NoseHooverChain")
         state = system.with_forces(state)
-        if state.thermostat is not None:
+        if known:
             return state
         assert state.forces is not None
-        count = freedom(system, state, state.forces, None, self.momentum).count
-        return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [count]]))
+        free = freedom(system, state, state.forces, None, self.momentum)
+        warn_of_conserved_momenta(system, state.velocities, free)
+        return replace(state, thermostat=np.concatenate([np.zeros(2 * self.length), [free.count]]))
 
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`.

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.steppers import System
+from kcons.thermostats.freedom import drift_velocity, open_directions, positive
 
 
 def thermal_velocities(
@@ -39,7 +40,7 @@ def thermal_velocities(
     time : float
         For targets that move.
     zero_momentum : bool
-        Take total momentum out, where no row knows a place in space.
+        Take total momentum out, in the directions in which no row knows a place in space.
     kinetic_energy : float, optional
         Scale to exactly this kinetic energy, for the isokinetic thermostat.
 
@@ -48,41 +49,30 @@ def thermal_velocities(
     InputError
         Energies that are not positive; nothing can move.
     UnsupportedError
-        `zero_momentum` with rows that fix atoms in space.
+        `zero_momentum` with rows that hold atoms in space in every direction.
     """
-    for item, value in (("thermal_energy", thermal_energy), ("kinetic_energy", kinetic_energy)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(f"{item} is {value}; give a positive number", item=item)
+    positive(thermal_energy, "thermal_energy")
+    if kinetic_energy is not None:
+        positive(kinetic_energy, "kinetic_energy")
     generator = rng if isinstance(rng, np.random.Generator) else np.random.default_rng(rng)
     motion = system.motion
     x = np.ascontiguousarray(positions, dtype=np.float64)
     drive = motion.project_velocities(x, np.zeros_like(x), time=time)
     noise = generator.standard_normal(x.shape) * np.sqrt(thermal_energy * system.inverse_masses)
+    free = motion.degrees_of_freedom
     if zero_momentum:
-        noise -= drift_velocity(system, noise)
+        directions = open_directions(motion, x, time)
+        noise -= drift_velocity(noise, system.masses, directions)
+        free -= len(directions)
     v = motion.project_velocities(x, drive + noise, time=time) - drive
     if kinetic_energy is not None:
         # The drive is M-orthogonal to all that is tangent, so that energies add up.
         has, left = system.kinetic_energy(v), kinetic_energy - system.kinetic_energy(drive)
-        if not (has > 0 and left > 0):
+        if not (free > 0 and has > 0 and left > 0):
             raise InputError(
                 f"no velocities have the kinetic energy {kinetic_energy}: moving targets alone take "
-                f"{kinetic_energy - left:g}, and the rows leave {motion.degrees_of_freedom} degrees of freedom",
+                f"{kinetic_energy - left:g}, and {free} degrees of freedom are left",
                 item="kinetic_energy",
             )
         v *= math.sqrt(left / has)
     return drive + v
-
-
-def drift_velocity(system: System, velocities: FloatArray) -> FloatArray:
-    """Velocity of the centre of mass, shape (3,).
-
-    Raises
-    ------
-    UnsupportedError
-        Rows or fixed atoms know a place in space: total momentum cannot be taken out.
-    """
-    for item in system.motion.constraint_set.constraints:
-        if not item.translation_invariant:
-            raise UnsupportedError(f"total momentum is not conserved: {item.family} holds atoms in space")
-    return np.asarray(system.masses @ velocities / system.masses.sum())

@@ -1,0 +1,145 @@
+"""The isokinetic kick at fixed positions in closed form, for any strength of the force.
+
+With u the velocities on the surface, F = M_par^+ f and 2K = u^T M u, the equation du/dt = F - (u.f/2K) u has the
+solution u(t) = (u + s F)/s', where c^2 = f.F/2K, a = u.f/2K and
+
+    s = (a/c^2)(cosh ct - 1) + sinh(ct)/c,    s' = (a/c) sinh ct + cosh ct.
+
+Everything is divided by e^{ct}, which overflows for ct > 710. Only sums over the atoms enter: u^T M u, u.f and f.F.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+
+#: Sums may be taken in any order, so that they are compiled to vector instructions; NaN stays NaN.
+_SUMS = {"reassoc", "contract", "arcp", "nsz"}
+#: Below this share of the terms, their sum has lost digits.
+_CANCELS = 0.01
+
+
+class Weights(NamedTuple):
+    """What of the velocities becomes of the kick: u' = keep u + push F, and by how much it was scaled."""
+
+    keep: float
+    push: float
+    log_growth: float
+    #: Whether digits were lost, so that u' must be found by `turned`.
+    cancels: bool
+
+
+def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
+    """Factors of the kick over a time t.
+
+    Parameters
+    ----------
+    aligned, square, twice : float
+        u.f, f.F and 2K.
+    t : float
+        May be negative.
+    """
+    a = aligned / twice
+    c2 = square / twice if square > 0 else 0.0
+    z = math.sqrt(c2) * abs(t)
+    decay = math.exp(-z)
+    # sinh z/z, (cosh z - 1)/z^2 and cosh z, times e^-z; expm1 is exact near 0.
+    sinh = -0.5 * math.expm1(-2 * z) / z if z > 0 else 1.0
+    cosh_less = 0.5 * (math.expm1(-z) / z) ** 2 if z > 0 else 0.5
+    cosh = 0.5 * (1 + decay * decay)
+    growth = a * t * sinh + cosh
+    if not growth > _CANCELS:
+        return Weights(math.nan, math.nan, math.nan, True)
+    return Weights(decay / growth, t * (a * t * cosh_less + sinh) / growth, z + math.log(growth), False)
+
+
+def turned(
+    u: FloatArray, pace: FloatArray, masses: FloatArray, square: float, twice: float, t: float
+) -> tuple[FloatArray, float]:
+    """The kick of velocities that run against a strong force, and log of its growth.
+
+    There u + s F and s' are differences of numbers that are nearly equal. The part of u across F decides how fast u
+    turns round; with e = F/|F|, p = u.e/|u|, and q that part:
+
+        u(t) = (q e^{-z} + e |u| [(1 + p) - (1 - p) e^{-2z}]/2)/g,    g = [(1 + p) + (1 - p) e^{-2z}]/2.
+
+    Parameters
+    ----------
+    u, pace, masses : ndarray, shape (n_atoms, 3)
+        Velocities, F and masses; masses are 0 for atoms that do not take part.
+    square, twice, t : float
+        As for `weights`.
+    """
+    length = math.sqrt(square)
+    axis = pace * (math.copysign(1.0, t) / length)
+    inside = np.where(masses > 0, u, 0.0)
+    speed = math.sqrt(twice)
+    along = float((masses * inside * axis).sum())
+    across = inside - along * np.where(masses > 0, axis, 0.0)
+    q2 = min(float((masses * across * across).sum()) / twice, 1.0)
+    p = math.copysign(math.sqrt(1.0 - q2), along)
+    one_plus = q2 / (1.0 - p) if p < 0 else 1.0 + p
+    z = length / speed * abs(t)
+    decay = math.exp(-z)
+    growth = 0.5 * (one_plus + (1.0 - p) * decay * decay)
+    if not growth > 0:  # exactly against the force, for longer than any rounding
+        return np.where(masses > 0, -speed * axis, u), -z
+    lead = 0.5 * (one_plus - (1.0 - p) * decay * decay) * speed
+    return np.where(masses > 0, (decay * across + lead * axis) / growth, u), z + math.log(growth)
+
+
+# -- sums over the atoms ----------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+def sums(u, pace, masses):  # type: ignore[no-untyped-def]
+    """u^T M u, u^T M F and F^T M F, flat."""
+    a, b, m = u.ravel(), pace.ravel(), masses.ravel()
+    uu = up = pp = 0.0
+    for i in range(a.size):
+        w = m[i] * a[i]
+        uu += w * a[i]
+        up += w * b[i]
+        pp += m[i] * b[i] * b[i]
+    return uu, up, pp
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+def square_sum(u, masses):  # type: ignore[no-untyped-def]
+    """u^T M u."""
+    a, m = u.ravel(), masses.ravel()
+    uu = 0.0
+    for i in range(a.size):
+        uu += m[i] * a[i] * a[i]
+    return uu
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_SUMS)
+def aligned_sum(u, f, taken):  # type: ignore[no-untyped-def]
+    """u.f of the atoms for which `taken` is not 0."""
+    a, b, m = u.ravel(), f.ravel(), taken.ravel()
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i] if m[i] > 0 else 0.0
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def combine(u, keep, f, push, weights, out):  # type: ignore[no-untyped-def]
+    """out = keep u + push w f, w per coordinate."""
+    a, b, w, c = u.ravel(), f.ravel(), weights.ravel(), out.ravel()
+    for i in range(a.size):
+        c[i] = keep * a[i] + push * (w[i] * b[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def mix(u, keep, pace, push, out):  # type: ignore[no-untyped-def]
+    """out = keep u + push F."""
+    a, b, c = u.ravel(), pace.ravel(), out.ravel()
+    for i in range(a.size):
+        c[i] = keep * a[i] + push * b[i]

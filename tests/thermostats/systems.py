@@ -1,0 +1,82 @@
+"""Small systems for the tests of thermostats, and an independent integration of the isokinetic equations."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint, Distance
+from kcons.motion import Motion
+from kcons.steppers import State, System
+
+Array = NDArray[np.float64]
+METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+TEN = list(combinations(range(5), 2))
+
+
+def system(rows: list[Constraint], x, masses, force=None, potential=None, time=0.0) -> System:
+    x = np.asarray(x, dtype=float)
+    return System(Motion(ConstraintSet(rows, x, masses, time=time), x, time=time), force, potential=potential)
+
+
+def repelling(x: Array, t: float = 0.0) -> Array:
+    """Soft pairs: no place in space, some torque-free."""
+    d = x[:, None] - x[None, :]
+    r2 = (d * d).sum(-1) + np.eye(len(x))
+    return (d * np.exp(-r2)[..., None]).sum(1) * 2
+
+
+def repelling_potential(x: Array, t: float = 0.0) -> float:
+    d = x[:, None] - x[None, :]
+    r2 = (d * d).sum(-1)[np.triu_indices(len(x), 1)]
+    return float(np.exp(-r2).sum())
+
+
+def quartic(x: Array, t: float = 0.0) -> Array:
+    return -(x**3)
+
+
+def quartic_potential(x: Array, t: float = 0.0) -> float:
+    return float((x**4).sum() / 4)
+
+
+def waves(x: Array, t: float = 0.0) -> Array:
+    """A field that is the same nowhere, and exerts torques."""
+    return np.sin(np.array([1.0, 1.3, 0.7]) * x + np.array([0.1, 0.5, 0.9]))
+
+
+def waves_potential(x: Array, t: float = 0.0) -> float:
+    k = np.array([1.0, 1.3, 0.7])
+    return float((np.cos(k * x + np.array([0.1, 0.5, 0.9])) / k).sum())
+
+
+def dumbbells(n: int = 2, seed: int = 0, force=waves, potential=waves_potential) -> tuple[System, Array]:
+    rng = np.random.default_rng(seed)
+    x = np.repeat(2.5 * np.stack(np.unravel_index(np.arange(n), (2, 2, 99)), 1).astype(float), 2, axis=0)
+    turn = rng.standard_normal((n, 3))
+    x[1::2] += turn / np.linalg.norm(turn, axis=1)[:, None]
+    masses = np.tile([1.0, 2.0], n)
+    pairs = np.arange(2 * n).reshape(-1, 2)
+    return system([Distance(pairs, np.ones(n))], x, masses, force, potential), x
+
+
+def integrated(system: System, state: State, end: float) -> tuple[Array, Array]:
+    """Gauss's principle with all rows and v^T M at once, dense, by an ODE solver."""
+    held, masses = system.motion.constraint_set, np.repeat(system.masses, 3)
+
+    def slope(t, y):
+        x, v = y[: len(y) // 2], y[len(y) // 2 :]
+        place = x.reshape(-1, 3)
+        f = np.asarray(system.force(place, t)).ravel()
+        rows = np.vstack([held.jacobian(place, t).toarray(), masses * v])
+        b = np.append(held.acceleration_target(place, v.reshape(-1, 3), t), 0.0)
+        z = rows.T @ np.linalg.lstsq((rows / masses) @ rows.T, b - rows @ (f / masses), rcond=None)[0]
+        return np.concatenate([v, (f + z) / masses])
+
+    begin = np.concatenate([state.positions.ravel(), state.velocities.ravel()])
+    found = solve_ivp(slope, (state.time, end), begin, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    return found[: len(masses)].reshape(-1, 3), found[len(masses) :].reshape(-1, 3)
