@@ -39,6 +39,8 @@ Convention = Literal["exact", "notes"]
 SMALLEST = 1e-290
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
 ROUNDING = 1e-12
+#: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
+MANY = 1e4
 _MAX_ITERATIONS = 50
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
@@ -267,7 +269,7 @@ class Isokinetic(Splitting):
         assert state.forces is not None
         share = self._share(system)
         rest = _split(system, state.positions, state.velocities, state.time)[1]
-        return float(closed_form.aligned_sum(rest, state.forces, share.masses)) / share.square(rest)
+        return float(closed_form.raw_sums(rest, state.forces, system.weights, share.masses)[0]) / share.square(rest)
 
     def compression_rate(self, system: System, state: State) -> float:
         """Divergence of the flow in phase space, -(g - 1) alpha."""
@@ -349,7 +351,8 @@ def paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> Flo
     motion = system.motion
     if motion.plan.driven:
         return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
-    pace = forces * system.weights
+    with np.errstate(over="ignore"):  # velocities are checked
+        pace = forces * system.weights
     return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
 
 
@@ -417,10 +420,10 @@ class _Step:
         system, share = self.system, self.share
         if system.force is None:
             return
-        aligned = float(closed_form.aligned_sum(self.u, self.forces, share.masses))
+        aligned, raw = closed_form.raw_sums(self.u, self.forces, system.weights, share.masses)
         w = closed_form.weights(aligned, self.push_square, self.left, t)
-        if w.cancels:
-            self._turn(paced(system, self.x, self.forces, self.now), 1.0, t)
+        if w.cancels or not w.push * w.push * raw <= MANY * self.left:
+            self.kick(t)
             return
         u = np.empty_like(self.u)
         closed_form.combine(self.u, w.keep, self.forces, w.push, system.weights, u)
@@ -458,10 +461,10 @@ class _Step:
 
     def _turn(self, pace: FloatArray, factor: float, t: float) -> None:
         share = self.share
-        u, growth = closed_form.turned(factor * self.u, pace, share.masses, self.push_square, self.left, t)
+        u, growth = closed_form.turned(factor * self.u, pace, share.masses, self.left, t)
         if share.others is not None:
             u = np.where(share.others, self.u + t * pace, u)
-        self.u = share.scaled(u, self.left)
+        self.u = u
         self.integral += growth
 
     # -- drifts ---------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ class Weights(NamedTuple):
     keep: float
     push: float
     log_growth: float
-    #: Whether digits were lost, so that u' must be found by `turned`.
+    #: Whether digits were lost, or c^2 is too large a number, so that u' must be found by `turned`.
     cancels: bool
 
 
@@ -46,6 +46,8 @@ def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
     """
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
+    if not math.isfinite(c2):
+        return Weights(math.nan, math.nan, math.nan, True)
     z = math.sqrt(c2) * abs(t)
     decay = math.exp(-z)
     # sinh z/z, (cosh z - 1)/z^2 and cosh z, times e^-z; expm1 is exact near 0.
@@ -58,9 +60,7 @@ def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
     return Weights(decay / growth, t * (a * t * cosh_less + sinh) / growth, z + math.log(growth), False)
 
 
-def turned(
-    u: FloatArray, pace: FloatArray, masses: FloatArray, square: float, twice: float, t: float
-) -> tuple[FloatArray, float]:
+def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t: float) -> tuple[FloatArray, float]:
     """The kick of velocities that run against a strong force, and log of its growth.
 
     There u + s F and s' are differences of numbers that are nearly equal. The part of u across F decides how fast u
@@ -72,25 +72,30 @@ def turned(
     ----------
     u, pace, masses : ndarray, shape (n_atoms, 3)
         Velocities, F and masses; masses are 0 for atoms that do not take part.
-    square, twice, t : float
+    twice, t : float
         As for `weights`.
     """
-    length = math.sqrt(square)
-    axis = pace * (math.copysign(1.0, t) / length)
-    inside = np.where(masses > 0, u, 0.0)
+    inside = np.where(masses > 0, pace, 0.0)
+    largest = float(np.abs(inside).max())
+    axis = inside / largest  # squares of the strongest forces overflow
+    length = math.sqrt(float((masses * axis * axis).sum()))
+    axis *= math.copysign(1.0, t) / length
     speed = math.sqrt(twice)
-    along = float((masses * inside * axis).sum())
-    across = inside - along * np.where(masses > 0, axis, 0.0)
+    along = float((masses * u * axis).sum())
+    across = np.where(masses > 0, u, 0.0) - along * axis
+    across -= float((masses * across * axis).sum()) * axis  # what rounding left along the force
     q2 = min(float((masses * across * across).sum()) / twice, 1.0)
     p = math.copysign(math.sqrt(1.0 - q2), along)
     one_plus = q2 / (1.0 - p) if p < 0 else 1.0 + p
-    z = length / speed * abs(t)
+    z = largest * (length / speed * abs(t))
     decay = math.exp(-z)
     growth = 0.5 * (one_plus + (1.0 - p) * decay * decay)
-    if not growth > 0:  # exactly against the force, for longer than any rounding
+    if growth == 0:  # exactly against the force, for longer than any rounding
         return np.where(masses > 0, -speed * axis, u), -z
     lead = 0.5 * (one_plus - (1.0 - p) * decay * decay) * speed
-    return np.where(masses > 0, (decay * across + lead * axis) / growth, u), z + math.log(growth)
+    after = (decay * across + lead * axis) / growth
+    after *= math.sqrt(twice / float((masses * after * after).sum()))
+    return np.where(masses > 0, after, u), z + math.log(growth)
 
 
 # -- sums over the atoms ----------------------------------------------------------------------------
@@ -120,13 +125,15 @@ def square_sum(u, masses):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_SUMS)
-def aligned_sum(u, f, taken):  # type: ignore[no-untyped-def]
-    """u.f of the atoms for which `taken` is not 0."""
-    a, b, m = u.ravel(), f.ravel(), taken.ravel()
-    total = 0.0
+def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
+    """u.f and f.M^-1 f of the atoms whose mass is not 0 here; `weights` is 1/m."""
+    a, b, w, m = u.ravel(), f.ravel(), weights.ravel(), masses.ravel()
+    uf = ff = 0.0
     for i in range(a.size):
-        total += a[i] * b[i] if m[i] > 0 else 0.0
-    return total
+        taken = m[i] * w[i]  # 1 or 0
+        uf += taken * (a[i] * b[i])
+        ff += taken * (w[i] * b[i] * b[i])
+    return uf, ff
 
 
 @numba.njit(cache=True, nogil=True)

@@ -24,10 +24,15 @@ def system(rows: list[Constraint], x, masses, force=None, potential=None, time=0
 
 
 def repelling(x: Array, t: float = 0.0) -> Array:
-    """Soft pairs: no place in space, some torque-free."""
+    """Soft pairs: no place in space, no torque."""
     d = x[:, None] - x[None, :]
     r2 = (d * d).sum(-1) + np.eye(len(x))
     return (d * np.exp(-r2)[..., None]).sum(1) * 2
+
+
+def swirling(x: Array, t: float = 0.0) -> Array:
+    """Adds up to nothing wherever it is, and exerts a torque."""
+    return repelling(x) + np.cross([0.3, 0.1, 1.0], x - x.mean(axis=0))
 
 
 def repelling_potential(x: Array, t: float = 0.0) -> float:

@@ -1,0 +1,198 @@
+"""Degrees of freedom, counted by hand, and what the thermostats hold by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kcons.constraints import (
+    CenterOfMass,
+    Cylinder,
+    Distance,
+    FixedAtoms,
+    LinearVelocity,
+    Plane,
+    Sphere,
+)
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.steppers import State
+from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
+from kcons.thermostats.freedom import drift_velocity, open_directions
+from thermostats.systems import METHANE, TEN, quartic, repelling, swirling, system, waves
+
+RNG = np.random.default_rng(11)
+SCATTERED = 3.0 * RNG.standard_normal((12, 3))
+WEIGHTS = np.linspace(1.0, 3.0, 12)
+
+
+def methanes(force):
+    """Two methanes, each by all ten distances (rank 9), and two free atoms."""
+    x = np.vstack([METHANE, METHANE + np.array([5.0, 0, 0]), [[0, 4.0, 1.0], [2.0, -3.0, 0.5]]])
+    pairs = np.array(TEN + [(i + 5, j + 5) for i, j in TEN])
+    return system([Distance(pairs)], x, WEIGHTS, force), x
+
+
+def mixed(force):
+    """A bond from a fixed atom, a bond named twice, a bond between free atoms, and atoms on a plane."""
+    rows = [FixedAtoms([0]), Distance([[0, 1], [2, 3], [2, 3], [4, 5]]), Plane([6, 7], [0, 0, 1.0])]
+    return system(rows, SCATTERED, WEIGHTS, force), SCATTERED
+
+
+def gravity(x, t):
+    return np.tile([0.0, 0.0, -2.0], (len(x), 1)) + swirling(x)
+
+
+FLAT = SCATTERED[:6] * [1.0, 1.0, 0.0]
+ROUND = SCATTERED[:6].copy()
+ROUND[:, :2] *= 2.0 / np.linalg.norm(ROUND[:, :2], axis=1)[:, None]
+
+# (system and positions, g by hand, directions in which momentum is conserved)
+COUNTED = {
+    "free atoms, own forces": ((system([], SCATTERED, WEIGHTS, swirling), SCATTERED), 36 - 3, 3),
+    "free atoms in a field": ((system([], SCATTERED, WEIGHTS, waves), SCATTERED), 36, 0),
+    "ideal gas": ((system([], SCATTERED, WEIGHTS), SCATTERED), 36 - 3, 3),
+    "gravity": ((system([], SCATTERED, WEIGHTS, gravity), SCATTERED), 36 - 2, 2),
+    "a trap": ((system([], SCATTERED, WEIGHTS, quartic), SCATTERED), 36, 0),
+    "methanes, redundant": (methanes(swirling), 36 - 18 - 3, 3),
+    "methanes in a field": (methanes(waves), 36 - 18, 0),
+    "mixed": (mixed(swirling), 36 - 3 - 1 - 1 - 1 - 2, 0),
+    "centre of mass held": (
+        (system([CenterOfMass([list(range(12))])], SCATTERED, WEIGHTS, swirling), SCATTERED),
+        36 - 3,
+        0,
+    ),
+    "flat": ((system([Plane(list(range(6)), [0, 0, 1.0])], FLAT, WEIGHTS[:6], swirling), FLAT), 12 - 2, 2),
+    "on a cylinder": (
+        (system([Cylinder(list(range(6)), [0, 0, 0], [0, 0, 1.0], 2.0)], ROUND, WEIGHTS[:6], swirling), ROUND),
+        12 - 1,
+        1,
+    ),
+    "a velocity row": (
+        (system([LinearVelocity([[0, 1]], [[[1.0, 0, 0], [-1.0, 0, 0]]])], SCATTERED, WEIGHTS, swirling), SCATTERED),
+        36 - 1 - 3,
+        3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_the_thermostats_hold_what_is_counted_by_hand(name):
+    (held, x), count, directions = COUNTED[name]
+    zero = {"zero_momentum": True} if directions else {}
+    state = State(x, thermal_velocities(held, x, 0.7, 1, **zero))
+    forces = held.forces(x, state.velocities, 0.0, 0)
+    assert freedom(held, state, forces).count == count
+    assert len(freedom(held, state, forces).directions) == directions
+    for kt in (0.7, 1.9):
+        begun = Isokinetic(kt).start(held, state)
+        assert 2 * held.kinetic_energy(begun.velocities) == pytest.approx((count - 1) * kt, rel=1e-12)
+        after = Isokinetic(kt).step(held, begun, 0.01)
+        assert 2 * held.kinetic_energy(after.velocities) == pytest.approx((count - 1) * kt, rel=1e-12)
+        assert after.thermostat[0] == pytest.approx((count - 1) * kt, rel=1e-14)
+    moving = int((held.inverse_masses > 0).sum())
+    notes = Isokinetic(0.7, convention="notes").start(held, state)
+    assert 2 * held.kinetic_energy(notes.velocities) == pytest.approx(3 * moving * 0.7, rel=1e-12)
+    assert NoseHooverChain(0.7, 1.0).start(held, state).thermostat[-1] == count
+
+
+def test_conserved_directions_lie_where_they_should():
+    (flat, x), _, _ = COUNTED["flat"]
+    assert np.abs(open_directions(flat.motion, x)[:, 2]).max() <= 1e-12
+    (falling, y), _, _ = COUNTED["gravity"]
+    found = freedom(falling, State(y, y), falling.forces(y, y, 0.0, 0)).directions
+    assert np.abs(found[:, 2]).max() <= 1e-7
+    np.testing.assert_allclose(found @ found.T, np.eye(2), atol=1e-12)
+
+
+def test_forces_that_cancel_by_symmetry_do_not_conserve_momentum():
+    x = np.array([[0.7, 0.2, -0.4], [-0.7, -0.2, 0.4]])
+    held = system([], x, [1.0, 1.0], quartic)
+    assert np.abs(quartic(x).sum(axis=0)).max() == 0
+    assert freedom(held, State(x, x), quartic(x)).count == 6
+
+
+def test_forces_in_single_precision_are_balanced_enough():
+    held = system([], SCATTERED, WEIGHTS, lambda x, t: swirling(x).astype(np.float32))
+    state = State(SCATTERED, SCATTERED)
+    assert freedom(held, state, held.forces(SCATTERED, SCATTERED, 0.0, 0)).count == 33
+
+
+@pytest.mark.parametrize(("momentum", "count"), [("auto", 36), ("conserved", 33), ("free", 36)])
+def test_momentum_by_request(momentum, count):
+    held = system([], SCATTERED, WEIGHTS, waves)
+    state = State(SCATTERED, SCATTERED)
+    assert freedom(held, state, waves(SCATTERED), momentum=momentum).count == count
+
+
+def test_one_atom_keeps_its_momentum():
+    held = system([], SCATTERED[:1], [1.0], lambda x, t: np.zeros_like(x))
+    state = State(SCATTERED[:1], SCATTERED[:1])
+    assert freedom(held, state, np.zeros((1, 3))).count == 3
+
+
+def test_a_part_of_the_system():
+    held, x = mixed(swirling)
+    state = State(x, thermal_velocities(held, x, 1.0, 0))
+    forces = swirling(x)
+    assert freedom(held, state, forces, [2, 3, 8]).count == 9 - 1
+    assert freedom(held, state, forces, [0, 1, 6]).count == 9 - 3 - 1 - 1
+    assert freedom(held, state, forces, [10, 11]).count == 6
+    assert freedom(held, state, forces, np.arange(12) >= 10).count == 6
+    everything = freedom(held, state, forces, range(12))
+    assert everything.atoms is None and everything.count == 28
+    with pytest.raises(UnsupportedError, match=r"couples thermostatted atoms to others"):
+        freedom(held, state, forces, [2, 8])
+
+
+@pytest.mark.parametrize("atoms", [[], [12], [-1], [0.5], ["a"], np.zeros(12, dtype=bool)])
+def test_bad_atom_numbers(atoms):
+    held, x = mixed(swirling)
+    with pytest.raises(InputError, match="atoms must be whole numbers from 0 to 11"):
+        freedom(held, State(x, x), swirling(x), atoms)
+
+
+def test_what_cannot_be():
+    held, x = mixed(swirling)
+    state = State(x, np.zeros_like(x))
+    with pytest.raises(InputError, match="choose 'auto'"):
+        freedom(held, state, swirling(x), momentum="maybe")
+    with pytest.raises(UnsupportedError, match="hold atoms in space in every direction"):
+        freedom(held, state, swirling(x), momentum="conserved")
+    with pytest.raises(UnsupportedError, match="total momentum is not conserved"):
+        drift_velocity(x, WEIGHTS, open_directions(held.motion, x))
+    rigid = system([Distance(TEN)], METHANE, np.ones(5), swirling)
+    state = State(METHANE, METHANE)
+    assert freedom(rigid, state, swirling(METHANE)).count == 3
+    pinned = system([FixedAtoms(range(5))], METHANE, np.ones(5), swirling)
+    with pytest.raises(OverdeterminedError, match="no degree of freedom is left"):
+        freedom(pinned, state, swirling(METHANE))
+
+
+def test_total_momentum_that_is_conserved_and_not_zero_is_said():
+    """H39: P exp(-U/2K) is conserved, so that no K gives a temperature."""
+    held = system([], SCATTERED, WEIGHTS, swirling)
+    still = State(SCATTERED, thermal_velocities(held, SCATTERED, 1.0, 0, zero_momentum=True))
+    moving = replace(still, velocities=still.velocities + np.array([0.0, 0.01, 0.0]))
+    for thermostat in (Isokinetic(1.0), Isokinetic(), NoseHooverChain(1.0, 1.0)):
+        thermostat.start(held, still)
+        with pytest.warns(UserWarning, match="total momentum is not zero"):
+            thermostat.start(held, moving)
+    field = system([], SCATTERED, WEIGHTS, waves)
+    Isokinetic(1.0).start(field, moving)
+
+
+def test_angular_momentum_of_a_free_cluster_is_said():
+    held = system([], SCATTERED, WEIGHTS, repelling)
+    state = State(SCATTERED, thermal_velocities(held, SCATTERED, 1.0, 0, zero_momentum=True))
+    for thermostat in (Isokinetic(1.0), NoseHooverChain(1.0, 1.0)):
+        with pytest.warns(UserWarning, match="exert no torque"):
+            thermostat.start(held, state)
+    Isokinetic().start(held, state)  # no temperature is asked for
+
+
+def test_a_sphere_has_no_open_direction_and_a_far_plane_two():
+    x = np.array([[0.0, 0, 1.0], [3.0, 0.2, 0.1]])
+    assert len(open_directions(system([Sphere([0], [0, 0, 0.0], 1.0)], x, [1.0, 1.0]).motion, x)) == 0
+    assert len(open_directions(system([Plane([0], [0, 1.0, 1.0])], x, [1.0, 1.0]).motion, x)) == 2
