@@ -109,6 +109,8 @@ class NoseHooverChain:
 
         Raises
         ------
+        InputError
+            A time step that the chain cannot follow; the state carries variables of another thermostat.
         ConvergenceError, NonFiniteError, InputError, UnsupportedError
             As for the stepper.
         """
@@ -117,9 +119,16 @@ class NoseHooverChain:
         if still is not None:
             return still
         begin = self.start(system, state)
-        v, chain = self._half(system, begin.velocities, begin.thermostat, dt)
-        after = self.stepper.step(system, replace(begin, velocities=v), dt)
-        v, chain = self._half(system, after.velocities, chain, dt)
+        try:
+            v, chain = self._half(system, begin.velocities, begin.thermostat, dt)
+            after = self.stepper.step(system, replace(begin, velocities=v), dt)
+            v, chain = self._half(system, after.velocities, chain, dt)
+        except OverflowError:
+            raise InputError(
+                f"step {state.step + 1}: a chain of period {self.period:g} cannot follow a time step of {dt:g}; take at "
+                "most a twentieth of the period",
+                item="dt",
+            ) from None
         return replace(after, velocities=v, thermostat=chain)
 
     def _masses(self, count: float) -> FloatArray:

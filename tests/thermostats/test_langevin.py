@@ -1,0 +1,174 @@
+"""Geodesic BAOAB: exact friction and noise on the constraints, restarts, momentum, bad input."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import State, System, run
+from kcons.thermostats import Isokinetic, Langevin, thermal_velocities
+from thermostats.systems import METHANE, TEN, dumbbells, quartic, quartic_potential, swirling, system, waves
+
+
+def started(n=2, **options):
+    held, x = dumbbells(n, **options)
+    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
+
+
+def test_free_flight_forgets_its_velocity_at_the_rate_asked_for():
+    """Without forces and rows a step is the exact Ornstein-Uhlenbeck process: <v(t)> = e^{-gamma t} v(0)."""
+    n, kt, gamma, dt = 20_000, 0.7, 0.8, 0.5
+    held = system([], np.zeros((n, 3)), np.full(n, 2.0))
+    v = np.tile([1.0, -0.5, 0.2], (n, 1))
+    state = State(np.zeros((n, 3)), v)
+    for k in range(1, 4):
+        state = Langevin(kt, gamma, 7).step(held, state, dt)
+        keep = math.exp(-gamma * dt * k)
+        spread = math.sqrt(kt / 2 * (1 - keep**2))
+        np.testing.assert_allclose(state.velocities.mean(axis=0), keep * v[0], atol=4.5 * spread / math.sqrt(n))
+        np.testing.assert_allclose(state.velocities.std(axis=0), spread, rtol=4.5 / math.sqrt(2 * n))
+
+
+def test_everything_stays_on_the_constraints():
+    x = np.vstack([METHANE, METHANE + np.array([4.0, 0, 0])])
+    rows = np.array(TEN + [(i + 5, j + 5) for i, j in TEN])
+    held = system([Distance(rows), Plane([0], [0, 0, 1.0])], x, np.tile([12.0, 1, 1, 1, 1], 2), waves)
+    state = held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
+    after = run(held, state, 0.02, 300, stepper=Langevin(0.5, 2.0, 3))
+    held_rows = held.motion.constraint_set
+    assert np.abs(held_rows.value(after.positions)).max() <= 1e-13
+    assert np.abs(held_rows.jacobian(after.positions) @ after.velocities.ravel()).max() <= 1e-13
+
+
+def test_without_friction_it_is_the_plain_scheme():
+    held, state = started()
+    one = run(held, state, 0.01, 100, stepper=Langevin(0.5, 0.0, 3, substeps=4))
+    errors = []
+    for n in (50, 100, 200):
+        a = run(held, state, 1 / n, n, stepper=Langevin(0.5, 0.0, 3, substeps=4))
+        b = run(held, state, 1 / 1600, 1600)
+        errors.append(np.abs(a.positions - b.positions).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.15)
+    assert np.array_equal(
+        one.positions, run(held, state, 0.01, 100, stepper=Langevin(0.9, 0.0, 8, substeps=4)).positions
+    )
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_noise_is_a_function_of_seed_and_step(saved):
+    held, state = started()
+    thermostat = Langevin(0.5, 1.0, 3)
+    half = run(held, state, 0.02, 25, stepper=thermostat)
+    whole = run(held, half, 0.02, 25, stepper=thermostat)
+    if saved:
+        file = io.BytesIO()
+        half.save(file)
+        file.seek(0)
+        half = State.load(file)
+    again = run(held, half, 0.02, 25, stepper=Langevin(0.5, 1.0, 3))
+    for name in ("positions", "velocities", "forces", "thermostat"):
+        assert np.array_equal(getattr(whole, name), getattr(again, name)), name
+    other = run(held, half, 0.02, 25, stepper=Langevin(0.5, 1.0, 4))
+    assert np.abs(other.positions - whole.positions).max() > 1e-3
+    repeated = run(held, replace(half, step=0), 0.02, 25, stepper=Langevin(0.5, 1.0, 3))
+    assert np.abs(repeated.positions - whole.positions).max() > 1e-3
+
+
+def test_momentum_is_left_alone_where_asked():
+    held, state = started(force=swirling, potential=None)
+    state = replace(state, velocities=state.velocities + np.array([0.3, 0, 0]))
+    total = held.masses @ state.velocities
+    after = run(held, state, 0.01, 500, stepper=Langevin(0.5, 2.0, 3, conserve_momentum=True))
+    np.testing.assert_allclose(held.masses @ after.velocities, total, atol=1e-12)
+    forgotten = run(held, state, 0.01, 500, stepper=Langevin(0.5, 2.0, 3))
+    assert np.abs(held.masses @ forgotten.velocities - total).max() > 0.1
+
+
+def test_momentum_along_a_plane():
+    x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
+    flat = system([Plane(range(5), [0, 0, 1.0])], x, np.arange(1.0, 6), swirling)
+    state = State(x, thermal_velocities(flat, x, 1.0, 5, zero_momentum=True))
+    after = run(flat, state, 0.01, 200, stepper=Langevin(0.5, 2.0, 3, conserve_momentum=True))
+    assert np.abs(flat.masses @ after.velocities).max() <= 1e-12
+
+
+def test_momentum_cannot_be_conserved_with_atoms_held_in_space():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = system([FixedAtoms([0])], x, [1.0, 1.0], waves)
+    with pytest.raises(UnsupportedError, match="total momentum is not conserved"):
+        Langevin(0.5, 1.0, 3, conserve_momentum=True).step(held, State(x, np.zeros_like(x)), 0.01)
+
+
+def test_moving_targets_are_followed_and_friction_knows_their_speed():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    held = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t), Sphere([0], [0, 0, -1.0], 1.0)], x, [1.0, 3.0], waves)
+    state = held.initial_state(x, thermal_velocities(held, x, 0.5, 3))
+    after = run(held, state, 0.01, 200, stepper=Langevin(0.5, 50.0, 3))
+    d = after.positions[1] - after.positions[0]
+    assert np.linalg.norm(d) == pytest.approx(2.0, rel=1e-13)
+    assert d @ (after.velocities[1] - after.velocities[0]) / 2 == pytest.approx(0.5, rel=1e-12)
+
+
+def test_heat_is_counted():
+    """Total energy less the heat stays, to the order of the scheme."""
+    drifts = []
+    for dt in (0.02, 0.01):
+        held, x = dumbbells(2, force=quartic, potential=quartic_potential)
+        x = x - 1.2
+        held = System(held.motion, quartic, potential=quartic_potential)
+        thermostat = Langevin(0.5, 1.0, 3)
+        values = []
+        run(
+            held,
+            State(x, thermal_velocities(held, x, 0.5, 4)),
+            dt,
+            round(20 / dt),
+            stepper=thermostat,
+            observers=[lambda s, h=held, t=thermostat, v=values: v.append(t.conserved_energy(h, s))],
+        )
+        drifts.append(np.std(values))
+        assert np.abs(np.diff(values)).max() <= 20 * dt**2
+    assert drifts[0] <= 0.05
+    assert drifts[1] <= 0.5 * drifts[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"thermal_energy": 0.0}, "thermal_energy is 0.0; give a positive number"),
+        ({"thermal_energy": math.nan}, "thermal_energy is nan"),
+        ({"friction": -1.0}, "friction is -1.0; give one number >= 0"),
+        ({"friction": [1.0, 2.0]}, "give one number"),
+        ({"friction": math.inf}, "friction is inf"),
+        ({"substeps": 0}, "substeps is 0"),
+        ({"substeps": 1.5}, "substeps is 1.5"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": 0.5}, "seed is 0.5"),
+    ],
+)
+def test_bad_parameters(options, words):
+    with pytest.raises(InputError, match=words):
+        Langevin(**{"thermal_energy": 1.0, "friction": 1.0, "seed": 0, **options})
+
+
+def test_steps_that_cannot_be():
+    held, state = started()
+    thermostat = Langevin(0.5, 1.0, 3)
+    with pytest.raises(InputError, match="noise cannot be taken back"):
+        thermostat.step(held, state, -0.01)
+    with pytest.raises(ConvergenceError, match="step 1: time step too large"):
+        thermostat.step(held, state, 90.0)
+    with pytest.raises(InputError, match="variables of another thermostat, not of Langevin"):
+        thermostat.step(held, Isokinetic(0.5).start(held, state), 0.01)
+    with pytest.raises(UnsupportedError, match="use friction"):
+        thermostat.step(System(held.motion, lambda x, v, t: -v, velocity_dependent=True), state, 0.1)
+    with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
+        thermostat.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), state, 0.1)
+    same = thermostat.step(held, state, 0.0)
+    assert np.array_equal(same.positions, state.positions) and np.array_equal(same.velocities, state.velocities)

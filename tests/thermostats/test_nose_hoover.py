@@ -1,0 +1,130 @@
+"""Nose-Hoover chains: reversible, of order 2, with a conserved energy; degrees of freedom by rank."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Distance, Plane
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import Geodesic, State, Suzuki4, System, run
+from kcons.thermostats import NoseHooverChain, thermal_velocities
+from thermostats.systems import METHANE, TEN, dumbbells, quartic, quartic_potential, system, waves
+
+
+def started(n=2, **options):
+    held, x = dumbbells(n, **options)
+    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
+
+
+@pytest.mark.parametrize(("length", "steps"), [(1, 500), (3, 500), (5, 100)])
+def test_a_negative_step_undoes_a_step(length, steps):
+    held, state = started()
+    thermostat = NoseHooverChain(0.5, 1.0, length=length)
+    begun = thermostat.start(held, state)
+    there = run(held, begun, 0.02, steps, stepper=thermostat)
+    back = run(held, there, -0.02, steps, stepper=thermostat)
+    assert np.abs(there.positions - begun.positions).max() > 0.1
+    assert np.abs(back.positions - begun.positions).max() <= 1e-10
+    assert np.abs(back.velocities - begun.velocities).max() <= 1e-10
+    assert np.abs(back.thermostat - begun.thermostat).max() <= 1e-10
+
+
+def test_order_two():
+    held, state = started()
+    thermostat = NoseHooverChain(0.5, 1.0)
+    exact = run(held, state, 1 / 3200, 3200, stepper=thermostat)
+    errors = [
+        np.abs(run(held, state, 1 / n, n, stepper=thermostat).positions - exact.positions).max() for n in (40, 80, 160)
+    ]
+    slopes = np.diff(-np.log2(errors))
+    np.testing.assert_allclose(slopes, 2, atol=0.15)
+
+
+def test_conserved_energy_has_no_slope():
+    held, x = dumbbells(2, force=quartic, potential=quartic_potential)
+    x = x - 1.2
+    thermostat = NoseHooverChain(0.5, 1.0)
+    values = []
+    run(
+        held,
+        State(x, thermal_velocities(held, x, 0.5, 4)),
+        0.01,
+        20_000,
+        stepper=thermostat,
+        observers=[lambda s: values.append(thermostat.conserved_energy(held, s))],
+        every=20,
+    )
+    trend = np.polyfit(np.linspace(0, 200, len(values)), values, 1)[0]
+    assert np.std(values) <= 5e-3
+    assert abs(trend) <= 1e-5
+
+
+def test_degrees_of_freedom_by_rank():
+    x = METHANE
+    held = system([Distance(TEN), Plane([0], [0, 0, 1.0])], x, [12.0, 1, 1, 1, 1], waves)
+    state = State(x, thermal_velocities(held, x, 0.5, 1))
+    assert NoseHooverChain(0.5, 1.0).start(held, state).thermostat[-1] == 15 - 9 - 1
+
+
+def test_a_saved_run_goes_on_to_the_last_bit():
+    held, state = started()
+    thermostat = NoseHooverChain(0.5, 1.0)
+    half = run(held, state, 0.02, 25, stepper=thermostat)
+    file = io.BytesIO()
+    half.save(file)
+    file.seek(0)
+    whole, again = (run(held, s, 0.02, 25, stepper=thermostat) for s in (half, State.load(file)))
+    for name in ("positions", "velocities", "forces", "thermostat"):
+        assert np.array_equal(getattr(whole, name), getattr(again, name)), name
+
+
+def test_another_stepper_of_order_two():
+    held, state = started()
+    a, b = (run(held, state, 0.01, 100, stepper=NoseHooverChain(0.5, 1.0, stepper=s)) for s in (None, Geodesic()))
+    assert 0 < np.abs(a.positions - b.positions).max() <= 1e-3
+    with pytest.raises(UnsupportedError, match="has order 4, the chain 2; use Rattle"):
+        NoseHooverChain(0.5, 1.0, stepper=Suzuki4())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"thermal_energy": 0.0}, "thermal_energy is 0.0; give a positive number"),
+        ({"period": -1.0}, "period is -1.0; give a positive number"),
+        ({"period": math.nan}, "period is nan"),
+        ({"length": 0}, "length is 0"),
+        ({"length": 1.5}, "length is 1.5"),
+    ],
+)
+def test_bad_parameters(options, words):
+    with pytest.raises(InputError, match=words):
+        NoseHooverChain(**{"thermal_energy": 1.0, "period": 1.0, **options})
+
+
+def test_steps_that_cannot_be():
+    held, state = started()
+    thermostat = NoseHooverChain(0.5, 1.0)
+    begun = thermostat.start(held, state)
+    copies = begun.positions.copy(), begun.velocities.copy(), begun.thermostat.copy()
+    with pytest.raises(ConvergenceError, match="step 1: time step too large"):
+        NoseHooverChain(0.5, 900.0).step(held, begun, 90.0)
+    with pytest.raises(InputError, match="step 1: a chain of period 1 cannot follow a time step of 90"):
+        thermostat.step(held, begun, 90.0)
+    with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
+        thermostat.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), begun, 0.1)
+    for now, before in zip((begun.positions, begun.velocities, begun.thermostat), copies, strict=True):
+        assert np.array_equal(now, before)
+    with pytest.raises(InputError, match="variables of another thermostat"):
+        NoseHooverChain(0.5, 1.0, length=4).step(held, begun, 0.01)
+    with pytest.raises(UnsupportedError, match="have no place"):
+        thermostat.step(System(held.motion, lambda x, v, t: -v, velocity_dependent=True), state, 0.1)
+    same = thermostat.step(held, begun, 0.0)
+    assert np.array_equal(same.velocities, begun.velocities)
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    moving = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t)], x, [1.0, 3.0], waves)
+    with pytest.raises(UnsupportedError, match="targets move"):
+        thermostat.step(moving, moving.initial_state(x), 0.01)
