@@ -125,8 +125,8 @@ class NoseHooverChain:
             v, chain = self._half(system, after.velocities, chain, dt)
         except OverflowError:
             raise InputError(
-                f"step {state.step + 1}: a chain of period {self.period:g} cannot follow a time step of {dt:g}; take at "
-                "most a twentieth of the period",
+                f"step {state.step + 1}: a chain of period {self.period:g} cannot follow a time step of {dt:g}; take "
+                "at most a twentieth of the period",
                 item="dt",
             ) from None
         return replace(after, velocities=v, thermostat=chain)

@@ -1,0 +1,274 @@
+"""Periodic fluids of molecules with Lennard-Jones sites and charges, smooth at the cutoff; any consistent units.
+
+Small and compiled: for statistics over millions of steps. Atoms of one molecule do not act on each other.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+
+#: Where the potential begins to be switched off, as a share of the cutoff.
+SWITCH = 0.7
+
+
+class LennardJones:
+    """Forces, energies and curvatures of a periodic fluid in a cubic box.
+
+    u(r) = S(r) [4 eps ((sigma/r)^12 - (sigma/r)^6) + q q'/r], mixed by Lorentz and Berthelot; S falls from 1 to 0 with
+    two continuous derivatives.
+
+    Parameters
+    ----------
+    molecule : array_like of int, shape (n_atoms,)
+        Molecule of each atom; atoms of one molecule follow each other.
+    masses, epsilon, sigma, charges : array_like, shape (n_atoms,), or float
+        `charges` in units in which the energy of two is q q'/r.
+    box : float
+        Edge of the cube.
+    cutoff : float, optional
+        Half the box by default.
+
+    Raises
+    ------
+    InputError
+        A cutoff above half the box: minimum images would be wrong.
+    """
+
+    def __init__(
+        self,
+        molecule: ArrayLike,
+        box: float,
+        *,
+        masses: ArrayLike = 1.0,
+        epsilon: ArrayLike = 1.0,
+        sigma: ArrayLike = 1.0,
+        charges: ArrayLike = 0.0,
+        cutoff: float | None = None,
+    ) -> None:
+        self.molecule = np.asarray(molecule, dtype=np.int64)
+        n = len(self.molecule)
+        if n and (self.molecule[0] != 0 or not np.isin(np.diff(self.molecule), (0, 1)).all()):
+            raise InputError(
+                "molecules must be numbered 0, 0, ..., 1, 1, ... in the order of the atoms", item="molecule"
+            )
+        cutoff = 0.5 * box if cutoff is None else cutoff
+        if not 0 < cutoff <= 0.5 * box:
+            raise InputError(
+                f"the cutoff {cutoff:g} must be above 0 and at most half the box, {0.5 * box:g}: beyond that more than "
+                "one image is near",
+                item="cutoff",
+            )
+        self.box, self.cutoff = float(box), float(cutoff)
+        table = [np.broadcast_to(np.asarray(a, dtype=np.float64), n) for a in (epsilon, sigma, charges, masses)]
+        #: eps^(1/2), sigma/2, q and m of each atom.
+        self.sites: FloatArray = np.ascontiguousarray(
+            np.stack([np.sqrt(table[0]), 0.5 * table[1], table[2], table[3]], axis=1)
+        )
+        self.masses: FloatArray = table[3].copy()
+        self.first = np.append(np.flatnonzero(np.diff(self.molecule, prepend=-1)), n)
+
+    def force(self, x: FloatArray, time: float = 0.0) -> FloatArray:
+        """Forces, shape (n_atoms, 3)."""
+        f = np.zeros_like(x)
+        _evaluate(x, self.molecule, self.sites, self.box, self.cutoff, f)
+        return f
+
+    def potential(self, x: FloatArray, time: float = 0.0) -> float:
+        return float(_evaluate(x, self.molecule, self.sites, self.box, self.cutoff, np.zeros_like(x)))
+
+    def rigid_sample(self, x: FloatArray, arm: float = 1.0) -> tuple[float, float]:
+        """|grad U|^2 and laplacian of U in the shifts and turns of whole molecules.
+
+        For `kcons.thermostats.configurational_temperature`. Any scale `arm` of angles against lengths will do.
+        Molecules must be whole, not wrapped.
+        """
+        s = _rigid(x, self.molecule, self.first, self.sites, self.box, self.cutoff)
+        return s[0] + s[2] / arm**2, s[1] + s[3] / arm**2
+
+    def metropolis(
+        self, x: ArrayLike, thermal_energy: float, sweeps: int, every: int, seed: int, shift: float, turn: float
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Canonical sampling of rigid molecules by plain Metropolis moves, without forces or velocities.
+
+        Parameters
+        ----------
+        x : array_like, shape (n_atoms, 3)
+        thermal_energy : float
+        sweeps, every : int
+            Moves of each molecule, and how many of them lie between two records of the energy.
+        seed : int
+        shift, turn : float
+            Largest shift of a molecule along each axis, and largest angle about a random axis.
+
+        Returns
+        -------
+        energies, positions at the end, share of accepted moves
+        """
+        y = np.array(x, dtype=np.float64)
+        energies = np.empty(sweeps // every)
+        accepted = _metropolis(
+            y,
+            self.first,
+            self.sites,
+            self.box,
+            self.cutoff,
+            thermal_energy,
+            every,
+            np.random.default_rng(seed),
+            shift,
+            turn,
+            energies,
+        )
+        return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
+    """u, u'/r and u'' of two sites."""
+    r = np.sqrt(r2)
+    s = a[1] + b[1]
+    q = a[2] * b[2]
+    c = (s * s / r2) ** 3
+    e = 4.0 * a[0] * b[0] * c
+    u = e * (c - 1.0) + q / r
+    d = -(e * (12.0 * c - 6.0) + q / r) / r
+    dd = (e * (156.0 * c - 42.0) + 2.0 * q / r) / r2
+    begin = SWITCH * cutoff
+    if r > begin:
+        w = 1.0 / (cutoff - begin)
+        t = (r - begin) * w
+        k = 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t))
+        dk = -30.0 * t * t * (1.0 - t) * (1.0 - t) * w
+        ddk = -60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) * w * w
+        dd = dd * k + 2.0 * d * dk + u * ddk
+        d = d * k + u * dk
+        u = u * k
+    return u, d / r, dd
+
+
+@numba.njit(cache=True, nogil=True)
+def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-def]
+    total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
+    n = x.shape[0]
+    for i in range(n):
+        for j in range(i + 1, n):
+            if molecule[j] == molecule[i]:
+                continue
+            dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+            dx -= box * np.rint(dx * inverse)
+            dy -= box * np.rint(dy * inverse)
+            dz -= box * np.rint(dz * inverse)
+            r2 = dx * dx + dy * dy + dz * dz
+            if r2 < cut2:
+                u, slope, _ = _pair(r2, sites[i], sites[j], cutoff)
+                total += u
+                f[i, 0] -= slope * dx
+                f[i, 1] -= slope * dy
+                f[i, 2] -= slope * dz
+                f[j, 0] += slope * dx
+                f[j, 1] += slope * dy
+                f[j, 2] += slope * dz
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-def]
+    """Squares of forces, laplacian over shifts, squares of torques, laplacian over turns; summed over molecules.
+
+    A turn about the axis e moves a site at p from the centre by e x p, and bends its path by e x (e x p). Summed over
+    three axes, the first gives |e x p|^2 -> |p x d|^2 along the line d of a pair and 2 p^2 in all, the second -2 p.
+    """
+    n, cut2, inverse = x.shape[0], cutoff * cutoff, 1.0 / box
+    f = np.zeros_like(x)
+    arms = np.empty_like(x)
+    for k in range(len(first) - 1):
+        a, b = first[k], first[k + 1]
+        mass = 0.0
+        centre = np.zeros(3)
+        for i in range(a, b):
+            mass += sites[i, 3]
+            centre += sites[i, 3] * x[i]
+        for i in range(a, b):
+            arms[i] = x[i] - centre / mass
+    shifts = turns = 0.0
+    for i in range(n):
+        for j in range(n):
+            if molecule[j] == molecule[i]:
+                continue
+            d = x[i] - x[j]
+            d -= box * np.rint(d * inverse)
+            r2 = (d * d).sum()
+            if r2 < cut2:
+                _, slope, bend = _pair(r2, sites[i], sites[j], cutoff)
+                f[i] -= slope * d
+                shifts += bend + 2.0 * slope
+                p = arms[i]
+                p2 = (p * p).sum()
+                along = (p * d).sum()
+                across = p2 - along * along / r2  # |p x d|^2 / d^2
+                turns += (bend - slope) * across + slope * 2.0 * p2
+    squares = torques = 0.0
+    for k in range(len(first) - 1):
+        push, twist = np.zeros(3), np.zeros(3)
+        for i in range(first[k], first[k + 1]):
+            push += f[i]
+            twist += np.cross(arms[i], f[i])
+            turns += 2.0 * (f[i] * arms[i]).sum()  # grad U = -f, bent by -2 p
+        squares += (push * push).sum()
+        torques += (twist * twist).sum()
+    return squares, shifts, torques, turns
+
+
+@numba.njit(cache=True, nogil=True)
+def _one(y, a, b, x, sites, box, cutoff):  # type: ignore[no-untyped-def]
+    """Energy of atoms a..b at y with all others at x."""
+    total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
+    for i in range(a, b):
+        for j in range(x.shape[0]):
+            if a <= j < b:
+                continue
+            r2 = 0.0
+            for c in range(3):
+                d = y[i - a, c] - x[j, c]
+                d -= box * np.rint(d * inverse)
+                r2 += d * d
+            if r2 < cut2:
+                total += _pair(r2, sites[i], sites[j], cutoff)[0]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _metropolis(x, first, sites, box, cutoff, kt, every, rng, shift, turn, energies):  # type: ignore[no-untyped-def]
+    molecules = len(first) - 1
+    energy = 0.0
+    for k in range(molecules):
+        energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, sites, box, cutoff)
+    accepted = 0
+    for record in range(len(energies)):
+        for _ in range(every * molecules):
+            k = int(rng.random() * molecules)
+            a, b = first[k], first[k + 1]
+            y = x[a:b].copy()
+            centre = np.zeros(3)
+            for i in range(b - a):
+                centre += y[i] / (b - a)
+            axis = rng.normal(0.0, 1.0, 3)
+            axis /= np.sqrt((axis * axis).sum())
+            angle = turn * (2.0 * rng.random() - 1.0)
+            sine, cosine = np.sin(angle), np.cos(angle)
+            move = shift * (2.0 * rng.random(3) - 1.0)
+            for i in range(b - a):
+                p = y[i] - centre
+                y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
+            change = _one(y, a, b, x, sites, box, cutoff) - _one(x[a:b], a, b, x, sites, box, cutoff)
+            if change <= 0.0 or rng.random() < np.exp(-change / kt):
+                x[a:b] = y
+                energy += change
+                accepted += 1
+        energies[record] = energy
+    return accepted

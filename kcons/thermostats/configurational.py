@@ -1,0 +1,119 @@
+"""The temperature that configurations have, whatever the velocities do.
+
+On a surface with the density e^{-U/kT} of its volume, any field X that preserves volume gives kT = <(X U)^2>/<X X U>;
+summed over all directions, kT = <|grad U|^2>/<laplacian of U> (Rugh, Phys. Rev. Lett. 78, 772 (1997); Butler et al.,
+J. Chem. Phys. 109, 6519 (1998)). Constrained canonical configurations have the volume that belongs to the metric M, so
+that |grad U|^2 = f.M_par^+ f, and the laplacian is the mean second derivative of U along geodesics, which are the free
+flights of the constrained atoms.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import State, System
+from kcons.steppers.summation import Point
+from kcons.thermostats.isokinetic import paced
+from kcons.thermostats.velocities import thermal_velocities
+
+#: Fewest blocks that errors are taken from.
+BLOCKS = 16
+
+
+class Estimate(NamedTuple):
+    """A mean and its standard error."""
+
+    value: float
+    error: float
+
+    def off(self, expected: float, error: float = 0.0) -> float:
+        """Distance from `expected` (known to `error`) in standard errors."""
+        return (self.value - expected) / math.hypot(self.error, error)
+
+
+def mean(values: ArrayLike) -> Estimate:
+    """Mean of correlated values; the error by averages over blocks.
+
+    Of 16, 32, 64 and 128 blocks the largest error counts: short blocks depend on each other, few are noisy.
+
+    Raises
+    ------
+    InputError
+        Fewer than 32 values.
+    """
+    series = np.asarray(values, dtype=np.float64)
+    if series.ndim != 1 or len(series) < 2 * BLOCKS:
+        raise InputError(f"{series.shape} values are too few for an error; give {2 * BLOCKS} or more", item="values")
+    errors = []
+    for count in (BLOCKS, 2 * BLOCKS, 4 * BLOCKS, 8 * BLOCKS):
+        size = len(series) // count
+        if size:
+            blocks = series[: size * count].reshape(count, size).mean(axis=1)
+            errors.append(float(blocks.std(ddof=1)) / math.sqrt(count))
+    return Estimate(float(series.mean()), max(errors))
+
+
+def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Estimate:
+    """k_B T = <|grad U|^2>/<laplacian of U> from samples of both along a run.
+
+    Raises
+    ------
+    InputError
+        Fewer than 32 samples, or not as many of one as of the other.
+    """
+    above, below = np.asarray(squares, dtype=np.float64), np.asarray(curvatures, dtype=np.float64)
+    if above.shape != below.shape:
+        raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
+    scale = float(below.mean())
+    ratio = float(above.mean()) / scale
+    return Estimate(ratio, mean((above - ratio * below) / scale).error)
+
+
+def configurational_sample(
+    system: System, state: State, rng: np.random.Generator, *, flight: float = 1e-4, directions: int = 1
+) -> tuple[float, float]:
+    """|grad U|^2 and an unbiased sample of the laplacian of U on the surface, in the metric M.
+
+    Two force evaluations for each direction.
+
+    Parameters
+    ----------
+    system : System
+    state : State
+    rng : numpy.random.Generator
+    flight : float
+        How long to fly along a geodesic at unit thermal energy, for a difference of the slopes of U at its ends.
+    directions : int
+        How many random directions to average over.
+
+    Raises
+    ------
+    UnsupportedError
+        Targets move, or forces depend on the velocities.
+    """
+    if system.motion.plan.driven or system.velocity_dependent:
+        raise UnsupportedError("configurations have a temperature where targets rest and forces know no velocities")
+    x, time = state.positions, state.time
+    forces = system.with_forces(state).forces
+    assert forces is not None
+    square = float((forces * paced(system, x, forces, time)).sum())
+    total = 0.0
+    for _ in range(directions):
+        v = thermal_velocities(system, x, 1.0, rng, time=time)
+        ends = [_slope(system, x, v, time, h) for h in (flight, -flight)]
+        total += (ends[0] - ends[1]) / (2 * flight)
+    return square, total / directions
+
+
+def _slope(system: System, x: FloatArray, v: FloatArray, time: float, h: float) -> float:
+    """dU/ds at the end of the geodesic that starts with v."""
+    point = Point(x, v, system.weights, exact=False)
+    system.drift.move(point, np.empty_like(x), time, time, h)
+    end = system.motion.project_velocities(point.x, point.v, time=time)
+    return -float((system.forces(point.x, end, time, 0) * end).sum())
