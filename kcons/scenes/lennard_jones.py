@@ -19,8 +19,9 @@ SWITCH = 0.7
 class LennardJones:
     """Forces, energies and curvatures of a periodic fluid in a cubic box.
 
-    u(r) = S(r) [4 eps ((sigma/r)^12 - (sigma/r)^6) + q q'/r], mixed by Lorentz and Berthelot; S falls from 1 to 0 with
-    two continuous derivatives.
+    u(r) = S(r) [4 eps ((sigma/r)^12 - (sigma/r)^6) + q q' (1/r + r^2/(2 c^3) - 3/(2 c))], mixed by Lorentz and
+    Berthelot: charges with a conducting reaction field beyond the cutoff c. S falls from 1 to 0 with two continuous
+    derivatives.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ class LennardJones:
         energies, positions at the end, share of accepted moves
         """
         y = np.array(x, dtype=np.float64)
-        energies = np.empty(sweeps // every)
+        energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
         accepted = _metropolis(
             y,
             self.first,
@@ -119,7 +120,7 @@ class LennardJones:
             self.cutoff,
             thermal_energy,
             every,
-            np.random.default_rng(seed),
+            rng,
             shift,
             turn,
             energies,
@@ -135,9 +136,10 @@ def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
     q = a[2] * b[2]
     c = (s * s / r2) ** 3
     e = 4.0 * a[0] * b[0] * c
-    u = e * (c - 1.0) + q / r
-    d = -(e * (12.0 * c - 6.0) + q / r) / r
-    dd = (e * (156.0 * c - 42.0) + 2.0 * q / r) / r2
+    field = 1.0 / cutoff**3
+    u = e * (c - 1.0) + q * (1.0 / r + 0.5 * field * r2 - 1.5 / cutoff)
+    d = -e * (12.0 * c - 6.0) / r + q * (field * r - 1.0 / r2)
+    dd = e * (156.0 * c - 42.0) / r2 + q * (2.0 / (r2 * r) + field)
     begin = SWITCH * cutoff
     if r > begin:
         w = 1.0 / (cutoff - begin)

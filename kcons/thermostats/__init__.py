@@ -1,9 +1,21 @@
 """Thermostats on constraints. Each is a stepper: a pure function from one state to the next."""
 
+from kcons.thermostats.configurational import Estimate, configurational_sample, configurational_temperature, mean
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.velocities import thermal_velocities
 
-__all__ = ["Freedom", "Isokinetic", "Langevin", "NoseHooverChain", "freedom", "thermal_velocities"]
+__all__ = [
+    "Estimate",
+    "Freedom",
+    "Isokinetic",
+    "Langevin",
+    "NoseHooverChain",
+    "configurational_sample",
+    "configurational_temperature",
+    "freedom",
+    "mean",
+    "thermal_velocities",
+]

@@ -24,6 +24,8 @@ BALANCED = 1e-6
 AT_REST = 1e-16
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
 SHIFT = 1e-2
+#: How far each atom is moved besides, so that nothing cancels by symmetry.
+SHAKE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +95,7 @@ def freedom(
         if not len(directions):
             raise UnsupportedError(_HELD)
     elif momentum == "auto" and chosen is None and system.n_atoms > 1:
-        directions = _conserved_directions(system, state, forces)
-        turns = len(directions) == 3 and _no_torque(state.positions, forces)
+        directions, turns = _conserved(system, state, forces)
     count -= len(directions)
     if count <= 0:
         raise OverdeterminedError(
@@ -161,26 +162,30 @@ def open_directions(motion: Motion, positions: FloatArray, time: float = 0.0) ->
     return np.ascontiguousarray(axes[rank:])
 
 
-def _conserved_directions(system: System, state: State, forces: FloatArray) -> FloatArray:
+def _conserved(system: System, state: State, forces: FloatArray) -> tuple[FloatArray, bool]:
+    """Directions in which the forces add up to nothing, and whether they exert no torque, wherever the atoms are."""
     directions = open_directions(system.motion, state.positions, state.time)
     if system.force is None:
-        return directions
+        return directions, False
     rng = np.random.default_rng(0)
     size = float(np.ptp(state.positions, axis=0).max(initial=0.0)) or 1.0
-    f = forces
+    x, f = state.positions, forces
+    turns = True
     for attempt in range(4):
+        turns = turns and _no_torque(x, f)
         total = directions @ f.sum(axis=0)
         if np.abs(total).max(initial=0.0) <= BALANCED * np.abs(f).sum():
             # At one place they may cancel by symmetry.
             if attempt or not len(directions):
-                return directions
+                return directions, turns and len(directions) == 3
         elif len(directions) == 1:
-            return np.zeros((0, 3))
+            break
         else:
             directions = np.linalg.svd(total[None, :])[2][1:] @ directions
-        shifted = state.positions + SHIFT * size * rng.standard_normal(3)
-        f = system.forces(shifted, state.velocities, state.time, state.step)
-    return np.zeros((0, 3))
+        x = state.positions + SHIFT * size * rng.standard_normal(3)
+        x += SHAKE * size * rng.standard_normal(x.shape)
+        f = system.forces(x, state.velocities, state.time, state.step)
+    return np.zeros((0, 3)), False
 
 
 def _no_torque(x: FloatArray, forces: FloatArray) -> bool:

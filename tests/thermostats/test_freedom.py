@@ -17,6 +17,7 @@ from kcons.constraints import (
     Sphere,
 )
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.scenes.lennard_jones import LennardJones
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
 from kcons.thermostats.freedom import drift_velocity, open_directions
@@ -190,6 +191,18 @@ def test_angular_momentum_of_a_free_cluster_is_said():
         with pytest.warns(UserWarning, match="exert no torque"):
             thermostat.start(held, state)
     Isokinetic().start(held, state)  # no temperature is asked for
+
+
+def test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster():
+    fluid = LennardJones(range(8), 3.0)
+    x = 1.5 * np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), 1).astype(float)
+    x[:, 0] += 0.1 * (x[:, 0] > 0)
+    held = system([], x, np.ones(8), fluid.force)
+    assert (
+        np.abs(np.cross(x - x.mean(axis=0), fluid.force(x)).sum(axis=0)).max() <= 1e-12 < np.abs(fluid.force(x)).max()
+    )
+    found = freedom(held, State(x, x), fluid.force(x))
+    assert found.count == 21 and not found.turns
 
 
 def test_a_sphere_has_no_open_direction_and_a_far_plane_two():

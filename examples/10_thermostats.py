@@ -1,0 +1,386 @@
+"""Which temperature does a thermostat sample? Small fluids, measured by their configurations alone.
+
+    python examples/10_thermostats.py                  short runs, half a minute: large errors
+    python examples/10_thermostats.py --full --out F   an hour on two cores; F receives JSON
+    python examples/10_thermostats.py --show F         the tables of an earlier result
+
+The isokinetic thermostat with 2K = (g - 1) kT and, for comparison, 2K = g kT, and Langevin; the energy also by plain
+Metropolis sampling, which knows no forces. Reduced units. Then Langevin and Nose-Hoover on rigid water and on chains,
+in ASE, judged by the package physical_validation (full runs only, and if it is installed); not isokinetic runs, whose
+kinetic energy has no distribution.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import warnings
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from ase import Atoms, units
+from rich.console import Console
+from rich.table import Table
+
+from kcons import compare
+from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint, Distance
+from kcons.motion import Motion
+from kcons.scenes.lennard_jones import LennardJones
+from kcons.scenes.potential import Potential, PotentialCalculator
+from kcons.steppers import State, Stepper, System, run
+from kcons.thermostats import Isokinetic, Langevin, configurational_temperature, mean, thermal_velocities
+
+
+class Fluid(NamedTuple):
+    name: str
+    forces: LennardJones
+    positions: np.ndarray
+    rows: list[Constraint]
+    thermal_energy: float
+    step: float
+
+    def system(self) -> System:
+        held = ConstraintSet(self.rows, self.positions, self.forces.masses)
+        return System(Motion(held, self.positions), self.forces.force, potential=self.forces.potential)
+
+
+def atoms_fluid() -> Fluid:
+    box = (16 / 0.5) ** (1 / 3)
+    places = np.stack(np.unravel_index(np.arange(16), (3, 3, 2)), axis=1) * box / 3.0
+    return Fluid("Lennard-Jones, 16 atoms", LennardJones(range(16), box), places, [], 1.5, 0.006)
+
+
+def _placed(shape: np.ndarray, box: float) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    centres = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * box / 2
+    return np.concatenate([c + shape @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T for c in centres])
+
+
+def dumbbells_fluid() -> Fluid:
+    box = (16 / 0.5) ** (1 / 3)
+    x = _placed(np.array([[-0.35, 0, 0], [0.35, 0, 0]]), box)
+    rows: list[Constraint] = [Distance(np.arange(16).reshape(-1, 2), np.full(8, 0.7))]
+    return Fluid("8 dumbbells", LennardJones(np.repeat(range(8), 2), box, sigma=0.9), x, rows, 1.5, 0.006)
+
+
+def triatomic_fluid() -> Fluid:
+    box, k = 3.9, 3 * np.arange(8)
+    x = _placed(np.array([[0, 0, 0], [0.6, 0, 0], [-0.2, 0.4 * math.sqrt(2), 0]]), box)
+    rows: list[Constraint] = [Distance(np.concatenate([np.c_[k, k + 1], np.c_[k, k + 2], np.c_[k + 1, k + 2]]))]
+    forces = LennardJones(np.repeat(range(8), 3), box, masses=np.tile([2.0, 1, 1], 8), sigma=0.9)
+    return Fluid("8 rigid triatomics", forces, x, rows, 1.5, 0.006)
+
+
+FLUIDS = (atoms_fluid, dumbbells_fluid, triatomic_fluid)
+
+
+def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
+    """One run: temperature of the configurations and mean energy."""
+    fluid = FLUIDS[which]()
+    held, kt = fluid.system(), fluid.thermal_energy
+    state = State(fluid.positions, thermal_velocities(held, fluid.positions, kt, 1, zero_momentum=True))
+    stepper: Stepper
+    start = Isokinetic(kt).start(held, state)
+    assert start.thermostat is not None
+    g = int(start.thermostat[3])
+    if thermostat == "Langevin":
+        stepper = Langevin(kt, 1.0, seed=2, substeps=1)
+    elif thermostat == "g - 1":
+        stepper = Isokinetic(kt)
+    else:
+        stepper = Isokinetic(kinetic_energy=0.5 * g * kt)
+    state = run(held, state, fluid.step, steps // 20, stepper=stepper)
+    samples: list[tuple[float, float, float]] = []
+    run(
+        held,
+        state,
+        fluid.step,
+        steps,
+        stepper=stepper,
+        observers=[
+            lambda s: samples.append((*fluid.forces.rigid_sample(s.positions), fluid.forces.potential(s.positions)))
+        ],
+        every=8,
+    )
+    squares, curvatures, energies = np.transpose(samples)
+    return {
+        "fluid": fluid.name,
+        "thermostat": thermostat,
+        "g": g,
+        "thermal_energy": kt,
+        "steps": steps,
+        "temperature": list(configurational_temperature(squares, curvatures)),
+        "energy": list(mean(energies)),
+    }
+
+
+def metropolis(which: int, sweeps: int) -> dict[str, Any]:
+    """The energy by moves of whole molecules."""
+    fluid = FLUIDS[which]()
+    arguments = (fluid.thermal_energy, 10, 0.25, 0.5)
+    kt, every, shift, turn = arguments
+    _, x, _ = fluid.forces.metropolis(fluid.positions, kt, sweeps // 20, every, 3, shift, turn)
+    energies, _, accepted = fluid.forces.metropolis(x, kt, sweeps, every, 4, shift, turn)
+    return {"fluid": fluid.name, "sweeps": sweeps, "accepted": accepted, "energy": list(mean(energies))}
+
+
+def trap(convention: str, steps: int) -> dict[str, Any]:
+    """Two atoms in the trap x^4/4, coupled: kT = 4<U>/6 without any estimator, as U is homogeneous."""
+    x = np.array([[0.3, -0.2, 0.5], [-0.4, 0.6, 0.1]])
+
+    def force(x: np.ndarray, t: float) -> np.ndarray:
+        d = x[0] - x[1]
+        push = 0.5 * (d @ d) * d
+        return -(x**3) - np.array([push, -push])
+
+    def potential(x: np.ndarray, t: float) -> float:
+        d = x[0] - x[1]
+        return float((x**4).sum() / 4 + (d @ d) ** 2 / 8)
+
+    held = System(Motion(ConstraintSet([], x, [1.0, 1.0]), x), force, potential=potential)
+    kt = 1.0
+    stepper = Isokinetic(kt) if convention == "g - 1" else Isokinetic(kinetic_energy=0.5 * 6 * kt)
+    state = run(held, State(x, thermal_velocities(held, x, kt, 1)), 0.02, 1000, stepper=stepper)
+    energies: list[float] = []
+    run(held, state, 0.02, steps, stepper=stepper, observers=[lambda s: energies.append(potential(s.positions, 0))])
+    found = mean(4 * np.array(energies) / 6)
+    return {"thermostat": convention, "g": 6, "thermal_energy": kt, "steps": steps, "temperature": list(found)}
+
+
+# -- rigid water and chains, judged by physical_validation ------------------------------------------
+
+KB = units.kB
+COULOMB = 14.399645  # eV A
+
+
+def water() -> tuple[Atoms, int, int]:
+    """27 TIP3P molecules at 0.9 g/cm3, smooth cutoff at half the box; 3 atoms a molecule, 3 rows."""
+    n, box = 27, 9.65
+    rng = np.random.default_rng(5)
+    shape = np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]])
+    places = np.stack(np.unravel_index(np.arange(n), (3, 3, 3)), axis=1) * box / 3
+    x = np.concatenate([p + shape @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T for p in places])
+    atoms = Atoms("OHH" * n, positions=x)
+    charges = math.sqrt(COULOMB) * np.tile([-0.834, 0.417, 0.417], n)
+    epsilon = np.tile([0.1521 * units.kcal / units.mol, 0.0, 0.0], n)
+    forces = LennardJones(
+        np.repeat(range(n), 3), box, masses=atoms.get_masses(), epsilon=epsilon, sigma=3.1507, charges=charges
+    )
+    return _ready(atoms, forces, 3), 3, 3
+
+
+def chains() -> tuple[Atoms, int, int]:
+    """Six freely jointed chains of six argon-like beads; 5 rows each."""
+    n, box = 6, 13.0
+    rng = np.random.default_rng(6)
+    x = []
+    for k in range(n):
+        bend = np.cumsum(np.c_[np.full(6, 1.3), 0.75 * (-1.0) ** np.arange(6), 0.1 * rng.normal(size=6)], axis=0)
+        x.append(bend + np.array([0, (k % 3) * box / 3, (k // 3) * box / 2]))
+    atoms = Atoms("C" * 6 * n, positions=np.concatenate(x))
+    forces = LennardJones(np.repeat(range(n), 6), box, masses=atoms.get_masses(), epsilon=0.006, sigma=3.6)
+    return _ready(atoms, forces, 6), 6, 5
+
+
+def _ready(atoms: Atoms, forces: LennardJones, size: int) -> Atoms:
+    atoms.calc = PotentialCalculator(Potential(lambda x: (forces.potential(x), forces.force(x)), "Lennard-Jones"))
+    first = np.arange(0, len(atoms), size)
+    if size == 3:
+        pairs = np.concatenate([np.c_[first, first + 1], np.c_[first, first + 2], np.c_[first + 1, first + 2]])
+    else:
+        pairs = np.concatenate([np.c_[first + k, first + k + 1] for k in range(size - 1)])
+    constrain(atoms, Distance(pairs))
+    return atoms
+
+
+MOLECULES = {"rigid water": water, "chains": chains}
+TEMPERATURES = {"rigid water": (400.0, 425.0), "chains": (300.0, 330.0)}
+
+
+def dynamics(kind: str, atoms: Atoms, step: float, temperature: float) -> Any:
+    if kind == "Langevin":
+        return ConstrainedLangevin(atoms, step, temperature, 5e-3 / units.fs, rng=9, substeps=1)
+    return ConstrainedNoseHoover(atoms, step, temperature, 50 * units.fs, momentum="conserved")
+
+
+def thermal_run(name: str, kind: str, temperature: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Kinetic and potential energies in eV, every 100 fs."""
+    atoms, _, _ = MOLECULES[name]()
+    draw_velocities(atoms, temperature, 8, zero_momentum=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        moving = dynamics(kind, atoms, 2 * units.fs, temperature)
+    moving.run(10_000)
+    series = []
+    moving.attach(lambda: series.append((atoms.get_kinetic_energy(), atoms.get_potential_energy())), interval=50)
+    moving.run(steps)
+    kinetic, potential = np.transpose(series)
+    return kinetic, potential
+
+
+def convergence_run(name: str, kind: str, step: float) -> tuple[float, np.ndarray]:
+    """The conserved energy over 16 ps. Langevin without friction: its noise has no order."""
+    atoms, _, _ = MOLECULES[name]()
+    temperature = TEMPERATURES[name][0]
+    draw_velocities(atoms, temperature, 8)
+    warm = ConstrainedLangevin(atoms, 1 * units.fs, temperature, 0.02 / units.fs, rng=1)
+    warm.run(2000)
+    draw_velocities(atoms, temperature, 8, zero_momentum=True)
+    if kind == "Langevin":
+        moving: Any = ConstrainedLangevin(atoms, step * units.fs, temperature, 0.0, rng=1)
+    else:
+        moving = dynamics(kind, atoms, step * units.fs, temperature)
+    values: list[float] = []
+    moving.attach(lambda: values.append(moving.get_conserved_energy()), interval=round(8 / step))
+    moving.run(round(16_000 / step))
+    return step, np.array(values)
+
+
+def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
+    """p of the kinetic energy, standard errors of the ensembles at two temperatures, and convergence."""
+    import physical_validation as pv
+
+    atoms, size, rows = MOLECULES[name]()
+    n = len(atoms) // size
+    unit = pv.data.UnitData(
+        kb=KB,
+        energy_str="eV",
+        energy_conversion=96.48533,
+        length_str="A",
+        length_conversion=0.1,
+        volume_str="A^3",
+        volume_conversion=1e-3,
+        temperature_str="K",
+        temperature_conversion=1,
+        pressure_str="eV/A^3",
+        pressure_conversion=1.602177e6,
+        time_str="fs",
+        time_conversion=1e-3,
+    )
+    momentum = 0 if kind == "Langevin" else 3
+    system = pv.data.SystemData(
+        natoms=len(atoms),
+        nconstraints=rows * n,
+        ndof_reduction_tra=momentum,
+        ndof_reduction_rot=0,
+        mass=atoms.get_masses(),
+        molecule_idx=size * np.arange(n),
+        nconstraints_per_molecule=np.full(n, rows),
+    )
+
+    def data(temperature: float) -> Any:
+        kinetic, potential = thermal_run(name, kind, temperature, steps)
+        ensemble = pv.data.EnsembleData("NVT", natoms=len(atoms), volume=1000.0, temperature=temperature)
+        seen = pv.data.ObservableData(kinetic_energy=kinetic, potential_energy=potential)
+        return pv.data.SimulationData(units=unit, system=system, ensemble=ensemble, observables=seen)
+
+    cold, warm = (data(temperature) for temperature in TEMPERATURES[name])
+    results: dict[str, Any] = {"system": name, "thermostat": kind, "temperatures": TEMPERATURES[name]}
+    results["samples"] = len(cold.observables.kinetic_energy)
+    results["kinetic_p"] = [float(pv.kinetic_energy.distribution(d, strict=True, verbosity=0)) for d in (cold, warm)]
+    results["ensemble_sigma"] = [float(s) for s in pv.ensemble.check(cold, warm, verbosity=0)]
+    fine = []
+    slopes = []
+    for step in (4.0, 2.0, 1.0):
+        _, values = convergence_run(name, kind, step)
+        fine.append(
+            pv.data.SimulationData(units=unit, dt=step, observables=pv.data.ObservableData(constant_of_motion=values))
+        )
+        slopes.append(float(np.polyfit(np.arange(len(values)) * 8e-3, values, 1)[0]))
+    results["convergence"] = float(pv.integrator.convergence(fine, verbose=False))
+    results["spread_eV"] = [float(np.std(f.observables.constant_of_motion)) for f in fine]
+    results["slope_eV_per_ps"] = slopes
+    return results
+
+
+# -- all of it --------------------------------------------------------------------------------------
+
+
+def measure(full: bool, only: str | None) -> dict[str, Any]:
+    steps, sweeps = (1_600_000, 2_000_000) if full else (4000, 20_000)
+    result: dict[str, Any] = {"machine": compare.environment(), "full": full}
+    with ProcessPoolExecutor(2 if full and only is None else 1) as pool:
+        parts: dict[str, list[Future[dict[str, Any]]]] = {}
+        if only in (None, "sampling"):
+            parts["metropolis"] = [
+                pool.submit(metropolis, which, sweeps) for which in range(len(FLUIDS)) if full or which == 1
+            ]
+            parts["trap"] = [pool.submit(trap, c, 400_000 if full else 4000) for c in ("g - 1", "g")]
+            parts["runs"] = [
+                pool.submit(sampled, which, thermostat, steps // 3 if thermostat == "Langevin" else steps)
+                for which in range(len(FLUIDS))
+                for thermostat in ("g - 1", "g", "Langevin")
+                if full or which == 1
+            ]
+        if full and only in (None, "physical_validation"):
+            parts["physical_validation"] = [
+                pool.submit(judged, n, k, 200_000) for n in MOLECULES for k in ("Langevin", "Nose-Hoover")
+            ]
+        for name, futures in parts.items():
+            result[name] = [f.result() for f in futures]
+    return result
+
+
+def show(result: dict[str, Any], console: Console) -> None:
+    table = Table(box=None, title="kT of the configurations over the kT asked for, and mean potential energy")
+    for heading in ("system", "thermostat", "g", "kT found/asked", "off by", "<U>", "from Metropolis"):
+        table.add_column(heading, justify="left" if heading in ("system", "thermostat") else "right")
+    plain = {m["fluid"]: m["energy"] for m in result.get("metropolis", [])}
+    rows = [{**t, "fluid": "two atoms in a trap", "energy": None} for t in result.get("trap", [])] + result.get(
+        "runs", []
+    )
+    for r in rows:
+        kt, (found, error) = r["thermal_energy"], r["temperature"]
+        name = r["thermostat"] if r["thermostat"] == "Langevin" else f"2K = ({r['thermostat']}) kT"
+        energy, distance = "", ""
+        if r["energy"] is not None:
+            other = plain[r["fluid"]]
+            energy = f"{r['energy'][0]:.3f} ± {r['energy'][1]:.3f}"
+            distance = f"{(r['energy'][0] - other[0]) / math.hypot(r['energy'][1], other[1]):+.1f} s.e."
+        ratio = f"{found / kt:.4f} ± {error / kt:.4f}"
+        table.add_row(r["fluid"], name, str(r["g"]), ratio, f"{(found - kt) / error:+.1f} s.e.", energy, distance)
+    console.print(table)
+    for m in result.get("metropolis", []):
+        console.print(f"Metropolis, {m['fluid']}: <U> = {m['energy'][0]:.3f} ± {m['energy'][1]:.3f}")
+    if result.get("physical_validation"):
+        table = Table(box=None, title="\nphysical_validation: rigid TIP3P water (27) and chains (6 of 6 beads) in ASE")
+        for heading in ("system", "thermostat", "samples", "temperatures/K", "p(K)", "ensemble", "convergence"):
+            table.add_column(heading, justify="left" if heading in ("system", "thermostat") else "right")
+        for r in result["physical_validation"]:
+            p = ", ".join(f"{p:.2f}" for p in r["kinetic_p"])
+            sigma = ", ".join(f"{s:.2f} s.e." for s in r["ensemble_sigma"])
+            temperatures = ", ".join(f"{t:.0f}" for t in r["temperatures"])
+            table.add_row(
+                r["system"], r["thermostat"], str(r["samples"]), temperatures, p, sigma, f"{r['convergence']:.3f}"
+            )
+        console.print(table)
+    machine = result["machine"]
+    console.print(f"\n{machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="long runs, and physical_validation")
+    parser.add_argument("--only", choices=("sampling", "physical_validation"), help="one half of it")
+    parser.add_argument("--out", type=Path, help="JSON file for the results; the other half is left in it")
+    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
+    options = parser.parse_args()
+    console = Console(width=120)
+    if options.show:
+        show(json.loads(options.show.read_text()), console)
+        return
+    result = measure(options.full, options.only)
+    if options.out:
+        if options.only and options.out.exists():
+            result = {**json.loads(options.out.read_text()), **result}
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+    show(result, console)
+
+
+if __name__ == "__main__":
+    main()
