@@ -1,7 +1,7 @@
 """Which temperature does a thermostat sample? Small fluids, measured by their configurations alone.
 
     python examples/10_thermostats.py                  short runs, half a minute: large errors
-    python examples/10_thermostats.py --full --out F   an hour on two cores; F receives JSON
+    python examples/10_thermostats.py --full --out F   half an hour on two cores; F receives JSON
     python examples/10_thermostats.py --show F         the tables of an earlier result
 
 The isokinetic thermostat with 2K = (g - 1) kT and, for comparison, 2K = g kT, and Langevin; the energy also by plain
@@ -49,10 +49,15 @@ class Fluid(NamedTuple):
         return System(Motion(held, self.positions), self.forces.force, potential=self.forces.potential)
 
 
-def atoms_fluid() -> Fluid:
-    box = (16 / 0.5) ** (1 / 3)
-    places = np.stack(np.unravel_index(np.arange(16), (3, 3, 2)), axis=1) * box / 3.0
-    return Fluid("Lennard-Jones, 16 atoms", LennardJones(range(16), box), places, [], 1.5, 0.006)
+def atoms_fluid(n: int = 16) -> Fluid:
+    box, edge = (n / 0.5) ** (1 / 3), math.ceil(n ** (1 / 3))
+    places = np.stack(np.unravel_index(np.arange(n), (edge, edge, edge)), axis=1) * box / edge
+    forces = LennardJones(range(n), box, cutoff=min(2.5, box / 2))
+    return Fluid(f"Lennard-Jones, {n} atoms", forces, places, [], 1.5, 0.006)
+
+
+def larger_fluid() -> Fluid:
+    return atoms_fluid(108)
 
 
 def _placed(shape: np.ndarray, box: float) -> np.ndarray:
@@ -76,7 +81,8 @@ def triatomic_fluid() -> Fluid:
     return Fluid("8 rigid triatomics", forces, x, rows, 1.5, 0.006)
 
 
-FLUIDS = (atoms_fluid, dumbbells_fluid, triatomic_fluid)
+FLUIDS = (atoms_fluid, dumbbells_fluid, triatomic_fluid, larger_fluid)
+LARGER = 3
 
 
 def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
@@ -302,24 +308,28 @@ def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
 
 
 def measure(full: bool, only: str | None) -> dict[str, Any]:
-    steps, sweeps = (1_600_000, 2_000_000) if full else (4000, 20_000)
+    steps, sweeps = (2_000_000, 2_000_000) if full else (4000, 20_000)
     result: dict[str, Any] = {"machine": compare.environment(), "full": full}
     with ProcessPoolExecutor(2 if full and only is None else 1) as pool:
         parts: dict[str, list[Future[dict[str, Any]]]] = {}
         if only in (None, "sampling"):
             parts["metropolis"] = [
-                pool.submit(metropolis, which, sweeps) for which in range(len(FLUIDS)) if full or which == 1
+                pool.submit(metropolis, which, sweeps // 20 if which == LARGER else sweeps)
+                for which in range(len(FLUIDS))
+                if full or which == 1
             ]
             parts["trap"] = [pool.submit(trap, c, 400_000 if full else 4000) for c in ("g - 1", "g")]
             parts["runs"] = [
                 pool.submit(sampled, which, thermostat, steps // 3 if thermostat == "Langevin" else steps)
-                for which in range(len(FLUIDS))
+                for which in range(LARGER)
                 for thermostat in ("g - 1", "g", "Langevin")
                 if full or which == 1
             ]
+            if full:
+                parts["runs"].append(pool.submit(sampled, LARGER, "g - 1", steps // 5))
         if full and only in (None, "physical_validation"):
             parts["physical_validation"] = [
-                pool.submit(judged, n, k, 200_000) for n in MOLECULES for k in ("Langevin", "Nose-Hoover")
+                pool.submit(judged, n, k, 100_000) for n in MOLECULES for k in ("Langevin", "Nose-Hoover")
             ]
         for name, futures in parts.items():
             result[name] = [f.result() for f in futures]

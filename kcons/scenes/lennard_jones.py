@@ -186,43 +186,53 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
     three axes, the first gives |e x p|^2 -> |p x d|^2 along the line d of a pair and 2 p^2 in all, the second -2 p.
     """
     n, cut2, inverse = x.shape[0], cutoff * cutoff, 1.0 / box
-    f = np.zeros_like(x)
-    arms = np.empty_like(x)
+    f, p = np.zeros_like(x), np.empty_like(x)
     for k in range(len(first) - 1):
-        a, b = first[k], first[k + 1]
-        mass = 0.0
-        centre = np.zeros(3)
-        for i in range(a, b):
-            mass += sites[i, 3]
-            centre += sites[i, 3] * x[i]
-        for i in range(a, b):
-            arms[i] = x[i] - centre / mass
+        for c in range(3):
+            mass = centre = 0.0
+            for i in range(first[k], first[k + 1]):
+                mass += sites[i, 3]
+                centre += sites[i, 3] * x[i, c]
+            for i in range(first[k], first[k + 1]):
+                p[i, c] = x[i, c] - centre / mass
     shifts = turns = 0.0
     for i in range(n):
-        for j in range(n):
+        for j in range(i + 1, n):
             if molecule[j] == molecule[i]:
                 continue
-            d = x[i] - x[j]
-            d -= box * np.rint(d * inverse)
-            r2 = (d * d).sum()
+            dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+            dx -= box * np.rint(dx * inverse)
+            dy -= box * np.rint(dy * inverse)
+            dz -= box * np.rint(dz * inverse)
+            r2 = dx * dx + dy * dy + dz * dz
             if r2 < cut2:
                 _, slope, bend = _pair(r2, sites[i], sites[j], cutoff)
-                f[i] -= slope * d
-                shifts += bend + 2.0 * slope
-                p = arms[i]
-                p2 = (p * p).sum()
-                along = (p * d).sum()
-                across = p2 - along * along / r2  # |p x d|^2 / d^2
-                turns += (bend - slope) * across + slope * 2.0 * p2
+                f[i, 0] -= slope * dx
+                f[i, 1] -= slope * dy
+                f[i, 2] -= slope * dz
+                f[j, 0] += slope * dx
+                f[j, 1] += slope * dy
+                f[j, 2] += slope * dz
+                shifts += 2.0 * (bend + 2.0 * slope)
+                for k in (i, j):
+                    p2 = p[k, 0] ** 2 + p[k, 1] ** 2 + p[k, 2] ** 2
+                    along = p[k, 0] * dx + p[k, 1] * dy + p[k, 2] * dz
+                    across = p2 - along * along / r2  # |p x d|^2 / d^2
+                    turns += (bend - slope) * across + slope * 2.0 * p2
     squares = torques = 0.0
     for k in range(len(first) - 1):
-        push, twist = np.zeros(3), np.zeros(3)
+        fx = fy = fz = tx = ty = tz = 0.0
         for i in range(first[k], first[k + 1]):
-            push += f[i]
-            twist += np.cross(arms[i], f[i])
-            turns += 2.0 * (f[i] * arms[i]).sum()  # grad U = -f, bent by -2 p
-        squares += (push * push).sum()
-        torques += (twist * twist).sum()
+            fx += f[i, 0]
+            fy += f[i, 1]
+            fz += f[i, 2]
+            tx += p[i, 1] * f[i, 2] - p[i, 2] * f[i, 1]
+            ty += p[i, 2] * f[i, 0] - p[i, 0] * f[i, 2]
+            tz += p[i, 0] * f[i, 1] - p[i, 1] * f[i, 0]
+            # grad U = -f, bent by -2 p
+            turns += 2.0 * (f[i, 0] * p[i, 0] + f[i, 1] * p[i, 1] + f[i, 2] * p[i, 2])
+        squares += fx * fx + fy * fy + fz * fz
+        torques += tx * tx + ty * ty + tz * tz
     return squares, shifts, torques, turns
 
 

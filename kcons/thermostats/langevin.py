@@ -73,12 +73,14 @@ class Langevin:
             raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
         if int(substeps) != substeps or substeps < 1:
             raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
-        if int(seed) != seed or seed < 0:
-            raise InputError(f"seed is {seed}; give a whole number >= 0", item="seed")
+        if int(seed) != seed or not 0 <= seed < 2**64:
+            raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
         self.friction = float(friction)
         self.seed = int(seed)
         self.substeps = int(substeps)
         self.conserve_momentum = bool(conserve_momentum)
+        self._bits = np.random.Philox(0)
+        self._normal = np.random.Generator(self._bits)
         self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
@@ -155,21 +157,39 @@ class Langevin:
     ) -> tuple[FloatArray, float]:
         """Friction and noise in the tangent plane at x, and the heat they bring."""
         motion = system.motion
-        v = motion.project_velocities(x, v, time=time)
-        drive = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else np.zeros_like(v)
+        v = motion.project_velocities(x, v, time=time, out=v)
+        before = system.kinetic_energy(v)
         keep = math.exp(-self.friction * dt)
         spread = math.sqrt(-math.expm1(-2 * self.friction * dt) * self.thermal_energy)
-        # A generator for each step: noise is a function of seed and number.
-        noise = np.random.Generator(np.random.Philox(key=[self.seed, number])).standard_normal(v.shape)
+        noise = self._drawn(number, v.shape)
         noise *= spread * np.sqrt(system.inverse_masses)
-        kept = drive
+        # What friction does not act on: velocities that the targets demand, and of the centre of mass.
+        kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
         if self.conserve_momentum:
             directions = self._directions(system, x, time)
             noise -= drift_velocity(noise, system.masses, directions)
-            kept = drive + drift_velocity(v - drive, system.masses, directions)
-        before = system.kinetic_energy(v)
-        after = motion.project_velocities(x, kept + keep * (v - kept) + noise, time=time)
+            drift = drift_velocity(v if kept is None else v - kept, system.masses, directions)
+            kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
+        noise += keep * v if kept is None else kept + keep * (v - kept)
+        after = motion.project_velocities(x, noise, time=time, out=noise)
         return after, system.kinetic_energy(after) - before
+
+    def _drawn(self, number: int, shape: tuple[int, ...]) -> FloatArray:
+        """Normal numbers that are a function of the seed and of the number of the step."""
+        # A counter-based generator, set to the step's own stretch of the seed's stream.
+        bits = self._bits
+        bits.state = {
+            "bit_generator": "Philox",
+            "state": {
+                "counter": np.array([0, 0, number, 0], dtype=np.uint64),
+                "key": np.array([self.seed, 0], dtype=np.uint64),
+            },
+            "buffer": np.zeros(4, dtype=np.uint64),
+            "buffer_pos": 4,
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
+        return self._normal.standard_normal(shape)
 
     def _directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
         if self._open is None or self._open[0] is not system:

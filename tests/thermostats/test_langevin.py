@@ -149,6 +149,7 @@ def test_heat_is_counted():
         ({"substeps": 0}, "substeps is 0"),
         ({"substeps": 1.5}, "substeps is 1.5"),
         ({"seed": -1}, "seed is -1"),
+        ({"seed": 2**64}, "from 0 to 2"),
         ({"seed": 0.5}, "seed is 0.5"),
     ],
 )
