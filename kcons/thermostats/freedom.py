@@ -24,6 +24,8 @@ BALANCED = 1e-6
 AT_REST = 1e-16
 #: How far the system is shifted, relative to its size, to see whether forces depend on its place.
 SHIFT = 1e-2
+#: How far each atom is moved to see whether a surface is curved.
+TURN = 1e-3
 #: How far each atom is moved besides, so that nothing cancels by symmetry.
 SHAKE = 1e-4
 
@@ -151,9 +153,12 @@ def open_directions(motion: Motion, positions: FloatArray, time: float = 0.0) ->
     size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
     every = np.tile(np.eye(3), (motion.n_atoms, 1))
     sums = []
-    for spread in (0.0, SHIFT * size, SHIFT * size):
+    for spread in (0.0, TURN * size, TURN * size):
         x = positions + spread * rng.standard_normal(positions.shape)
-        rows = held.jacobian(x, time)
+        with np.errstate(all="ignore"):
+            rows = held.jacobian(x, time)
+        if not np.isfinite(rows.data).all():
+            return np.zeros((0, 3))  # a surface that is not defined nearby has a place in space
         change = np.asarray(rows @ every)[placed]
         scale = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())[placed]
         sums.append(change / np.where(scale > 0, scale, 1.0)[:, None])

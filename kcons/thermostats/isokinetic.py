@@ -254,7 +254,7 @@ class Isokinetic(Splitting):
         if still is not None:
             return still
         begin = self.start(system, state)
-        with np.errstate(all="ignore"):  # checked, with the step's number
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
             run = _Step(system, self._share(system), begin, dt)
             try:
                 return run.through(self.kicks, self._pieces)

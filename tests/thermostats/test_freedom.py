@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
     CenterOfMass,
     Cylinder,
     Distance,
     FixedAtoms,
+    ImplicitSurface,
     LinearVelocity,
     Plane,
     Sphere,
@@ -203,6 +205,21 @@ def test_a_lattice_that_exerts_no_torque_by_symmetry_is_no_cluster():
     )
     found = freedom(held, State(x, x), fluid.force(x))
     assert found.count == 21 and not found.turns
+
+
+def test_a_surface_that_ends_nearby_has_a_place():
+    x = np.array([[0.5, 0.0, 0.0], [3.0, 0.2, 0.1]])
+    edge = ImplicitSurface(
+        [0], lambda x: np.sqrt(0.5 - x[:, 0]), lambda x: np.c_[-0.5 / np.sqrt(0.5 - x[:, 0]), 0 * x[:, 1:]], None
+    )
+    near = ConstraintSet([edge], x - np.array([0.01, 0, 0]), [1.0, 1.0])
+    found = open_directions(_Held(near, 2), x - np.array([0.0001, 0, 0]))
+    assert found.shape == (0, 3)
+
+
+class _Held:
+    def __init__(self, constraint_set, n_atoms):
+        self.constraint_set, self.n_atoms = constraint_set, n_atoms
 
 
 def test_a_sphere_has_no_open_direction_and_a_far_plane_two():

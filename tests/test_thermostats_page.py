@@ -1,0 +1,80 @@
+"""The page on thermostats shows the committed results, and these reach what they must."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FILE = ROOT / "docs" / "results" / "thermostats.json"
+RESULT = json.loads(FILE.read_text(encoding="utf-8"))
+RUNS = {(r["fluid"], r["thermostat"]): r for r in RESULT["runs"]}
+ENERGIES = {m["fluid"]: m["energy"] for m in RESULT["metropolis"]}
+
+
+def test_page_shows_the_committed_results():
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "10_thermostats.py"), "--show", str(FILE)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    shown = "\n".join(line.rstrip() for line in result.stdout.strip("\n").split("\n"))
+    page = (ROOT / "docs" / "thermostats.md").read_text(encoding="utf-8")
+    assert shown in page
+
+
+@pytest.mark.parametrize("key", [key for key in RUNS if key[1] == "g - 1"], ids=lambda key: key[0])
+def test_configurations_have_the_temperature_asked_for(key):
+    """Within 0.5 % and three standard errors, and so has the energy, beside Metropolis."""
+    run = RUNS[key]
+    found, error = run["temperature"]
+    kt = run["thermal_energy"]
+    assert abs(found / kt - 1) <= 0.005
+    assert abs(found - kt) <= 3 * error <= 0.01 * kt
+    energy, plain = run["energy"], ENERGIES[key[0]]
+    assert abs(energy[0] - plain[0]) <= 3 * math.hypot(energy[1], plain[1])
+
+
+@pytest.mark.parametrize("key", [key for key in RUNS if key[1] == "g"], ids=lambda key: key[0])
+def test_the_other_convention_is_off_as_predicted(key):
+    """By g/(g - 1), with an error of at most a tenth of the difference, at g <= 50."""
+    run = RUNS[key]
+    g, kt = run["g"], run["thermal_energy"]
+    found, error = run["temperature"]
+    assert g <= 50
+    assert error <= 0.1 * kt / (g - 1)
+    assert abs(found - kt * g / (g - 1)) <= 3 * error
+    assert found - kt >= 5 * error
+
+
+def test_two_atoms_in_a_trap():
+    for run in RESULT["trap"]:
+        found, error = run["temperature"]
+        expected = 1.0 if run["thermostat"] == "g - 1" else 6 / 5
+        assert abs(found - expected) <= 3 * error <= 0.03
+
+
+@pytest.mark.parametrize("key", [key for key in RUNS if key[1] == "Langevin"], ids=lambda key: key[0])
+def test_langevin(key):
+    run = RUNS[key]
+    found, error = run["temperature"]
+    assert abs(found - run["thermal_energy"]) <= 3 * error <= 0.02 * run["thermal_energy"]
+    energy, plain = run["energy"], ENERGIES[key[0]]
+    assert abs(energy[0] - plain[0]) <= 3 * math.hypot(energy[1], plain[1])
+
+
+@pytest.mark.parametrize("run", RESULT["physical_validation"], ids=lambda r: f"{r['system']}, {r['thermostat']}")
+def test_physical_validation(run):
+    assert run["samples"] >= 2000
+    assert min(run["kinetic_p"]) >= 1e-3
+    assert max(run["ensemble_sigma"]) <= 3.5
+    assert run["convergence"] <= 0.15
