@@ -60,7 +60,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         """Start the thermostat, so that atoms have the kinetic energy it keeps before the first step is logged."""
         if not isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return
-        state = self._start()
+        state = self._start(self._systems())
         momenta = self.atoms.arrays["momenta"].copy()
         try:
             begun = self.stepper.start(self._systems(), state)
@@ -78,7 +78,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         A trajectory holds positions and momenta only: the isokinetic thermostat continues from it as well, Langevin
         with another seed, a Nose-Hoover chain from rest.
         """
-        state = self._start()
+        state = self._start(self._systems())
         content = io.BytesIO()
         state.save(content)
         target = Path(file)
@@ -107,7 +107,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
             # Only asked for where the atoms are, for which the calculator still knows the energy.
             system.potential = lambda x, t: float(self.atoms.get_potential_energy(apply_constraint=False))
         stepper = cast(Isokinetic | Langevin | NoseHooverChain, self.stepper)
-        return float(stepper.conserved_energy(system, self._start()))
+        return float(stepper.conserved_energy(system, self._start(self._systems())))
 
 
 class IsokineticDynamics(ThermostattedDynamics):
@@ -178,7 +178,7 @@ class IsokineticDynamics(ThermostattedDynamics):
     def set_temperature(self, temperature_K: float) -> None:
         """Keep another temperature from now on; momenta are scaled."""
         self.stepper = self._stepper(positive(temperature_K, "temperature_K"))
-        self._state = replace(self._start(), thermostat=None)
+        self._state = replace(self._start(self._systems()), thermostat=None)
         self._begin()
 
     def get_temperature(self) -> float:
