@@ -53,7 +53,7 @@ def atoms_fluid(n: int = 16) -> Fluid:
     box, edge = (n / 0.5) ** (1 / 3), math.ceil(n ** (1 / 3))
     places = np.stack(np.unravel_index(np.arange(n), (edge, edge, edge)), axis=1) * box / edge
     forces = LennardJones(range(n), box, cutoff=min(2.5, box / 2))
-    return Fluid(f"Lennard-Jones, {n} atoms", forces, places, [], 1.5, 0.006)
+    return Fluid(f"Lennard-Jones, {n} atoms", forces, places, [], 1.5, 0.003)
 
 
 def larger_fluid() -> Fluid:
@@ -70,7 +70,7 @@ def dumbbells_fluid() -> Fluid:
     box = (16 / 0.5) ** (1 / 3)
     x = _placed(np.array([[-0.35, 0, 0], [0.35, 0, 0]]), box)
     rows: list[Constraint] = [Distance(np.arange(16).reshape(-1, 2), np.full(8, 0.7))]
-    return Fluid("8 dumbbells", LennardJones(np.repeat(range(8), 2), box, sigma=0.9), x, rows, 1.5, 0.006)
+    return Fluid("8 dumbbells", LennardJones(np.repeat(range(8), 2), box, sigma=0.9), x, rows, 1.5, 0.003)
 
 
 def triatomic_fluid() -> Fluid:
@@ -78,7 +78,7 @@ def triatomic_fluid() -> Fluid:
     x = _placed(np.array([[0, 0, 0], [0.6, 0, 0], [-0.2, 0.4 * math.sqrt(2), 0]]), box)
     rows: list[Constraint] = [Distance(np.concatenate([np.c_[k, k + 1], np.c_[k, k + 2], np.c_[k + 1, k + 2]]))]
     forces = LennardJones(np.repeat(range(8), 3), box, masses=np.tile([2.0, 1, 1], 8), sigma=0.9)
-    return Fluid("8 rigid triatomics", forces, x, rows, 1.5, 0.006)
+    return Fluid("8 rigid triatomics", forces, x, rows, 1.5, 0.003)
 
 
 FLUIDS = (atoms_fluid, dumbbells_fluid, triatomic_fluid, larger_fluid)
@@ -308,7 +308,7 @@ def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
 
 
 def measure(full: bool, only: str | None) -> dict[str, Any]:
-    steps, sweeps = (2_000_000, 2_000_000) if full else (4000, 20_000)
+    steps, sweeps = (4_500_000, 2_000_000) if full else (4000, 20_000)
     result: dict[str, Any] = {"machine": compare.environment(), "full": full}
     with ProcessPoolExecutor(2 if full and only is None else 1) as pool:
         parts: dict[str, list[Future[dict[str, Any]]]] = {}
