@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -36,20 +34,13 @@ class ThermostattedDynamics(ConstrainedDynamics):
         restart: str | PathLike[str] | None = None,
         **kwargs: Any,
     ) -> None:
-        state = momenta = None
         if restart is not None:
-            state, momenta = _read(restart, len(atoms))
-            kwargs["time"] = state.time
+            if "state" in kwargs:
+                raise InputError("give restart or state, not both", item="restart")
+            kwargs["state"] = _read(restart, len(atoms))
         before = atoms.positions.copy(), atoms.get_momenta()
         try:
-            if state is not None and momenta is not None:
-                atoms.set_positions(state.positions, apply_constraint=False)
-                atoms.set_momenta(momenta, apply_constraint=False)
             super().__init__(atoms, timestep, stepper, **kwargs)
-            if state is not None and momenta is not None:
-                self._state, self._momenta = state, momenta.copy()
-                self.nsteps = state.step
-            stepper.check(self._systems())
             self._begin()
         except BaseException:
             atoms.set_positions(before[0], apply_constraint=False)
@@ -67,25 +58,18 @@ class ThermostattedDynamics(ConstrainedDynamics):
         finally:  # forces were asked for elsewhere too
             self._put(state.positions, momenta)
         if begun.velocities is not state.velocities:
-            momenta = begun.velocities * self._weights[0]
+            momenta, self._resumed = begun.velocities * self._weights[0], None
             self._put(state.positions, momenta)
         self._momenta = momenta
         self._state = begun
 
     def save(self, file: str | PathLike[str]) -> None:
-        """Write all it takes to continue to the last bit, with `restart=file`; an older file is replaced in one piece.
+        """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).
 
         A trajectory holds positions and momenta only: the isokinetic thermostat continues from it as well, Langevin
         with another seed, a Nose-Hoover chain from rest.
         """
-        state = self._start(self._systems())
-        content = io.BytesIO()
-        state.save(content)
-        target = Path(file)
-        unfinished = target.with_name(target.name + ".unfinished")
-        with unfinished.open("wb") as opened:
-            np.savez(opened, momenta=self.atoms.get_momenta(), state=np.frombuffer(content.getvalue(), np.uint8))
-        unfinished.replace(target)
+        self.state.save(file)
 
     @property
     def thermostat_degrees_of_freedom(self) -> int:
@@ -382,15 +366,13 @@ def draw_velocities(
         atoms.set_momenta(momenta, apply_constraint=False)
 
 
-def _read(file: str | PathLike[str], n_atoms: int) -> tuple[State, FloatArray]:
+def _read(file: str | PathLike[str], n_atoms: int) -> State:
     try:
-        with np.load(file) as stored:
-            momenta, content = stored["momenta"], stored["state"]
-        state = State.load(io.BytesIO(content.tobytes()))
+        state = State.load(file)
     except FileNotFoundError:
         raise
-    except (KeyError, ValueError, OSError, EOFError) as error:
+    except InputError as error:
         raise InputError(f"{file} was not written by save: {error}", item="restart") from error
-    if state.positions.shape != (n_atoms, 3) or momenta.shape != (n_atoms, 3):
+    if state.positions.shape != (n_atoms, 3):
         raise InputError(f"{file} holds {len(state.positions)} atoms, not {n_atoms}", item="restart")
-    return state, momenta
+    return state

@@ -13,6 +13,7 @@ from ase.constraints import FixAtoms
 from ase.io import read
 
 from kcons.ase import (
+    ConstrainedDynamics,
     ConstrainedLangevin,
     ConstrainedNoseHoover,
     Constraints,
@@ -222,6 +223,25 @@ def test_a_saved_run_goes_on_to_the_last_bit(kind, at, tmp_path):
     assert np.array_equal(moving._state.thermostat, resumed._state.thermostat)
     assert resumed.nsteps == 30
     assert not list(tmp_path.glob("*.unfinished"))
+
+
+def test_a_run_goes_on_from_a_state_of_another_dynamics():
+    """Velocities of the state, scaled to K; the number of the step and the time go on."""
+    atoms = waters()
+    moving = ConstrainedDynamics(atoms, FS)
+    moving.run(10)
+    given = moving.state
+    again = waters(momenta=False)
+    resumed = made("isokinetic", again, state=given)
+    assert resumed.nsteps == 10 and resumed.get_time() == 10 * FS
+    wanted = 17 * units.kB * 300
+    assert 2 * again.get_kinetic_energy() == pytest.approx(wanted, rel=1e-12)
+    scale = again.get_velocities() / given.velocities
+    np.testing.assert_allclose(scale, scale[0, 0], rtol=1e-12)
+    resumed.run(5)
+    assert 2 * again.get_kinetic_energy() == pytest.approx(wanted, rel=1e-12)
+    with pytest.raises(InputError, match="not both"):
+        made("isokinetic", again, state=given, restart="a.npz")
 
 
 def test_isokinetic_goes_on_from_a_trajectory(tmp_path):
