@@ -75,12 +75,16 @@ class LennardJones:
 
     def force(self, x: FloatArray, time: float = 0.0) -> FloatArray:
         """Forces, shape (n_atoms, 3)."""
-        f = np.zeros_like(x)
-        _evaluate(x, self.molecule, self.sites, self.box, self.cutoff, f)
-        return f
+        return self.evaluate(x)[1]
 
     def potential(self, x: FloatArray, time: float = 0.0) -> float:
-        return float(_evaluate(x, self.molecule, self.sites, self.box, self.cutoff, np.zeros_like(x)))
+        """Potential energy."""
+        return self.evaluate(x)[0]
+
+    def evaluate(self, x: FloatArray) -> tuple[float, FloatArray]:
+        """Energy and forces in one pass."""
+        f = np.zeros_like(x)
+        return float(_evaluate(x, self.molecule, self.sites, self.box, self.cutoff, f)), f
 
     def rigid_sample(self, x: FloatArray, arm: float = 1.0) -> tuple[float, float]:
         """|grad U|^2 and laplacian of U in the shifts and turns of whole molecules.
