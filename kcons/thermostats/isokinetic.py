@@ -348,11 +348,15 @@ class _Share:
 
 def paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     """M_par^+ f."""
+    with np.errstate(over="ignore"):  # velocities are checked
+        return _paced(system, x, forces, time)
+
+
+def _paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
     motion = system.motion
     if motion.plan.driven:
         return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
-    with np.errstate(over="ignore"):  # velocities are checked
-        pace = forces * system.weights
+    pace = forces * system.weights
     return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
 
 
@@ -420,17 +424,17 @@ class _Step:
         system, share = self.system, self.share
         if system.force is None:
             return
-        aligned, raw = closed_form.raw_sums(self.u, self.forces, system.weights, share.masses)
-        w = closed_form.weights(aligned, self.push_square, self.left, t)
-        if w.cancels or not w.push * w.push * raw <= MANY * self.left:
+        u = np.empty_like(self.u)
+        log_growth, done = closed_form.before_drift(
+            self.u, self.forces, system.weights, share.masses, self.push_square, self.left, t, MANY, u
+        )
+        if not done:
             self.kick(t)
             return
-        u = np.empty_like(self.u)
-        closed_form.combine(self.u, w.keep, self.forces, w.push, system.weights, u)
         if share.others is not None:
             u = np.where(share.others, self.u + t * system.weights * self.forces, u)
         self.u = u
-        self.integral += w.log_growth
+        self.integral += log_growth
 
     def kick(self, t: float) -> None:
         """Bring u, projected, to its length, and follow the closed form."""
@@ -440,24 +444,18 @@ class _Step:
             self.u = self.u * factor if share.others is None else np.where(share.others, self.u, self.u * factor)
             self.integral -= math.log(factor)
             return
-        pace = paced(system, self.x, self.forces, self.now)
-        uu, aligned, self.push_square = closed_form.sums(self.u, pace, share.masses)
-        factor = math.sqrt(self.left / uu) if uu > 0 else math.nan
-        aligned *= factor
-        self.integral -= math.log(factor)
-        w = closed_form.weights(aligned, self.push_square, self.left, t)
-        if w.cancels:
+        pace = _paced(system, self.x, self.forces, self.now)
+        u = np.empty_like(pace)
+        self.push_square, factor, log_growth, done = closed_form.after_drift(
+            self.u, pace, share.masses, self.left, t, u
+        )
+        self.integral += log_growth
+        if not done:
             self._turn(pace, factor, t)
             return
-        # What rounding has left to correct.
-        got = w.keep * (w.keep * self.left + 2 * w.push * aligned) + w.push * w.push * self.push_square
-        right = math.sqrt(self.left / got) if got > 0 else math.nan
-        u = np.empty_like(pace)
-        closed_form.mix(self.u, right * factor * w.keep, pace, right * w.push, u)
         if share.others is not None:
             u = np.where(share.others, self.u + t * pace, u)
         self.u = u
-        self.integral += w.log_growth
 
     def _turn(self, pace: FloatArray, factor: float, t: float) -> None:
         share = self.share

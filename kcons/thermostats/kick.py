@@ -44,10 +44,15 @@ def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
     t : float
         May be negative.
     """
+    return Weights(*_weights(aligned, square, twice, t))
+
+
+@numba.njit(cache=True, nogil=True)
+def _weights(aligned, square, twice, t):  # type: ignore[no-untyped-def]
     a = aligned / twice
     c2 = square / twice if square > 0 else 0.0
     if not math.isfinite(c2):
-        return Weights(math.nan, math.nan, math.nan, True)
+        return math.nan, math.nan, math.nan, True
     z = math.sqrt(c2) * abs(t)
     decay = math.exp(-z)
     # sinh z/z, (cosh z - 1)/z^2 and cosh z, times e^-z; expm1 is exact near 0.
@@ -56,8 +61,8 @@ def weights(aligned: float, square: float, twice: float, t: float) -> Weights:
     cosh = 0.5 * (1 + decay * decay)
     growth = a * t * sinh + cosh
     if not growth > _CANCELS:
-        return Weights(math.nan, math.nan, math.nan, True)
-    return Weights(decay / growth, t * (a * t * cosh_less + sinh) / growth, z + math.log(growth), False)
+        return math.nan, math.nan, math.nan, True
+    return decay / growth, t * (a * t * cosh_less + sinh) / growth, z + math.log(growth), False
 
 
 def turned(u: FloatArray, pace: FloatArray, masses: FloatArray, twice: float, t: float) -> tuple[FloatArray, float]:
@@ -136,17 +141,42 @@ def raw_sums(u, f, weights, masses):  # type: ignore[no-untyped-def]
     return uf, ff
 
 
+# -- kicks, in one call -----------------------------------------------------------------------------
+
+
 @numba.njit(cache=True, nogil=True)
-def combine(u, keep, f, push, weights, out):  # type: ignore[no-untyped-def]
-    """out = keep u + push w f, w per coordinate."""
+def before_drift(u, f, weights, masses, square, twice, t, many, out):  # type: ignore[no-untyped-def]
+    """out = keep u + push M^-1 f, with forces that are not projected; log of the growth, and whether it was done.
+
+    It is not where digits would be lost, or where a drift would have to take out more than `many` times 2K.
+    """
+    aligned, raw = raw_sums(u, f, weights, masses)
+    keep, push, log_growth, cancels = _weights(aligned, square, twice, t)
+    if cancels or not push * push * raw <= many * twice:
+        return 0.0, False
     a, b, w, c = u.ravel(), f.ravel(), weights.ravel(), out.ravel()
     for i in range(a.size):
         c[i] = keep * a[i] + push * (w[i] * b[i])
+    return log_growth, True
 
 
 @numba.njit(cache=True, nogil=True)
-def mix(u, keep, pace, push, out):  # type: ignore[no-untyped-def]
-    """out = keep u + push F."""
+def after_drift(u, pace, masses, twice, t, out):  # type: ignore[no-untyped-def]
+    """Bring u to its length, and out = keep u + push F.
+
+    Returns f.F, the factor of u, log of the growth, and whether it was done: it is not where digits would be lost.
+    """
+    uu, aligned, square = sums(u, pace, masses)
+    factor = math.sqrt(twice / uu) if uu > 0 else math.nan
+    aligned *= factor
+    keep, push, log_growth, cancels = _weights(aligned, square, twice, t)
+    if cancels:
+        return square, factor, -math.log(factor), False
+    # What rounding has left to correct.
+    got = keep * (keep * twice + 2 * push * aligned) + push * push * square
+    right = math.sqrt(twice / got) if got > 0 else math.nan
+    left, more = right * factor * keep, right * push
     a, b, c = u.ravel(), pace.ravel(), out.ravel()
     for i in range(a.size):
-        c[i] = keep * a[i] + push * b[i]
+        c[i] = left * a[i] + more * b[i]
+    return square, factor, log_growth - math.log(factor), True

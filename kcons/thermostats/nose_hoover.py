@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
@@ -141,27 +142,12 @@ class NoseHooverChain:
         self, system: System, v: FloatArray, thermostat: FloatArray | None, dt: float
     ) -> tuple[FloatArray, FloatArray]:
         assert thermostat is not None
-        n, kt = self.length, self.thermal_energy
-        place, speed, count = thermostat[:n].copy(), thermostat[n : 2 * n].copy(), float(thermostat[2 * n])
-        q = self._masses(count)
-        twice = 2 * system.kinetic_energy(v)
-        scale = 1.0
-
-        def push(k: int) -> float:
-            driving = twice * scale**2 - count * kt if k == 0 else q[k - 1] * speed[k - 1] ** 2 - kt
-            return float(driving / q[k])
-
-        for fraction in FRACTIONS:
-            h = 0.5 * dt * fraction
-            for k in reversed(range(n)):
-                damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < n else 1.0
-                speed[k] = (speed[k] * damp + 0.5 * h * push(k)) * damp
-            scale *= math.exp(-h * speed[0])
-            place += h * speed
-            for k in range(n):
-                damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < n else 1.0
-                speed[k] = (speed[k] * damp + 0.5 * h * push(k)) * damp
-        return v * scale, np.concatenate([place, speed, [count]])
+        chain = thermostat.copy()
+        masses = self._masses(float(chain[-1]))
+        scale = _advance(chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, 0.5 * dt, FRACTIONS)
+        if not math.isfinite(scale):
+            raise OverflowError
+        return v * scale, chain
 
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy of system and chain; needs `System.potential`."""
@@ -171,3 +157,28 @@ class NoseHooverChain:
         place, speed, count = state.thermostat[:n], state.thermostat[n : 2 * n], float(state.thermostat[2 * n])
         chain = 0.5 * float(self._masses(count) @ speed**2) + kt * (count * float(place[0]) + float(place[1:].sum()))
         return system.total_energy(state) + chain
+
+
+@numba.njit(cache=True, nogil=True)
+def _advance(chain, q, twice, kt, time, fractions):  # type: ignore[no-untyped-def]
+    """Move the chain on, in place; returns the factor of the velocities."""
+    n, scale = len(q), 1.0
+    count = chain[2 * n]
+    place, speed = chain[:n], chain[n : 2 * n]
+    for fraction in fractions:
+        h = time * fraction
+        for k in range(n - 1, -1, -1):
+            speed[k] = _pushed(k, speed, q, twice * scale**2 - count * kt, kt, h)
+        scale *= math.exp(-h * speed[0])
+        for k in range(n):
+            place[k] += h * speed[k]
+        for k in range(n):
+            speed[k] = _pushed(k, speed, q, twice * scale**2 - count * kt, kt, h)
+    return scale
+
+
+@numba.njit(cache=True, nogil=True)
+def _pushed(k, speed, q, excess, kt, h):  # type: ignore[no-untyped-def]
+    damp = math.exp(-0.25 * h * speed[k + 1]) if k + 1 < len(q) else 1.0
+    driving = excess if k == 0 else q[k - 1] * speed[k - 1] ** 2 - kt
+    return (speed[k] * damp + 0.5 * h * driving / q[k]) * damp
