@@ -6,16 +6,17 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
 from kcons.errors import InputError, KconsError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
-    from kcons.compare import Comparison
     from kcons.scenes import Scene
+    from kcons.scenes.fluid import Fluid
 
 
 #: Columns of a page that is no terminal.
@@ -58,7 +59,8 @@ def _parser() -> argparse.ArgumentParser:
         "compare",
         parents=[common],
         help="how much error each method makes, for how much time",
-        description="Run a scene through several methods; table, plot and JSON of error against cost.",
+        description="Run a scene through several methods; table, plot and JSON of error against cost. Trajectories "
+        "are compared, or averages of the scenes at a temperature.",
     )
     compare.add_argument(
         "--dt",
@@ -99,60 +101,97 @@ def _names(text: str) -> list[str]:
 def _compare(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return _list()
-    from kcons import compare, methods, report
-    from kcons.progress import Bars
+    from kcons import scenes
 
-    methods.chosen(chosen.methods)  # complain before any work
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
     folder: Path = chosen.out or Path(f"compare-{chosen.scene}")
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
     asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt}
+    if chosen.scene in scenes.FLUIDS:
+        return _compare_averages(chosen, budget, folder, asked)
+    from kcons import compare, methods, report
+    from kcons.progress import Bars
+
+    methods.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
     with Bars() as watcher:
         watcher.begin("building the scene" + ("" if compare.kernels_cached() else "; compiling kernels (once)"), 1)
-        scene = _scene(chosen, quick=chosen.quick)
+        scene = scenes.build(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
         watcher.end()
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
         result = compare.compare(scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked)
-    text = _rendered(result)
     console = _console()
-    console.print(report.table(result, narrow=not report.fits(result, console.width)))
-    console.print(report.explanation(result), highlight=False, markup=False)
-    for path in report.write(result, folder, tables=[text, report.explanation(result)]):
-        print(f"wrote {path}")
+    explained = report.explanation(result)
+    _print(report.table(result, narrow=not report.fits(result, console.width)), explained, console)
+    _say_written(report.write(result, folder, tables=[_rendered(report.table(result)), explained]))
     return 0
+
+
+def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, asked: dict[str, Any]) -> int:
+    from kcons import sampling, sampling_report
+    from kcons.progress import Bars
+
+    sampling.chosen(chosen.methods)  # complain before any work
+    _check_scene(chosen)
+    fluid = _fluid(chosen, quick=chosen.quick)
+    if chosen.dt is not None:
+        fluid = fluid.with_time_steps(chosen.dt)
+    folder.mkdir(parents=True, exist_ok=True)
+    with Bars() as watcher:
+        result = sampling.compare(
+            fluid, methods=chosen.methods, budget=budget, seed=chosen.seed, watcher=watcher, settings=asked
+        )
+    table, explained = sampling_report.table(result), sampling_report.explanation(result)
+    _print(table, explained, _console())
+    _say_written(sampling_report.write(result, folder, tables=[_rendered(table), explained]))
+    return 0
+
+
+def _print(table: Table, explained: str, console: Console) -> None:
+    console.print(table)
+    console.print(explained, highlight=False, markup=False)
+
+
+def _say_written(paths: list[Path]) -> None:
+    for path in paths:
+        print(f"wrote {path}")
 
 
 def _check_scene(chosen: argparse.Namespace) -> None:
     from kcons import scenes
 
+    names = (*scenes.SCENES, *scenes.FLUIDS)
     if chosen.scene is None:
-        raise InputError(f"name a scene: {', '.join(scenes.SCENES)}", item="scene")
-    if chosen.scene not in scenes.SCENES:
-        raise InputError(f"there is no scene {chosen.scene!r}; there are {', '.join(scenes.SCENES)}", item="scene")
+        raise InputError(f"name a scene: {', '.join(names)}", item="scene")
+    if chosen.scene not in names:
+        raise InputError(f"there is no scene {chosen.scene!r}; there are {', '.join(names)}", item="scene")
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
-def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
+def _scene(chosen: argparse.Namespace) -> Scene:
     from kcons import scenes
 
-    return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick)
+    return scenes.build(chosen.scene, chosen.size, chosen.seed)
 
 
-def _rendered(result: Comparison) -> str:
+def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
+    from kcons import scenes
+
+    return scenes.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
+
+
+def _rendered(table: Table) -> str:
     """The table as plain text, wide enough for all columns."""
     from io import StringIO
 
     from rich.console import Console
 
-    from kcons import report
-
     page = StringIO()
-    Console(file=page, width=WIDE, color_system=None).print(report.table(result))
+    Console(file=page, width=WIDE, color_system=None).print(table)
     return page.getvalue().rstrip()
 
 
@@ -170,7 +209,14 @@ def _console() -> Console:
 def _plan(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return _list()
+    from kcons import scenes
+
     _check_scene(chosen)
+    if chosen.scene in scenes.FLUIDS:
+        fluid = _fluid(chosen)
+        print(fluid.title)
+        print(fluid.motion.report(fluid.positions))
+        return 0
     scene = _scene(chosen)
     print(scene.title)
     print(scene.motion.report(scene.positions, scene.velocities))
@@ -178,7 +224,7 @@ def _plan(chosen: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    from kcons import methods, scenes
+    from kcons import methods, sampling, scenes
 
     print("scenes")
     for name, entry in scenes.SCENES.items():
@@ -186,6 +232,12 @@ def _list() -> int:
     print("methods")
     for name, method in methods.METHODS.items():
         print(f"  {name:<16} {method.title}{'' if method.usual else ' (only when named)'}")
+    print("scenes at a temperature, whose averages are compared")
+    for name, entry in scenes.FLUIDS.items():
+        print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
+    print("thermostats for these")
+    for name, thermostat in sampling.METHODS.items():
+        print(f"  {name:<21} {thermostat.title}")
     return 0
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kcons.errors import InputError
 from kcons.scenes.scene import Reference, Scene, Units
 
-__all__ = ["SCENES", "Entry", "Reference", "Scene", "Units", "build"]
+if TYPE_CHECKING:
+    from kcons.scenes.fluid import Fluid
+
+__all__ = ["FLUIDS", "SCENES", "Entry", "Reference", "Scene", "Units", "build", "build_fluid"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,43 @@ SCENES: Mapping[str, Entry] = {
     "bead-torus": Entry("bead", "free bead on a torus", 1, 1, "bead", {"on": "torus"}),
     "slab": Entry("slab", "rigid CO on Cu(111), lower layers fixed, EMT forces", 1, 1, "molecules"),
 }
+
+#: Where averages are compared instead of trajectories.
+FLUIDS: Mapping[str, Entry] = {
+    "thermostat": Entry("fluid", "Lennard-Jones atoms at a temperature", 32, 16, "atoms"),
+    "thermostat-dumbbells": Entry(
+        "fluid", "rigid dumbbells at a temperature", 16, 8, "dumbbells", {"kind": "dumbbells"}
+    ),
+    "thermostat-water": Entry("fluid", "rigid TIP3P water at 400 K", 27, 27, "molecules", {"kind": "water"}),
+}
+
+
+def build_fluid(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False) -> Fluid:
+    """The fluid called `name`.
+
+    Parameters
+    ----------
+    name : str
+        A key of `FLUIDS`.
+    size : int, optional
+        Number of molecules.
+    seed : int
+        Of the orientations on the lattice.
+    quick : bool
+        A smaller default size.
+
+    Raises
+    ------
+    InputError
+        Unknown name; a size the fluid cannot be built at.
+    """
+    if name not in FLUIDS:
+        raise InputError(f"there is no fluid {name!r}; there are {', '.join(FLUIDS)}", item="scene")
+    entry = FLUIDS[name]
+    if size is None:
+        size = entry.quick_size if quick else entry.size
+    fluid: Fluid = import_module(f"kcons.scenes.{entry.module}").build(size, seed, **entry.options)
+    return fluid
 
 
 def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:

@@ -5,6 +5,8 @@ Small and compiled: for statistics over millions of steps. Atoms of one molecule
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
@@ -96,7 +98,14 @@ class LennardJones:
         return s[0] + s[2] / arm**2, s[1] + s[3] / arm**2
 
     def metropolis(
-        self, x: ArrayLike, thermal_energy: float, sweeps: int, every: int, seed: int, shift: float, turn: float
+        self,
+        x: ArrayLike,
+        thermal_energy: float,
+        sweeps: int,
+        every: int,
+        seed: int | Sequence[int],
+        shift: float,
+        turn: float,
     ) -> tuple[FloatArray, FloatArray, float]:
         """Canonical sampling of rigid molecules by plain Metropolis moves, without forces or velocities.
 
@@ -106,7 +115,7 @@ class LennardJones:
         thermal_energy : float
         sweeps, every : int
             Moves of each molecule, and how many of them lie between two records of the energy.
-        seed : int
+        seed : int or sequence of int
         shift, turn : float
             Largest shift of a molecule along each axis, and largest angle about a random axis.
 
