@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from ase import Atoms, units
@@ -32,65 +32,28 @@ from rich.table import Table
 from kcons import compare
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import Constraint, Distance
+from kcons.constraints import Distance
 from kcons.motion import Motion
+from kcons.scenes import fluid
 from kcons.scenes.lennard_jones import LennardJones
 from kcons.scenes.potential import Potential, PotentialCalculator
 from kcons.steppers import State, Stepper, System, run
 from kcons.thermostats import Isokinetic, Langevin, configurational_temperature, mean, thermal_velocities
 
-
-class Fluid(NamedTuple):
-    name: str
-    forces: LennardJones
-    positions: np.ndarray
-    rows: list[Constraint]
-    thermal_energy: float
-    step: float
-
-    def system(self) -> System:
-        held = ConstraintSet(self.rows, self.positions, self.forces.masses)
-        return System(Motion(held, self.positions), self.forces.force, potential=self.forces.potential)
-
-
-def atoms_fluid(n: int = 16) -> Fluid:
-    box, edge = (n / 0.5) ** (1 / 3), math.ceil(n ** (1 / 3))
-    places = np.stack(np.unravel_index(np.arange(n), (edge, edge, edge)), axis=1) * box / edge
-    forces = LennardJones(range(n), box, cutoff=min(2.5, box / 2))
-    return Fluid(f"Lennard-Jones, {n} atoms", forces, places, [], 1.5, 0.003)
-
-
-def _placed(shape: np.ndarray, box: float) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    centres = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * box / 2
-    return np.concatenate([c + shape @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T for c in centres])
-
-
-def dumbbells_fluid() -> Fluid:
-    box = (16 / 0.5) ** (1 / 3)
-    x = _placed(np.array([[-0.35, 0, 0], [0.35, 0, 0]]), box)
-    rows: list[Constraint] = [Distance(np.arange(16).reshape(-1, 2), np.full(8, 0.7))]
-    return Fluid("8 dumbbells", LennardJones(np.repeat(range(8), 2), box, sigma=0.9), x, rows, 1.5, 0.003)
-
-
-def triatomic_fluid() -> Fluid:
-    box, k = 3.9, 3 * np.arange(8)
-    x = _placed(np.array([[0, 0, 0], [0.6, 0, 0], [-0.2, 0.4 * math.sqrt(2), 0]]), box)
-    rows: list[Constraint] = [Distance(np.concatenate([np.c_[k, k + 1], np.c_[k, k + 2], np.c_[k + 1, k + 2]]))]
-    forces = LennardJones(np.repeat(range(8), 3), box, masses=np.tile([2.0, 1, 1], 8), sigma=0.9)
-    return Fluid("8 rigid triatomics", forces, x, rows, 1.5, 0.003)
-
-
-FLUIDS = (atoms_fluid, dumbbells_fluid, triatomic_fluid)
+#: Small, so that one degree of freedom counts.
+FLUIDS = (fluid.atoms(16), fluid.dumbbells(8), fluid.triatomics(8))
+NAMES = ("Lennard-Jones, 16 atoms", "8 dumbbells", "8 rigid triatomics")
+#: Errors that come from the step are a tenth of a percent then.
+STEP = 0.003
 #: Steps of full isokinetic runs: standard errors of the temperature are 0.2 %.
 STEPS = (2_500_000, 3_500_000, 4_000_000)
 
 
 def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
     """One run: temperature of the configurations and mean energy."""
-    fluid = FLUIDS[which]()
-    held, kt = fluid.system(), fluid.thermal_energy
-    state = State(fluid.positions, thermal_velocities(held, fluid.positions, kt, 1, zero_momentum=True))
+    chosen = FLUIDS[which]
+    held, kt, forces = chosen.system(), chosen.thermal_energy, chosen.forces
+    state = State(chosen.positions, thermal_velocities(held, chosen.positions, kt, 1, zero_momentum=True))
     stepper: Stepper
     start = Isokinetic(kt).start(held, state)
     assert start.thermostat is not None
@@ -101,22 +64,20 @@ def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
         stepper = Isokinetic(kt)
     else:
         stepper = Isokinetic(kinetic_energy=0.5 * g * kt)
-    state = run(held, state, fluid.step, steps // 20, stepper=stepper)
+    state = run(held, state, STEP, steps // 20, stepper=stepper)
     samples: list[tuple[float, float, float]] = []
     run(
         held,
         state,
-        fluid.step,
+        STEP,
         steps,
         stepper=stepper,
-        observers=[
-            lambda s: samples.append((*fluid.forces.rigid_sample(s.positions), fluid.forces.potential(s.positions)))
-        ],
+        observers=[lambda s: samples.append((*forces.rigid_sample(s.positions), forces.potential(s.positions)))],
         every=8,
     )
     squares, curvatures, energies = np.transpose(samples)
     return {
-        "fluid": fluid.name,
+        "fluid": NAMES[which],
         "thermostat": thermostat,
         "g": g,
         "thermal_energy": kt,
@@ -128,12 +89,11 @@ def sampled(which: int, thermostat: str, steps: int) -> dict[str, Any]:
 
 def metropolis(which: int, sweeps: int) -> dict[str, Any]:
     """The energy by moves of whole molecules."""
-    fluid = FLUIDS[which]()
-    arguments = (fluid.thermal_energy, 10, 0.25, 0.5)
-    kt, every, shift, turn = arguments
-    _, x, _ = fluid.forces.metropolis(fluid.positions, kt, sweeps // 20, every, 3, shift, turn)
-    energies, _, accepted = fluid.forces.metropolis(x, kt, sweeps, every, 4, shift, turn)
-    return {"fluid": fluid.name, "sweeps": sweeps, "accepted": accepted, "energy": list(mean(energies))}
+    chosen, every = FLUIDS[which], 10
+    forces, kt, shift, turn = chosen.forces, chosen.thermal_energy, chosen.shift, chosen.turn
+    _, x, _ = forces.metropolis(chosen.positions, kt, sweeps // 20, every, 3, shift, turn)
+    energies, _, accepted = forces.metropolis(x, kt, sweeps, every, 4, shift, turn)
+    return {"fluid": NAMES[which], "sweeps": sweeps, "accepted": accepted, "energy": list(mean(energies))}
 
 
 def trap(convention: str, steps: int) -> dict[str, Any]:
@@ -162,23 +122,13 @@ def trap(convention: str, steps: int) -> dict[str, Any]:
 # -- rigid water and chains, judged by physical_validation ------------------------------------------
 
 KB = units.kB
-COULOMB = 14.399645  # eV A
 
 
 def water() -> tuple[Atoms, int, int]:
     """27 TIP3P molecules at 0.9 g/cm3, smooth cutoff at half the box; 3 atoms a molecule, 3 rows."""
-    n, box = 27, 9.65
-    rng = np.random.default_rng(5)
-    shape = np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]])
-    places = np.stack(np.unravel_index(np.arange(n), (3, 3, 3)), axis=1) * box / 3
-    x = np.concatenate([p + shape @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T for p in places])
-    atoms = Atoms("OHH" * n, positions=x)
-    charges = math.sqrt(COULOMB) * np.tile([-0.834, 0.417, 0.417], n)
-    epsilon = np.tile([0.1521 * units.kcal / units.mol, 0.0, 0.0], n)
-    forces = LennardJones(
-        np.repeat(range(n), 3), box, masses=atoms.get_masses(), epsilon=epsilon, sigma=3.1507, charges=charges
-    )
-    return _ready(atoms, forces, 3), 3, 3
+    chosen = fluid.water(27, seed=5)
+    atoms = Atoms(chosen.symbols, positions=chosen.positions, masses=chosen.forces.masses)
+    return _ready(atoms, chosen.forces, 3), 3, 3
 
 
 def chains() -> tuple[Atoms, int, int]:
@@ -197,11 +147,8 @@ def chains() -> tuple[Atoms, int, int]:
 def _ready(atoms: Atoms, forces: LennardJones, size: int) -> Atoms:
     atoms.calc = PotentialCalculator(Potential(forces.evaluate, "Lennard-Jones"))
     first = np.arange(0, len(atoms), size)
-    if size == 3:
-        pairs = np.concatenate([np.c_[first, first + 1], np.c_[first, first + 2], np.c_[first + 1, first + 2]])
-    else:
-        pairs = np.concatenate([np.c_[first + k, first + k + 1] for k in range(size - 1)])
-    constrain(atoms, Distance(pairs))
+    along = [np.c_[first + k, first + k + 1] for k in range(size - 1)]
+    constrain(atoms, Distance(fluid.triangles(len(first)) if size == 3 else np.concatenate(along)))
     return atoms
 
 
@@ -316,7 +263,7 @@ def jobs(full: bool) -> dict[str, Job]:
     """What there is to run: a name, the list of the result it goes to, and the run."""
     found: dict[str, Job] = {}
     for which in range(len(FLUIDS)) if full else (1,):
-        name, steps = FLUIDS[which]().name, STEPS[which] if full else 4000
+        name, steps = NAMES[which], STEPS[which] if full else 4000
         found[f"Metropolis, {name}"] = "metropolis", partial(metropolis, which, 600_000 if full else 20_000)
         for thermostat in ("g - 1", "g", "Langevin"):
             taken = steps // 3 if thermostat == "Langevin" else steps

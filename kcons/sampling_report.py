@@ -81,7 +81,7 @@ def _cells(m: Sampled, notes: dict[str, int]) -> list[str | Text]:
 def _digits(error: float) -> int:
     """Decimals that show two digits of the error."""
     digits = 0
-    while error < 9.5 and digits < 8:
+    while error < 9.95 and digits < 8:
         error, digits = 10 * error, digits + 1
     return digits
 
@@ -120,6 +120,7 @@ def plot(comparison: SamplingComparison, path: Path) -> None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -151,6 +152,10 @@ def plot(comparison: SamplingComparison, path: Path) -> None:
                     )
                 axes.plot([], [], color=colour, marker=marker, linestyle=dashes[k % len(dashes)], label=label)
         axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
         axes.grid(True, which="both", linewidth=0.4, alpha=0.4)
     left.set_xlabel("force evaluations")
     right.set_xlabel("wall time / s")

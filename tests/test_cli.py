@@ -47,6 +47,27 @@ def test_compare_writes_table_plot_and_json(tmp_path, capsys):
     assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_compare_samples_fluids(tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--size", 8, "--methods", "isokinetic,langevin", "--dt", "0.01", "--budget", "0.3", "--out", out]
+    assert run("compare", "thermostat", *options) == 0
+    printed = capsys.readouterr()
+    assert "8 Lennard-Jones atoms" in printed.out
+    assert "kT off by: temperature of the configurations" in printed.out
+    assert "Metropolis sampling\n" in printed.err
+    data = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [("isokinetic", 0.01), ("langevin", 0.01)]
+    assert data["settings"]["size"] == 8 and data["settings"]["dt"] == [0.01]
+    assert (out / "compare.png").exists()
+    assert "isokinetic, 2K = (g - 1) kT" in (out / "compare.txt").read_text(encoding="utf-8")
+
+
+def test_plan_of_a_fluid(capsys):
+    assert run("plan", "thermostat-water") == 0
+    text = capsys.readouterr().out
+    assert "27 rigid TIP3P waters" in text and "rank 81" in text
+
+
 def test_default_folder_is_named_after_the_scene(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
@@ -80,6 +101,8 @@ def test_list(command, capsys):
     text = capsys.readouterr().out
     for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "bead-torus", "slab", "rattle", "dop853"):
         assert word in text
+    for word in ("thermostat-dumbbells", "thermostat-water", "isokinetic-notes", "nose-hoover"):
+        assert f"  {word} " in text
     for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4", "baumgarte"):
         (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))
         assert line.endswith("(only when named)")
@@ -103,6 +126,10 @@ def test_version(capsys):
         (["plan", "wat"], "there is no scene 'wat'"),
         (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
         (["compare", "chain", "--methods", ","], "no method"),
+        (["compare", "thermostat", "--methods", "rattle"], "there is no thermostat 'rattle'"),
+        (["compare", "thermostat", "--dt", "0.01,-1"], "give a positive number"),
+        (["compare", "thermostat-water", "--size", "8"], "use 27 or more"),
+        (["compare", "thermostat", "--budget", "0"], "positive number of seconds"),
         (["compare", "chain", "--size", "0"], "at least one bond"),
         (["compare", "chain", "--size", "3", "--dt", "3"], "does not divide the horizon"),
         (["compare", "chain", "--size", "3", "--dt", ","], "--dt is empty"),

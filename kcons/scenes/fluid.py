@@ -29,6 +29,8 @@ REDUCED = Units("σ", "ε", "τ", 1.0, "τ", 1.0)
 DENSITY, THERMAL_ENERGY, CUTOFF = 0.5, 1.5, 2.5
 #: Bond of a dumbbell and size of its sites.
 BOND, SITE = 0.7, 0.9
+#: Edge of a box of 8 triatomic molecules, and their shape.
+TRIATOMIC_EDGE, TRIATOMIC_SHAPE = 3.9, np.array([[0, 0, 0], [0.6, 0, 0], [-0.2, 0.4 * math.sqrt(2), 0]])
 #: Edge of a box of 27 waters (0.9 g/cm3) and largest cutoff in Å, and temperature in K.
 WATER_EDGE, WATER_CUTOFF, WATER_TEMPERATURE = 9.65, 9.0, 400.0
 #: Charges are in units in which two of them have the energy q q'/r in eV.
@@ -36,7 +38,7 @@ COULOMB = 14.399645
 #: TIP3P: charges, the well of the oxygen in eV and its size in Å, and the places of O, H, H.
 WATER_CHARGES, WATER_WELL, WATER_SIZE = (-0.834, 0.417, 0.417), 0.1521 * units.kcal / units.mol, 3.1507
 WATER_SHAPE = np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]])
-WATER_MASSES = (15.9994, 1.008, 1.008)
+WATER_MASSES = (15.999, 1.008, 1.008)
 
 
 @dataclass(frozen=True)
@@ -112,17 +114,17 @@ class Fluid:
 
 
 def build(size: int, seed: int = 1, *, kind: str = "atoms") -> Fluid:
-    """`size` molecules of the fluid `kind`: 'atoms', 'dumbbells' or 'water'.
+    """`size` molecules of the fluid `kind`: 'atoms', 'dumbbells', 'triatomics' or 'water'.
 
     Raises
     ------
     InputError
         Too few molecules for a box.
     """
-    smallest = {"atoms": 8, "dumbbells": 8, "water": 27}[kind]
+    smallest = 27 if kind == "water" else 8
     if size < smallest:
         raise InputError(f"{size} are too few for a periodic fluid; use {smallest} or more", item="size")
-    return {"atoms": atoms, "dumbbells": dumbbells, "water": water}[kind](size, seed)
+    return {"atoms": atoms, "dumbbells": dumbbells, "triatomics": triatomics, "water": water}[kind](size, seed)
 
 
 def atoms(size: int, seed: int = 1) -> Fluid:
@@ -142,6 +144,17 @@ def dumbbells(size: int, seed: int = 1) -> Fluid:
     held = ConstraintSet(Distance(np.arange(2 * size).reshape(-1, 2), np.full(size, BOND)), x, forces.masses)
     title = f"{size} rigid dumbbells, box {box:.4g} σ, kT = {THERMAL_ENERGY:g} ε, cutoff {forces.cutoff:.3g} σ"
     return _reduced("thermostat-dumbbells", title, held, x, forces)
+
+
+def triatomics(size: int, seed: int = 1) -> Fluid:
+    """Rigid triangles of Lennard-Jones sites, one of them twice as heavy."""
+    box = TRIATOMIC_EDGE * (size / 8) ** (1 / 3)
+    x = placed(TRIATOMIC_SHAPE, size, box, seed)
+    masses = np.tile([2.0, 1.0, 1.0], size)
+    forces = LennardJones(np.repeat(range(size), 3), box, masses=masses, sigma=SITE, cutoff=min(CUTOFF, 0.5 * box))
+    held = ConstraintSet(Distance(triangles(size)), x, masses)
+    title = f"{size} rigid triatomics, box {box:.4g} σ, kT = {THERMAL_ENERGY:g} ε, cutoff {forces.cutoff:.3g} σ"
+    return _reduced("thermostat-triatomics", title, held, x, forces)
 
 
 def water(size: int, seed: int = 1) -> Fluid:
