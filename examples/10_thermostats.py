@@ -287,7 +287,8 @@ def measure(full: bool, out: Path | None) -> dict[str, Any]:
             continue
         begun = time.process_time()
         found = job()
-        result["parts"][name] = {"group": group, "cpu_seconds": round(time.process_time() - begun, 1), **found}
+        taken = {"group": group, "commit": result["machine"]["commit"], "cpu_seconds": time.process_time() - begun}
+        result["parts"][name] = {**taken, **found}
         if out is not None:
             out.write_text(json.dumps(result, indent=1) + "\n")
         print(f"{name}: {time.process_time() - begun:.0f} s", file=sys.stderr, flush=True)
