@@ -7,6 +7,8 @@ collective variables, surfaces and the constraint objects of kcons.
 from kcons.openmm.carrier import CarriedConstraints
 from kcons.openmm.collective import CollectiveRows
 from kcons.openmm.implicit_rows import ExpressionSurface
+from kcons.openmm.isokinetic import Isokinetic
+from kcons.openmm.langevin import Langevin
 from kcons.openmm.projected import ProjectedIntegrator
 from kcons.openmm.row_forces import Row, each_term
 from kcons.openmm.surface import SurfaceIntegrator, surface_parts
@@ -16,6 +18,8 @@ __all__ = [
     "CarriedConstraints",
     "CollectiveRows",
     "ExpressionSurface",
+    "Isokinetic",
+    "Langevin",
     "ProjectedIntegrator",
     "Row",
     "SurfaceIntegrator",

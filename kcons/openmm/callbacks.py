@@ -95,7 +95,8 @@ class Engine:
         self._integrator = weakref.ref(integrator)
         scheme = getattr(integrator, "scheme", None)
         if scheme is not None:
-            self._fractions = tuple(a * w for a in scheme.drifts for w in scheme.flight)
+            halves = integrator.ensemble.halves  # type: ignore[attr-defined]
+            self._fractions = (0.5, 0.5) if halves else tuple(a * w for a in scheme.drifts for w in scheme.flight)
             sums = np.cumsum(self._fractions)[:-1].tolist()
             self._nodes = (0.0, *sums, 1.0)
 
@@ -142,7 +143,8 @@ class Engine:
         return change
 
     def project(self, state: openmm.State) -> FloatArray:
-        self._between_steps = True
+        # Thermostats project within a step, too.
+        self._between_steps = self._stage >= len(self._fractions) - 1
         read, v = self._read, self._v
         _positions(state, read)
         read -= self._x
@@ -156,7 +158,7 @@ class Engine:
             v[self.atoms] = read
             x = self._start
             x[self.atoms] = self._x
-        now = self._times(len(self._nodes) - 2)[1]
+        now = self._times(self._stage)[1]
         push = self._push if len(self._fractions) == 1 else None
         self.motion.project_velocities(x, v, time=now, out=v, multipliers=push)
         change = (v if self.whole else v[self.atoms]) - read
@@ -198,10 +200,11 @@ class Engine:
 
     def step_multipliers(self) -> FloatArray:
         integrator = self._integrator()
-        if integrator is None or len(self._fractions) != 1 or np.isnan(self._push_before).any():
+        mixed = integrator is not None and getattr(integrator, "thermostatted", False)
+        if integrator is None or mixed or len(self._fractions) != 1 or np.isnan(self._push_before).any():
             raise InputError(
-                "multipliers of a step need two steps of a scheme with one drift; multipliers(context) gives those of "
-                "any state",
+                "multipliers of a step need two steps of a scheme with one drift, at constant energy; "
+                "multipliers(context) gives those of any state",
                 item="scheme",
             )
         dt = _number(integrator.getStepSize())

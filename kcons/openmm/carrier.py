@@ -144,6 +144,15 @@ class CarriedConstraints:
         return self._engine.motion
 
     @property
+    def driven(self) -> bool:
+        """Whether rows demand velocities that are not zero."""
+        return self.motion.plan.driven
+
+    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
+        """The engine, and the positions it takes."""
+        return self.motion, self._state(context)[0]
+
+    @property
     def atoms(self) -> IntArray:
         """Particles that a row touches."""
         return self._engine.atoms
@@ -159,6 +168,13 @@ class CarriedConstraints:
         self._engine.follow(program.integrator)
         #: Without a projection at the end of the step, the solve for positions must tell of failures itself.
         self._leapfrog = getattr(program.integrator, "scheme", None) is None
+        #: Whether velocities are projected before the first drift.
+        self._early = getattr(program.integrator, "projects_first", False)
+
+    def begin(self, program: Program) -> None:
+        """Where x is not where the last step ended, and is wanted before the first drift."""
+        if self._early:
+            self.remember(program)
 
     def _guard(self, program: Program, phase: str, words: str) -> None:
         group = self._groups[phase]

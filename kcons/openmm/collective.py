@@ -166,6 +166,11 @@ class CollectiveRows(GroupRows):
         """The rows at the state of a context: gradients, Gram matrix, projections."""
         return ContextRows(self, context)
 
+    @property
+    def driven(self) -> bool:
+        """Whether targets move."""
+        return any(rate != 0.0 for rate in self._rates)
+
     def values(self, context: openmm.Context) -> FloatArray:
         """q of each row, shape (n_rows,)."""
         return self.at(context).values()
@@ -195,6 +200,11 @@ class CollectiveRows(GroupRows):
             Schemes in which these are not impulses of the same force; see `mean_multipliers`, `multipliers_at`.
         """
         scheme = getattr(integrator, "scheme", None)
+        if getattr(integrator, "thermostatted", False):
+            raise UnsupportedError(
+                "with a thermostat the impulses of a step are not those of the forces alone; read "
+                "multipliers_at(context)"
+            )
         if scheme is not None and not isinstance(scheme, Rattle | Composition):
             raise UnsupportedError(
                 f"{scheme!r} gives no multipliers at a point by the way; read mean_multipliers(integrator), the mean "

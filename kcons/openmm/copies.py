@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from kcons.openmm.projected import ProjectedIntegrator
 
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
-RUN_STATE = frozenset({"failed", "good_steps", "stale", "moved", "stage", "h", "first_stage", "end_stage"})
+RUN_STATE = frozenset(
+    {"failed", "good_steps", "stale", "moved", "stage", "h", "first_stage", "end_stage", "growth", "lost"}
+)
 
 
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:

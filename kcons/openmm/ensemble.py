@@ -3,19 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
+import openmm
+
+from kcons.errors import UnsupportedError
 from kcons.openmm.program import Program
+from kcons.steppers.splitting import Splitting
+
+if TYPE_CHECKING:
+    from kcons.openmm.projected import ProjectedIntegrator
 
 
 class Ensemble(Protocol):
-    """The kicks of an integrator."""
+    """The kicks of an integrator, and what happens in the middle of its step.
+
+    Attributes
+    ----------
+    stays_tangent : bool
+        Whether kicks leave v tangent to all constraints at x: a step that ends with a kick ends without a projection
+        of its own then.
+    halves : bool
+        Whether `middle` does something, between two halves of the only drift.
+    """
+
+    stays_tangent: bool
+    halves: bool
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
+        ...
 
     def declare(self, program: Program) -> None:
         """Variables and tables."""
         ...
 
-    def kick(self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None]) -> None:
+    def kick(
+        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+    ) -> None:
         """Let the applied forces act for a time.
 
         For h = 0 it must do nothing but add the impulse: so the constraints are applied alone.
@@ -31,18 +56,69 @@ class Ensemble(Protocol):
             Expression that is to be added to v before (that of the drift that came before), or ''.
         project : callable
             Writes the computations that make v tangent to all constraints at x.
+        tangent : bool
+            Whether v is tangent before, without the impulse.
         """
+        ...
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        """Between two halves of the drift; adds the impulse of the first, and leaves v tangent."""
+        ...
+
+    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+        """At the first step of a run, x and v on the constraints.
+
+        Raises
+        ------
+        KconsError
+            The ensemble does not exist for this System or this start.
+        """
+        ...
+
+    def verify(self, integrator: ProjectedIntegrator) -> None:
+        """Raise `ConvergenceError` if something went wrong since the last check."""
+        ...
+
+    def warmth(self, integrator: ProjectedIntegrator) -> float:
+        """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
+        ...
+
+    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
+        """Another temperature (K) from now on."""
         ...
 
 
 class ConstantEnergy:
     """Newton's equations: v += h f/m."""
 
+    stays_tangent = False
+    halves = False
+
+    def check(self, scheme: Splitting | None) -> None:
+        pass
+
     def declare(self, program: Program) -> None:
         pass
 
-    def kick(self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None]) -> None:
+    def kick(
+        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+    ) -> None:
         if impulse:
             program.each("v", f"v+{impulse}+{h}*{force}/m", "the constraint forces act, then the applied ones (kick)")
         else:
             program.each("v", f"v+{h}*{force}/m", "the applied forces act (kick)")
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        raise NotImplementedError
+
+    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+        pass
+
+    def verify(self, integrator: ProjectedIntegrator) -> None:
+        pass
+
+    def warmth(self, integrator: ProjectedIntegrator) -> float:
+        return 1.0
+
+    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
+        raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")

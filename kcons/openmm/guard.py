@@ -150,6 +150,7 @@ class Guard:
             self._make_tangent(x, v)
             for part in integrator.parts:
                 part.check(context)
+            integrator.ensemble.begin(integrator, context)
         except Exception:
             context.setVelocities(v)
             raise
@@ -204,6 +205,7 @@ class Guard:
             x = positions_of(context)
             _check_finite(x, velocities_of(context), step, self.rows.n_rows > 0)
             self.check_rows(x, step)
+            self.integrator.ensemble.verify(self.integrator)
         except (ConvergenceError, NonFiniteError):
             self.put_back()
             raise
@@ -237,14 +239,18 @@ class Guard:
 
     # -- degrees of freedom ---------------------------------------------------------------------
 
-    def degrees_of_freedom(self) -> int:
+    def independent_momenta(self) -> int:
+        """Three for each particle with a mass, less the rank of all constraints."""
         if self._freedom is None:
             moving = 3 * int(np.sum(self.rows.masses > 0))
             held = self.rows.rank(positions_of(self.context))
             held += sum(part.rank(self.context) for part in self.integrator.parts)
-            held += 3 if removes_centre_of_mass_motion(self.system) else 0
             self._freedom = moving - held
         return self._freedom
+
+    def degrees_of_freedom(self) -> int:
+        """Also less three where a CMMotionRemover acts."""
+        return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
 
 
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:

@@ -14,6 +14,7 @@ from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.isokinetic import kelvins
 from kcons.openmm.minimization import descend
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
@@ -82,6 +83,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
         self.ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
+        self.ensemble.check(self.scheme)
         self.parts = tuple(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
@@ -109,6 +111,16 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         return self.program.listing()
 
     # -- running --------------------------------------------------------------------------------
+
+    @property
+    def thermostatted(self) -> bool:
+        """Whether velocities change by more than forces and constraints."""
+        return type(self.ensemble) is not ConstantEnergy
+
+    @property
+    def projects_first(self) -> bool:
+        """Whether a step projects velocities, or forces, before its first drift."""
+        return self.ensemble.stays_tangent
 
     @property
     def context(self) -> openmm.Context:
@@ -337,6 +349,22 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """
         return self._watch(context).degrees_of_freedom()
 
+    def independent_momenta(self, context: openmm.Context | None = None) -> int:
+        """Three for each particle with a mass, less the rank of all constraints, whatever happens to total momentum."""
+        return self._watch(context).independent_momenta()
+
+    def setTemperature(self, temperature: unit.Quantity | float) -> None:
+        """Change the temperature (K if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is not above zero.
+        UnsupportedError
+            The ensemble has none.
+        """
+        self.ensemble.set_temperature(self, kelvins(temperature))
+
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
         guard = self._watch(context)
@@ -349,6 +377,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     def computeSystemTemperature(self) -> unit.Quantity:
         """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.
 
+        With `Isokinetic`, whose K does not fluctuate, the temperature of the configurations.
+
         Raises
         ------
         InputError
@@ -357,7 +387,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         freedom = self.degrees_of_freedom()
         if freedom <= 0:
             raise InputError("the constraints leave no degree of freedom: there is no temperature", item="constraints")
-        return (2 * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
+        warmth = self.ensemble.warmth(self)
+        return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
 
     # -- settings -------------------------------------------------------------------------------
 

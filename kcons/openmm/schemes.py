@@ -16,6 +16,7 @@ from kcons.steppers import (
     Yoshida4,
 )
 from kcons.steppers.splitting import Splitting
+from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
 
 #: Schemes by name.
 SCHEMES: dict[str, Callable[[], Splitting]] = {
@@ -27,6 +28,8 @@ SCHEMES: dict[str, Callable[[], Splitting]] = {
     "blanes-moan4": BlanesMoan4,
     "blanes-moan6": BlanesMoan6,
     "blanes-moan6a": BlanesMoan6a,
+    "isokinetic4": lambda: Splitting(*ISOKINETIC[4]),
+    "isokinetic6": lambda: Splitting(*ISOKINETIC[6]),
 }
 LEAPFROG = "leapfrog"
 

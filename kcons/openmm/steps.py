@@ -27,7 +27,7 @@ class StepWriter:
 
     def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
         self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
-        self.drifts, self.kicks = stages_of(scheme)
+        self.drifts, self.kicks = ([0.5, 0.5], [0.5, 0.0, 0.5]) if ensemble.halves else stages_of(scheme)
         self.alone = len(self.drifts) + 1
         self.kept = scheme is not None and any(part.evaluates for part in self.parts)
 
@@ -55,8 +55,11 @@ class StepWriter:
     def _write_plain(self) -> None:
         p, drifts, kicks = self.program, self.drifts, self.kicks
         if kicks[0]:
-            self._kick(_of_dt(kicks[0]))
-        if len(drifts) == 1:
+            self._kick(_of_dt(kicks[0]), tangent=True)
+        if self.ensemble.halves:
+            self.ensemble.middle(p, self._drift("0.5*dt"), self._project)
+            self._kick("0.5*dt", self._drift("0.5*dt"))
+        elif len(drifts) == 1:
             impulse = self._drift("dt")
             if kicks[1]:
                 self._kick(_of_dt(kicks[1]), impulse)
@@ -75,7 +78,7 @@ class StepWriter:
                 p.let("stage", "stage+1", "what follows")
                 with p.when("kick_share(stage) != 0", "a kick follows"):
                     self._kick("dt*kick_share(stage)")
-        if self.scheme is not None:
+        if self.scheme is not None and not self._ends_tangent:
             self._project()
 
     # -- a step that is taken back when a part fails --------------------------------------------
@@ -88,7 +91,7 @@ class StepWriter:
         p.number("end_stage", "where the stages end", n)
         p.number("stage", "number of the drift")
         p.number("h", "length of the drift")
-        if len(self.drifts) == 1:
+        if self._last_drift_apart:
             p.number("per_h", "1/h after the drift")
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
@@ -121,9 +124,14 @@ class StepWriter:
             p.let("stale", "0", "forces belong to x")
             p.each("v_last", "v", "to come back to")
             if self.kicks[0]:
-                self._kick("dt*kick_share(first_stage)")
+                self._kick("dt*kick_share(first_stage)", tangent=True)
             p.let("stage", "first_stage", "first drift")
-            if len(self.drifts) == 1:
+            if self.ensemble.halves:
+                with p.when("first_stage = 0", "a step"):
+                    p.let("h", "dt*drift_share(0)", "length of the first drift")
+                    self.ensemble.middle(p, self._drift("h"), self._project)
+                    p.let("stage", "1", "what follows")
+            if self._last_drift_apart:
                 self._write_single()
             else:
                 self._write_loop()
@@ -135,9 +143,10 @@ class StepWriter:
                     p.let("good_steps", "good_steps+1", "count it")
             else:
                 with p.when("failed = 0", "all solves converged"):
-                    if len(self.drifts) == 1:
+                    if self._last_drift_apart:
                         self._kick_after("per_h*(x-xu)")
-                    self._project()
+                    if not self._ends_tangent:
+                        self._project()
                     p.let("good_steps", "good_steps+delta(failed)", "count it")
                     if self.kept:
                         p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
@@ -173,14 +182,26 @@ class StepWriter:
 
     # -- what both are made of ------------------------------------------------------------------
 
+    @property
+    def _last_drift_apart(self) -> bool:
+        """Whether the last drift is written outside of a loop."""
+        return len(self.drifts) == 1 or self.ensemble.halves
+
+    @property
+    def _ends_tangent(self) -> bool:
+        """Whether the last kick leaves v tangent, so that no projection is needed."""
+        # In a loop, the last kick may be left out, where constraints are applied alone.
+        return self.ensemble.stays_tangent and self.kicks[-1] != 0 and (not self.parts or self._last_drift_apart)
+
     def _kick_after(self, impulse: str = "") -> None:
         """The kick that follows drift `stage`, with the forces at x."""
         if self.kept:
             self.program.each("force", "f", "applied forces")
         self._kick("dt*kick_share(stage)", impulse)
 
-    def _kick(self, h: str, impulse: str = "") -> None:
-        self.ensemble.kick(self.program, h, self.force, impulse, self._project)
+    def _kick(self, h: str, impulse: str = "", tangent: bool = False) -> None:
+        # The leapfrog's velocities belong to half a step before.
+        self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent and self.scheme is not None)
 
     def _drift(self, h: str) -> str:
         """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""

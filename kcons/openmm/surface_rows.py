@@ -177,6 +177,11 @@ class SurfaceRows(ABC):
         v[self.atoms] = engine(context, [self], x).project_velocities(x[self.atoms], v[self.atoms])
         context.setVelocities(v)
 
+    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
+        """The engine for these atoms, and their positions."""
+        x, _ = positions_and_velocities(context)
+        return engine(context, [self], x), x[self.atoms]
+
     def rank(self, context: openmm.Context) -> int:
         """One for each atom: rows on different atoms are independent."""
         return len(self.atoms)

@@ -23,6 +23,7 @@ from openmm_systems import (
 
 from kcons.errors import ConvergenceError, InputError
 from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.ensemble import ConstantEnergy
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 PS = unit.picosecond
@@ -164,13 +165,13 @@ def test_changes_from_outside_reach_kept_forces(change):
     np.testing.assert_allclose(contexts[0], contexts[1], rtol=1e-12)
 
 
-class Friction:
+class Friction(ConstantEnergy):
     """An ensemble that is seen to be right: v falls exponentially during kicks."""
 
     def declare(self, program):
         program.number("rate", "of the friction", 1e3 * np.log(4.0))
 
-    def kick(self, program, h, force, impulse, project):
+    def kick(self, program, h, force, impulse, project, tangent):
         program.each("v", f"(v+{impulse or 0})*exp(-rate*{h})", "kick with friction")
         project()
 
