@@ -202,10 +202,10 @@ class Guard:
         context = self.context
         step = context.getStepCount()
         try:
+            self.integrator.ensemble.verify(self.integrator)
             x = positions_of(context)
             _check_finite(x, velocities_of(context), step, self.rows.n_rows > 0)
             self.check_rows(x, step)
-            self.integrator.ensemble.verify(self.integrator)
         except (ConvergenceError, NonFiniteError):
             self.put_back()
             raise

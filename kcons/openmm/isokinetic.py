@@ -172,9 +172,9 @@ class Isokinetic:
         # sinh is exact near 0, where 1 - exp(-2z) is not.
         p.let("sinhc", "select(step(z-1), 0.5*(1-decay^2), decay*sinh(min(z, 1)))/z", "closed form")
         p.let("coshc", "0.5*(select(step(z-1), 1-decay, 2*exp(-0.5*z)*sinh(0.5*min(z, 1)))/z)^2", "closed form")
-        p.let("scale", "aim*z*sinhc+0.5*(1+decay^2)", "closed form")
+        p.let("scale", "max(aim*z*sinhc+0.5*(1+decay^2), 1e-300)", "closed form")
         p.let("lost", f"lost+step({_CANCELS!r}-scale)", "count what cannot be trusted")
-        p.let("growth", "growth+z+log(max(scale, 1e-300))", "alpha over time")
+        p.let("growth", "growth+z+log(scale)", "alpha over time")
         # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
         p.let("keep", f"select({h}, sqrt(two_k/ww), 1)*decay/scale", "share of the velocities")
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")

@@ -23,8 +23,8 @@ class Langevin(ConstantEnergy):
 
         v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
 
-    half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator makes a run
-    reproducible, as far as the platform's forces are.
+    half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator makes
+    a run reproducible, as far as the platform's forces are.
 
     Parameters
     ----------

@@ -57,8 +57,8 @@ class StepWriter:
         if kicks[0]:
             self._kick(_of_dt(kicks[0]), tangent=True)
         if self.ensemble.halves:
-            self.ensemble.middle(p, self._drift("0.5*dt"), self._project)
-            self._kick("0.5*dt", self._drift("0.5*dt"))
+            self.ensemble.middle(p, self._drift("(0.5*dt)"), self._project)
+            self._kick("0.5*dt", self._drift("(0.5*dt)"))
         elif len(drifts) == 1:
             impulse = self._drift("dt")
             if kicks[1]:

@@ -1,0 +1,488 @@
+"""Isokinetic and Langevin ensembles in OpenMM."""
+
+import copy
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import unit
+from openmm_systems import (
+    alanine,
+    context_of,
+    dumbbell,
+    forces_at,
+    loose_alanine,
+    masses_of,
+    potential_energy,
+    started,
+    state_of,
+    water_box,
+)
+
+from kcons import ConstraintSet, Motion, State
+from kcons import System as CoreSystem
+from kcons.constraints import Angle, Distance, Sphere
+from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    ProjectedIntegrator,
+    Row,
+    SurfaceIntegrator,
+    hold,
+    surface_parts,
+)
+from kcons.openmm.isokinetic import GAS_CONSTANT
+from kcons.thermostats import Isokinetic as CoreIsokinetic
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+ORDERS = {"rattle": 2, "isokinetic4": 4, "isokinetic6": 6}
+
+
+def twice_kinetic(system, v):
+    return float(masses_of(system) @ np.einsum("ij,ij->i", v, v))
+
+
+def run(system, integrator, x, v, steps, platform="Reference"):
+    context = started(system, integrator, x, v, platform)
+    integrator.step(steps)
+    return context
+
+
+# -- isokinetic: trajectories -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ORDERS)
+def test_one_bond_as_the_core_stepper(scheme):
+    system, x, v = dumbbell()
+    dt = 0.5e-3
+    v = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x).project_velocities(x, v)
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14, ensemble=Isokinetic(momentum="free"))
+    context = started(system, integrator, x, v)
+    k, c = 50.0, 500.0
+
+    def force(r, t):
+        x, y, z = r.T
+        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
+
+    core = CoreSystem(Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x), force)
+    stepper, state = CoreIsokinetic(order=ORDERS[scheme], momentum="free"), State(x, v)
+    # Order 6 has 90 drifts a step, whose velocities are differences of positions.
+    for steps, limit in ((50, 1e-12), (250, 2e-11)) if scheme != "isokinetic6" else ((50, 2e-11),):
+        for _ in range(steps):
+            state = stepper.step(core, state, dt)
+        integrator.step(steps)
+        r, u = state_of(context)
+        assert np.abs(r - state.positions).max() <= limit
+        assert np.abs(u - state.velocities).max() <= 100 * limit
+
+
+#: System, time, reference steps, and the numbers of steps of each scheme. In many small steps velocities, which are
+#: differences of positions, are rounding: order 6 shows on the dumbbell only.
+RUNS = {
+    "dumbbell": (0.4, 64, {"rattle": (64, 128, 256), "isokinetic4": (16, 24, 32), "isokinetic6": (16, 20, 24)}),
+    "alanine": (0.016, 24, {"rattle": (16, 32, 64), "isokinetic4": (8, 12, 16)}),
+}
+
+
+@pytest.mark.parametrize(("name", "scheme"), [(name, scheme) for name, run in RUNS.items() for scheme in run[2]])
+def test_order(name, scheme):
+    """Slope of the error at fixed time: a bond in a field, and alanine dipeptide with all bonds held."""
+    system, x, v = dumbbell() if name == "dumbbell" else alanine()
+    span, many, runs = RUNS[name]
+
+    def end(scheme, n):
+        integrator = ProjectedIntegrator(span / n, scheme, tolerance=1e-14, ensemble=Isokinetic())
+        return state_of(run(system, integrator, x, v, n))[0]
+
+    exact = end("isokinetic6", many)
+    errors = [np.abs(end(scheme, n) - exact).max() for n in runs[scheme]]
+    slope = -np.polyfit(np.log(runs[scheme]), np.log(errors), 1)[0]
+    assert slope == pytest.approx(ORDERS[scheme], abs=0.15)
+
+
+@pytest.mark.parametrize("platform", ["Reference", "CPU"])
+@pytest.mark.parametrize("scheme", [*ORDERS, "geodesic"])
+def test_kinetic_energy_stays(scheme, platform):
+    system, x = water_box()
+    ensemble = Isokinetic(300 * unit.kelvin)
+    integrator = ProjectedIntegrator(1e-3, scheme, ensemble=ensemble)
+    context = context_of(system, integrator, platform)
+    context.setPositions(x)
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 2)
+    v = state_of(context)[1]
+    masses = masses_of(system)
+    context.setVelocities(v - masses @ v / masses.sum())
+    for _ in range(5):
+        integrator.step(20)
+        found = twice_kinetic(system, state_of(context)[1])
+        assert abs(found / ((6 * 27 - 4) * GAS_CONSTANT * 300) - 1) <= 1e-13
+    assert ensemble.count == 6 * 27 - 3
+    kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
+    assert kelvin == pytest.approx(300, rel=1e-12)
+
+
+def test_pseudo_energy_converges_with_the_order():
+    system, x, v = alanine()
+    spread = {}
+    for scheme, dt in (("rattle", 1e-3), ("rattle", 5e-4), ("isokinetic4", 1e-3)):
+        ensemble = Isokinetic(300.0)
+        integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-13, ensemble=ensemble)
+        context = started(system, integrator, x, v)
+        values = []
+        for _ in range(50):
+            integrator.step(round(2e-3 / dt))
+            values.append(ensemble.conserved_energy(integrator))
+        spread[scheme, dt] = np.ptp(values)
+        assert context.getStepCount() == 50 * round(2e-3 / dt)
+    assert spread["rattle", 1e-3] / spread["rattle", 5e-4] == pytest.approx(4, rel=0.3)
+    assert spread["isokinetic4", 1e-3] < 1e-3 * spread["rattle", 1e-3]
+
+
+def test_friction_and_compression_rate():
+    system, x, v = loose_alanine()
+    ensemble = Isokinetic(300.0)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    with pytest.warns(UserWarning, match="momentum"):
+        context = run(system, integrator, x, v, 1)
+    u = state_of(context)[1]
+    alpha = np.sum(u * forces_at(context)) / twice_kinetic(system, u)
+    assert ensemble.friction(integrator) == pytest.approx(alpha, rel=1e-12)
+    # A bond is free, and momentum is conserved.
+    assert ensemble.count == 66 - 20 - 3
+    assert ensemble.compression_rate(integrator) == pytest.approx(-(ensemble.count - 1) * alpha, rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+def test_strong_kicks_keep_the_kinetic_energy():
+    """c h of 2 to 10^6 in one kick, without overflow; velocities end along the force."""
+    for strength in (1.0, 1e3, 1e6, 1e12):
+        system = openmm.System()
+        field = openmm.CustomExternalForce("-a*x")
+        field.addGlobalParameter("a", 16.0 * strength)
+        for _ in range(2):
+            field.addParticle(system.addParticle(16.0), [])
+        system.addForce(field)
+        ensemble = Isokinetic()
+        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+        v = np.array([[0.0, 0.3, 0.4], [-0.1, 0.2, 0.5]])
+        context = run(system, integrator, np.zeros((2, 3)), v, 1)
+        u = state_of(context)[1]
+        assert abs(twice_kinetic(system, u) / twice_kinetic(system, v) - 1) <= 4e-15
+        if strength >= 1e6:
+            np.testing.assert_allclose(u[:, 0], np.sqrt(np.sum(v**2) / 2), rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+def test_velocities_straight_against_a_strong_force():
+    system = openmm.System()
+    field = openmm.CustomExternalForce("-a*x")
+    field.addGlobalParameter("a", 1e9)
+    field.addParticle(system.addParticle(16.0), [])
+    system.addForce(field)
+    integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(), check_every=1)
+    context = started(system, integrator, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]))
+    with pytest.raises(ConvergenceError, match="turned"):
+        integrator.step(1)
+    assert np.array_equal(state_of(context)[1], [[-1.0, 0, 0]])
+
+
+# -- isokinetic: with what is held -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
+def test_parts_keep_their_rows_and_the_kinetic_energy(scheme):
+    system = openmm.System()
+    x = np.array([[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]])
+    springs = openmm.CustomBondForce("200*(r-0.5)^2")
+    for i in range(6):
+        system.addParticle(12.0 + i)
+        for j in range(i):
+            springs.addBond(j, i)
+    system.addForce(springs)
+    carried = hold(system, [Angle([(0, 1, 2)], 1.9)], positions=x)
+    distance = openmm.CustomBondForce("r")
+    distance.addBond(3, 4)
+    rows = CollectiveRows(system, [Row(distance, 0.5)])
+    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
+    ensemble = Isokinetic(300.0)
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=(carried, rows, sphere), ensemble=ensemble)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300, 4)
+    for block in range(4):
+        integrator.step(20)
+        integrator.check()
+        r, u = state_of(context)
+        assert abs(np.linalg.norm(r[3] - r[4]) - 0.5) < 1e-12
+        assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
+        assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
+        # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
+        assert abs(twice_kinetic(system, u) / ((18 - 3 - 1) * GAS_CONSTANT * 300) - 1) <= 1e-13
+        if block == 1:  # somebody moves x between steps
+            context.setPositions(r + 0.0)
+            integrator.applyConstraints(context)
+    with pytest.raises(UnsupportedError, match="multipliers_at"):
+        rows.multipliers(integrator)
+    with pytest.raises(InputError, match="constant energy"):
+        carried.step_multipliers()
+
+
+def test_rows_that_are_carried_move_as_those_of_the_system():
+    """The same bonds held by OpenMM and by kcons: one trajectory, although others move x in between."""
+    system, x, v = loose_alanine()
+    other = copy.deepcopy(system)
+    carried = hold(other, [], positions=x, take="all")
+    ends = []
+    for this, parts in ((system, ()), (other, (carried,))):
+        ensemble = Isokinetic(300.0, momentum="free")
+        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=ensemble)
+        context = run(this, integrator, x, v, 10)
+        r, u = state_of(context)
+        context.setPositions(r + 0.7)
+        context.setVelocities(u)
+        integrator.step(10)
+        ends.append(state_of(context))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
+
+
+def test_surfaces_alone():
+    system = openmm.System()
+    springs = openmm.CustomBondForce("100*(r-0.5)^2")
+    x = np.array([[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
+    for k in range(3):
+        system.addParticle(20.0)
+        for j in range(k):
+            springs.addBond(j, k)
+    system.addForce(springs)
+    integrator = SurfaceIntegrator(
+        1e-3, surfaces=Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5), system=system, ensemble=Isokinetic(300.0)
+    )
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(100)
+    r, u = state_of(context)
+    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 0.5, atol=1e-14)
+    assert abs(twice_kinetic(system, u) / (5 * GAS_CONSTANT * 300) - 1) <= 1e-13
+
+
+def test_leapfrog_keeps_the_kinetic_energy_of_half_steps():
+    system, x, v = alanine()
+    integrator = ProjectedIntegrator(1e-3, "leapfrog", ensemble=Isokinetic(300.0))
+    context = started(system, integrator, x, v)
+    for _ in range(5):
+        integrator.step(10)
+        found = context.getState(energy=True).getKineticEnergy().value_in_unit(unit.kilojoule_per_mole)
+        assert abs(2 * found / (41 * GAS_CONSTANT * 300) - 1) <= 1e-13
+
+
+def test_a_part_of_the_particles():
+    system, x, v = water_box()[0], water_box()[1], np.random.default_rng(0).normal(size=(81, 3))
+    chosen = np.arange(12)
+    ensemble = Isokinetic(300.0, atoms=chosen)
+    integrator = ProjectedIntegrator(5e-4, ensemble=ensemble)
+    context = run(system, integrator, x, 0.3 * v, 30)
+    masses, u = masses_of(system), state_of(context)[1]
+    assert ensemble.count == 24
+    wanted = 23 * GAS_CONSTANT * 300
+    assert abs(masses[:12] @ np.sum(u[:12] ** 2, axis=1) / wanted - 1) <= 1e-13
+    # The others move by Newton's equations: the same first step as without a thermostat.
+    plain = ProjectedIntegrator(5e-4)
+    start = started(system, plain, x, 0.3 * v)
+    plain.step(1)
+    again = ProjectedIntegrator(5e-4, ensemble=Isokinetic(atoms=chosen))
+    both = run(system, again, x, 0.3 * v, 1)
+    np.testing.assert_allclose(state_of(both)[0][12:], state_of(start)[0][12:], atol=1e-13)
+    assert np.abs(state_of(both)[0][:12] - state_of(start)[0][:12]).max() > 1e-9
+    with pytest.raises(UnsupportedError, match="couples"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, atoms=[0, 1])), x, v, 1)
+
+
+# -- isokinetic: g, refusals, settings -----------------------------------------------------------------
+
+
+def test_momenta_that_are_conserved_are_found():
+    system, x, v = dumbbell()
+    ensemble = Isokinetic(300.0)
+    run(system, ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
+    assert ensemble.count == 5  # the field stands in space
+    field = system.getForce(0)
+    field.setEnergyFunction("k*x^2+c*0")
+    ensemble = Isokinetic(300.0)
+    with pytest.warns(UserWarning, match="total momentum is not zero"):
+        run(system, ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
+    assert ensemble.count == 3  # along y and z nothing acts
+    free = Isokinetic(300.0, momentum="free")
+    run(system, ProjectedIntegrator(1e-4, ensemble=free), x, v, 1)
+    assert free.count == 5
+
+
+def test_a_free_cluster_is_warned_of():
+    system, x, v = loose_alanine()
+    masses = masses_of(system)
+    with pytest.warns(UserWarning, match="no torque"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, v - masses @ v / masses.sum(), 1)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+def test_what_cannot_be_thermostatted_is_refused():
+    for arguments, match in (
+        ({"temperature": 0.0}, "temperature"),
+        ({"temperature": float("nan")}, "temperature"),
+        ({"kinetic_energy": -1.0}, "kinetic_energy"),
+        ({"temperature": 300.0, "kinetic_energy": 1.0}, "not both"),
+        ({"convention": "other"}, "convention"),
+        ({"momentum": "maybe"}, "momentum"),
+    ):
+        with pytest.raises(InputError, match=match):
+            Isokinetic(**arguments)
+    for scheme in ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6"):
+        with pytest.raises(UnsupportedError, match="isokinetic4"):
+            ProjectedIntegrator(1e-3, scheme, ensemble=Isokinetic(300.0))
+    system, x, v = dumbbell()
+    with pytest.raises(InputError, match="non-zero kinetic energy"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, 0 * v, 1)
+    one = openmm.System()
+    for m in (1.0, 0.0):
+        one.addParticle(m)
+    planes = CollectiveRows(one, [Row(_plane("x"), 0.0), Row(_plane("y"), 0.0)])
+    integrator = ProjectedIntegrator(1e-3, parts=[planes], ensemble=Isokinetic(300.0))
+    with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
+        run(one, integrator, np.zeros((2, 3)), [[0, 0, 1.0], [0, 0, 0]], 1)
+
+
+def _plane(name):
+    force = openmm.CustomExternalForce(name)
+    force.addParticle(0, [])
+    return force
+
+
+def test_moving_targets_are_refused_and_held_by_langevin():
+    for ensemble in (Isokinetic(300.0), Langevin(300.0, 5.0)):
+        system, x, v = dumbbell()
+        x = np.vstack([x, x[:1] + np.array([0.2, 0.1, 0.0])])
+        v = np.vstack([v, [[0.1, 0, 0]]])
+        system.addParticle(14.0)
+        part = hold(system, [Distance([[0, 2]], lambda t: 0.2236 + 0.5 * t)], positions=x)
+        integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=ensemble)
+        context = context_of(system, integrator)
+        context.setPositions(x)
+        integrator.applyConstraints(context)
+        integrator.setVelocitiesToTemperature(context, 300, 2)
+        if isinstance(ensemble, Isokinetic):
+            with pytest.raises(UnsupportedError, match="targets that rest"):
+                integrator.step(1)
+            continue
+        for _ in range(4):
+            integrator.step(10)
+            r, u = state_of(context)
+            d = r[2] - r[0]
+            now = context.getTime().value_in_unit(unit.picosecond)
+            assert abs(np.linalg.norm(d) - (0.2236 + 0.5 * now)) < 1e-12
+            assert abs(d @ (u[2] - u[0]) / np.linalg.norm(d) - 0.5) < 1e-9
+
+
+@pytest.mark.parametrize("ensemble", [Isokinetic(300.0, convention="notes"), Langevin(300.0, 1.0)], ids=repr)
+def test_copies_files_and_temperatures(ensemble):
+    system, x, v = alanine()
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    integrator.setRandomNumberSeed(5)
+    twins = [copy.copy(integrator), pickle.loads(pickle.dumps(integrator))]
+    text = openmm.XmlSerializer.serialize(integrator)
+    twins.append(ProjectedIntegrator.from_xml(text, ensemble=copy.copy(ensemble)))
+    context = run(system, integrator, x, v, 20)
+    first = state_of(context)
+    for twin in twins:
+        assert repr(twin.ensemble) == repr(ensemble)
+        assert np.array_equal(state_of(run(system, twin, x, v, 20)), first)
+    integrator.setTemperature(350 * unit.kelvin)
+    integrator.step(2)
+    assert repr(integrator.ensemble).count("350 K") == 1
+    if isinstance(ensemble, Isokinetic):
+        k = twice_kinetic(system, state_of(context)[1])
+        assert abs(k / (66 * GAS_CONSTANT * 350) - 1) <= 1e-13
+    with pytest.raises(UnsupportedError, match="ensemble"):
+        ProjectedIntegrator(1e-3).setTemperature(300)
+
+
+def test_checkpoints_continue_bit_for_bit():
+    system, x, v = alanine()
+    for ensemble in (Isokinetic(300.0), Langevin(300.0, 1.0)):
+        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+        integrator.setRandomNumberSeed(3)
+        context = run(system, integrator, x, v, 10)
+        kept = context.createCheckpoint()
+        integrator.step(10)
+        after = state_of(context)
+        context.loadCheckpoint(kept)
+        integrator.step(10)
+        assert np.array_equal(state_of(context), after)
+
+
+# -- Langevin ------------------------------------------------------------------------------------------
+
+
+def test_langevin_without_friction_is_the_drift_in_two_halves():
+    """Order 2, and no noise."""
+    system, x, v = alanine()
+    exact = state_of(run(system, ProjectedIntegrator(2.5e-4, "blanes-moan6", tolerance=1e-13), x, v, 64))[0]
+    errors = []
+    for n in (16, 32, 64):
+        integrator = ProjectedIntegrator(0.016 / n, tolerance=1e-13, ensemble=Langevin(300.0, 0.0))
+        errors.append(np.abs(state_of(run(system, integrator, x, v, n))[0] - exact).max())
+    slope = np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0]
+    assert slope == pytest.approx(2, abs=0.15)
+
+
+def test_langevin_is_refused_where_it_cannot_be():
+    for scheme in ("leapfrog", "geodesic", "suzuki4", "blanes-moan4", "isokinetic4"):
+        if scheme == "geodesic":  # the same splitting of OpenMM's program
+            continue
+        with pytest.raises(UnsupportedError):
+            ProjectedIntegrator(1e-3, scheme, ensemble=Langevin(300.0, 1.0))
+    with pytest.raises(InputError, match="friction"):
+        Langevin(300.0, -1.0)
+    with pytest.raises(InputError, match="temperature"):
+        Langevin(-300.0, 1.0)
+
+
+def test_langevin_velocities_have_the_temperature_of_the_tangent_plane():
+    """A chain of rigid waters without forces: <v A> = 0 exactly, and <2K> = g kT within three standard errors."""
+    system, x = water_box()
+    system.removeForce(0)
+    integrator = ProjectedIntegrator(2e-3, ensemble=Langevin(300.0, 200.0))
+    integrator.setRandomNumberSeed(11)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 7)
+    values = []
+    for _ in range(400):
+        integrator.step(5)  # friction x time = 2: independent draws
+        values.append(twice_kinetic(system, state_of(context)[1]) / GAS_CONSTANT / (6 * 27))
+    error = np.std(values) / 20
+    assert abs(np.mean(values) - 300) <= 3 * error
+    # The variance of a chi-square distribution with g degrees of freedom.
+    assert np.var(values) == pytest.approx(300**2 * 2 / (6 * 27), rel=0.3)
+
+
+def test_langevin_with_parts():
+    system, x, _ = loose_alanine()
+    carried = hold(system, [], positions=x, take="all")
+    integrator = ProjectedIntegrator(2e-3, parts=[carried], ensemble=Langevin(300.0, 5.0))
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(200)
+    report = carried.report(context)
+    r, u = state_of(context)
+    assert np.abs(carried.motion.constraint_set.value(r, 0.0)).max() < 1e-13
+    assert np.abs(carried.motion.constraint_set.jacobian(r, 0.0) @ u.ravel()).max() < 1e-11
+    assert report is not None
+    assert 100 < integrator.computeSystemTemperature().value_in_unit(unit.kelvin) < 700
+    assert np.isfinite(potential_energy(context))
