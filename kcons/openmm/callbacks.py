@@ -86,6 +86,8 @@ class Engine:
         self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
         self._fractions: tuple[float, ...] = (1.0,)
         self._nodes: tuple[float, ...] = (0.0, 1.0)
+        #: Whether velocities are projected between the drifts of a step, too.
+        self._within = False
         self._error: BaseException | None = None
         self._between_steps, self._began, self._stage = True, (0.0, 0), 0
         LIVE[key] = self
@@ -95,10 +97,15 @@ class Engine:
         self._integrator = weakref.ref(integrator)
         scheme = getattr(integrator, "scheme", None)
         if scheme is not None:
-            halves = integrator.ensemble.halves  # type: ignore[attr-defined]
-            self._fractions = (0.5, 0.5) if halves else tuple(a * w for a in scheme.drifts for w in scheme.flight)
+            ensemble = getattr(integrator, "ensemble", None)
+            self._within = ensemble is not None and ensemble.halves
+            self._fractions = (0.5, 0.5) if self._within else tuple(a * w for a in scheme.drifts for w in scheme.flight)
             sums = np.cumsum(self._fractions)[:-1].tolist()
             self._nodes = (0.0, *sums, 1.0)
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self._between_steps = True
 
     # -- callbacks ------------------------------------------------------------------------------
 
@@ -144,7 +151,7 @@ class Engine:
 
     def project(self, state: openmm.State) -> FloatArray:
         # Thermostats project within a step, too.
-        self._between_steps = self._stage >= len(self._fractions) - 1
+        self._between_steps = not self._within or self._stage >= len(self._fractions) - 1
         read, v = self._read, self._v
         _positions(state, read)
         read -= self._x
@@ -158,7 +165,7 @@ class Engine:
             v[self.atoms] = read
             x = self._start
             x[self.atoms] = self._x
-        now = self._times(self._stage)[1]
+        now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
         push = self._push if len(self._fractions) == 1 else None
         self.motion.project_velocities(x, v, time=now, out=v, multipliers=push)
         change = (v if self.whole else v[self.atoms]) - read

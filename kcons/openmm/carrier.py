@@ -180,6 +180,10 @@ class CarriedConstraints:
         group = self._groups[phase]
         program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
 
+    def begin_run(self) -> None:
+        """Called before steps are made."""
+        self._engine.begin_run()
+
     def remember(self, program: Program) -> None:
         self._guard(program, "remember", "carried rows: positions whose gradients are taken")
 

@@ -17,7 +17,7 @@ from kcons.errors import ConvergenceError, InputError, OverdeterminedError, Unsu
 from kcons.openmm.guard import positions_of, velocities_of
 from kcons.openmm.momenta import NONE, Momenta, Momentum, conserved_momenta
 from kcons.openmm.program import Program
-from kcons.openmm.system_checks import SystemRows
+from kcons.openmm.system_checks import SystemRows, removes_centre_of_mass_motion
 from kcons.steppers.compositions import Composition
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
@@ -209,6 +209,8 @@ class Isokinetic:
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
         masses, v = self._masses(integrator, context), velocities_of(context)
+        if self.atoms is None and removes_centre_of_mass_motion(context.getSystem()):
+            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover would do
         found = float(masses @ np.einsum("ij,ij->i", v, v))
         if not found > 0:
             raise InputError(
@@ -236,7 +238,7 @@ class Isokinetic:
             integrator.setPerDofVariableByName("share", share.tolist())
         integrator.setGlobalVariableByName("two_k", twice)
         if abs(found / twice - 1) > ROUNDING:
-            v[masses > 0] *= math.sqrt(twice / found)
+            v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
 
     def verify(self, integrator: ProjectedIntegrator) -> None:

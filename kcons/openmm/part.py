@@ -22,9 +22,15 @@ class Part(Protocol):
     The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
     is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
 
-    Two things are optional. `begin(program)`: what to compute where x is not where the last step ended, for parts that
-    keep something from step to step; written where the applied forces are computed anew. `stays_finite = True`: after
-    a failure x is still a place where forces can be computed; set-up is faster then.
+    Some things are optional.
+
+    - `driven`: whether rows demand velocities that are not 0.
+    - `engine_at(context)`: the engine for the rows and the positions it takes, by which thermostats see what the rows
+      do to total momentum.
+    - `begin_run()` is called before steps are made.
+    - `begin(program)`: what to compute where x is not where the last step ended, for parts that keep something from
+      step to step; written where the applied forces are computed anew.
+    - `stays_finite = True`: after a failure x is still a place where forces can be computed; set-up is faster then.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.system_checks`.

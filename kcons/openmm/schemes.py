@@ -18,6 +18,14 @@ from kcons.steppers import (
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
 
+
+def _any_flows(order: int) -> Splitting:
+    """A splitting that keeps its order with any kicks, those of the isokinetic thermostat among them."""
+    splitting = Splitting(*ISOKINETIC[order])
+    splitting.order = order
+    return splitting
+
+
 #: Schemes by name.
 SCHEMES: dict[str, Callable[[], Splitting]] = {
     "rattle": Rattle,
@@ -28,8 +36,8 @@ SCHEMES: dict[str, Callable[[], Splitting]] = {
     "blanes-moan4": BlanesMoan4,
     "blanes-moan6": BlanesMoan6,
     "blanes-moan6a": BlanesMoan6a,
-    "isokinetic4": lambda: Splitting(*ISOKINETIC[4]),
-    "isokinetic6": lambda: Splitting(*ISOKINETIC[6]),
+    "isokinetic4": lambda: _any_flows(4),
+    "isokinetic6": lambda: _any_flows(6),
 }
 LEAPFROG = "leapfrog"
 

@@ -381,6 +381,7 @@ def test_moving_targets_are_refused_and_held_by_langevin():
             continue
         for _ in range(4):
             integrator.step(10)
+            context.getState(energy=True, forces=True)  # evaluates all groups between steps
             r, u = state_of(context)
             d = r[2] - r[0]
             now = context.getTime().value_in_unit(unit.picosecond)

@@ -1,0 +1,237 @@
+"""Constant temperature in OpenMM with kcons: what it costs, and how the time step changes what is sampled.
+
+    python examples/12_openmm_thermostats.py                  short runs, half a minute
+    python examples/12_openmm_thermostats.py --full --out F   the committed results; F receives JSON after each run
+    python examples/12_openmm_thermostats.py --show F         the tables of an earlier run
+
+Times are medians, one thread, of runs that take turns; only their ratios mean something. The mean potential energy of
+alanine dipeptide (bonds with hydrogen held) in rigid water is compared with that of 1 fs; errors are standard errors
+from blocks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENMM_CPU_THREADS", "1")
+
+import numpy as np
+import openmm
+from openmm import app, unit
+from rich.console import Console
+from rich.table import Table
+
+from kcons import compare
+from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
+
+DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+TOLERANCE = 1e-8
+TEMPERATURE, FRICTION = 300.0, 1.0
+Make = Callable[[float], openmm.Integrator]
+
+
+def langevin(dt: float) -> openmm.Integrator:
+    return ProjectedIntegrator(dt, ensemble=Langevin(TEMPERATURE, FRICTION))
+
+
+def middle(dt: float) -> openmm.Integrator:
+    return openmm.LangevinMiddleIntegrator(TEMPERATURE, FRICTION, dt)
+
+
+def isokinetic(dt: float) -> openmm.Integrator:
+    # Charges on a mesh conserve momentum roughly only; the CMMotionRemover of the System keeps it at zero.
+    return ProjectedIntegrator(dt, ensemble=Isokinetic(TEMPERATURE))
+
+
+# -- systems ----------------------------------------------------------------------------------------
+
+
+def water(edge: float) -> tuple[openmm.System, Any]:
+    """Rigid TIP3P, PME."""
+    field = app.ForceField("tip3p.xml")
+    box = app.Modeller(app.Topology(), [])
+    box.addSolvent(field, boxSize=openmm.Vec3(edge, edge, edge))
+    system = field.createSystem(
+        box.topology, nonbondedMethod=app.PME, nonbondedCutoff=min(1.0, 0.45 * edge), rigidWater=True
+    )
+    return system, box.positions
+
+
+def peptide(edge: float) -> tuple[openmm.System, Any]:
+    """Alanine dipeptide in rigid TIP3P, bonds with hydrogen held, reaction field."""
+    field = app.ForceField("amber14-all.xml", "amber14/tip3p.xml")
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    box = app.Modeller(pdb.topology, pdb.positions)
+    box.addSolvent(field, boxSize=openmm.Vec3(edge, edge, edge), neutralize=False)
+    system = field.createSystem(
+        box.topology,
+        nonbondedMethod=app.CutoffPeriodic,
+        nonbondedCutoff=0.45 * edge,
+        constraints=app.HBonds,
+        rigidWater=True,
+    )
+    return system, box.positions
+
+
+def started(system: openmm.System, positions: Any, integrator: openmm.Integrator) -> openmm.Context:
+    integrator.setConstraintTolerance(TOLERANCE)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("CPU"), {"Threads": "1"})
+    context.setPositions(positions)
+    return context
+
+
+# -- what is measured -------------------------------------------------------------------------------
+
+
+def speed(full: bool) -> dict[str, Any]:
+    """Steps a second relative to VerletIntegrator."""
+    system, positions = water(3.0 if full else 2.0)
+    integrators = {
+        "VerletIntegrator": openmm.VerletIntegrator(0.002),
+        "LangevinMiddleIntegrator": middle(0.002),
+        "kcons rattle": ProjectedIntegrator(0.002),
+        "kcons Isokinetic": isokinetic(0.002),
+        "kcons Isokinetic, leapfrog": ProjectedIntegrator(0.002, "leapfrog", ensemble=Isokinetic(TEMPERATURE)),
+        "kcons Langevin": langevin(0.002),
+    }
+    contexts = {name: started(system, positions, integrator) for name, integrator in integrators.items()}
+    first = next(iter(contexts.values()))
+    openmm.LocalEnergyMinimizer.minimize(first, 50, 50)
+    first.applyConstraints(TOLERANCE)
+    first.setVelocitiesToTemperature(TEMPERATURE, 1)
+    state = first.getState(positions=True, velocities=True)
+    for name, context in contexts.items():
+        context.setState(state)
+        integrators[name].step(5)
+    steps, rounds = (20, 25) if full else (5, 3)
+    times: dict[str, list[float]] = {name: [] for name in integrators}
+    for _ in range(rounds):
+        for name, integrator in integrators.items():
+            begin = time.perf_counter()
+            integrator.step(steps)
+            contexts[name].getState(positions=True)
+            times[name].append((time.perf_counter() - begin) / steps)
+    base = np.array(times["VerletIntegrator"])
+    rows = {
+        name: {"ms": 1e3 * float(np.median(t)), "ratio": float(np.median(base / np.array(t)))}
+        for name, t in times.items()
+    }
+    return {"title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs", "rows": rows}
+
+
+def mean_energy(make: Make, fs: float, picoseconds: float, system: openmm.System, positions: Any) -> dict[str, float]:
+    """Mean potential energy in kJ/mol, with the standard error from twenty blocks."""
+    integrator = make(fs * 1e-3)
+    integrator.setRandomNumberSeed(1)  # type: ignore[attr-defined]
+    context = started(system, positions, integrator)
+    context.setVelocitiesToTemperature(TEMPERATURE, 2)
+    every = max(1, round(100 / fs))
+    samples = round(picoseconds * 1e3 / fs / every)
+    integrator.step(round(min(20.0, picoseconds) * 1e3 / fs))
+    values = []
+    for _ in range(samples):
+        integrator.step(every)
+        values.append(context.getState(energy=True).getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole))
+    blocks = np.array([part.mean() for part in np.array_split(np.array(values), 20)])
+    return {"fs": fs, "mean": float(np.mean(values)), "error": float(blocks.std(ddof=1) / np.sqrt(len(blocks)))}
+
+
+def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Mean potential energy at several time steps."""
+    edge = 1.5
+    system, positions = peptide(edge)
+    relax = openmm.LangevinMiddleIntegrator(TEMPERATURE, 10.0, 0.001)
+    context = started(system, positions, relax)
+    openmm.LocalEnergyMinimizer.minimize(context, 10, 200)
+    relax.step(50_000 if full else 200)
+    positions = context.getState(positions=True).getPositions(asNumpy=True)
+    length = 1000.0 if full else 2.5
+    plan: list[tuple[str, Make, float, float]] = [
+        ("LangevinMiddleIntegrator", middle, 1.0, 1.0),
+        *[("kcons Langevin", langevin, fs, 1.0) for fs in (1.0, 2.0, 3.0, 4.0)],
+        *[("LangevinMiddleIntegrator", middle, fs, 1.0) for fs in (2.0, 3.0, 4.0)],
+        *[("kcons Isokinetic", isokinetic, fs, 1.0) for fs in (2.0, 3.0)],
+    ]
+    rows: dict[str, list[dict[str, float]]] = {}
+    result = {
+        "title": f"Mean potential energy, alanine dipeptide in water, {system.getNumParticles()} atoms, {length:g} ps",
+        "sampling": rows,
+    }
+    for name, make, fs, share in plan:
+        rows.setdefault(name, []).append(mean_energy(make, fs, share * length, system, positions))
+        keep(result)
+    reference = [row for points in rows.values() for row in points if row["fs"] == 1.0]
+    weights = np.array([row["error"] ** -2 for row in reference])
+    result["reference"] = {
+        "mean": float(weights @ [row["mean"] for row in reference] / weights.sum()),
+        "error": float(weights.sum() ** -0.5),
+    }
+    keep(result)
+    return result
+
+
+# -- output -----------------------------------------------------------------------------------------
+
+
+def show(result: dict[str, Any], console: Console) -> None:
+    fast, sampled = (result["measurements"].get(name) for name in ("speed", "sampling"))
+    if fast:
+        table = Table(title=fast["title"])
+        for heading in ("integrator", "ms a step", "steps a second, relative"):
+            table.add_column(heading, justify="left" if heading == "integrator" else "right")
+        for name, row in fast["rows"].items():
+            table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}")
+        console.print(table)
+    if sampled and "reference" in sampled:
+        table = Table(title=sampled["title"])
+        for heading in ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs"):
+            table.add_column(heading, justify="left" if heading == "integrator" else "right")
+        zero = sampled["reference"]
+        for name, points in sampled["sampling"].items():
+            for row in points:
+                mean, error = f"{row['mean']:.1f} ± {row['error']:.1f}", np.hypot(row["error"], zero["error"])
+                off = "" if row["fs"] == 1.0 else f"{row['mean'] - zero['mean']:+.1f} ± {error:.1f}"
+                table.add_row(name, f"{row['fs']:g}", mean, off)
+        console.print(table)
+    machine = result["machine"]
+    console.print(
+        f"{machine['cpu']}, one thread; OpenMM {machine['versions']['openmm']}; "
+        f"commit {machine['commit']}, {machine['date']}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="the sizes of the committed results")
+    parser.add_argument("--only", choices=["speed", "sampling"], help="one measurement; others in --out are kept")
+    parser.add_argument("--out", type=Path, help="JSON file for the results")
+    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
+    options = parser.parse_args()
+    console = Console(width=120)
+    if options.show:
+        show(json.loads(options.show.read_text()), console)
+        return
+    result: dict[str, Any] = {"machine": compare.environment(), "full": options.full, "measurements": {}}
+    if options.out and options.only and options.out.exists():
+        result["measurements"] = json.loads(options.out.read_text())["measurements"]
+
+    def keep(name: str, measured: dict[str, Any]) -> None:
+        result["measurements"][name] = measured
+        if options.out:
+            options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+    if options.only != "sampling":
+        keep("speed", speed(options.full))
+    if options.only != "speed":
+        sampling(options.full, lambda measured: keep("sampling", measured))
+    show(result, console)
+
+
+if __name__ == "__main__":
+    main()
