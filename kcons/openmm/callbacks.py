@@ -3,7 +3,8 @@
 A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
 them, each in a force group of its own, serve one set of rows:
 
-* `remember`: the positions at the start of a drift, where gradients are taken. Returns no force.
+* `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
+  last drift has ended there for sure.
 * `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
 * `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x.
 
@@ -73,7 +74,8 @@ class Engine:
         self._x, self._read = np.zeros(local), np.zeros(local)
         rows = self.motion.constraint_set.n_rows
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
-        self._timed = self.motion.constraint_set.moving
+        #: Whether the time of a drift matters.
+        self.timed = self.motion.constraint_set.moving
         self._flight: NonholonomicFlight | None = None
         if not self.motion.constraint_set.holonomic.all():
             with np.errstate(divide="ignore"):
@@ -82,18 +84,24 @@ class Engine:
             weights[np.concatenate([*fixed, np.zeros(0, np.int64)])] = 0.0
             self._flight = NonholonomicFlight(self.motion, weights)
             self._weights = np.repeat(weights, 3, axis=1)
-            self._timed = True
+            self.timed = True
         self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
+        self._lean = False
         self._fractions: tuple[float, ...] = (1.0,)
         self._nodes: tuple[float, ...] = (0.0, 1.0)
         #: Whether velocities are projected between the drifts of a step, too.
         self._within = False
         self._error: BaseException | None = None
         self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        #: Whether it is known where the drift begins.
+        self._begun = False
+        #: Free positions of the drift and what brings them onto the rows.
+        self._landing: tuple[FloatArray, FloatArray] | None = None
         LIVE[key] = self
 
-    def follow(self, integrator: openmm.CustomIntegrator) -> None:
-        """Take times and step sizes from this integrator."""
+    def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
+        """Take times and step sizes from this integrator; `lean` as for parts."""
+        self._lean = lean
         self._integrator = weakref.ref(integrator)
         scheme = getattr(integrator, "scheme", None)
         if scheme is not None:
@@ -117,17 +125,27 @@ class Engine:
                 self.follow_cell(state)
         self._stage += 1
         _positions(state, self._x)
+        self._begin_drift()
+        return self._nothing
+
+    def _begin_drift(self) -> None:
+        self._landing = None
+        self._begun = True
         if self.whole:
             np.copyto(self._start, self._x)
         else:
             self._start[self.atoms] = self._x
-        return self._nothing
 
     def land(self, state: openmm.State) -> FloatArray:
         there, read = self._there, self._read
         _positions(state, read)
-        if not self._timed and np.array_equal(read, self._x):
+        if self._landing is not None and np.array_equal(read, self._landing[0]):
+            return self._landing[1]  # force and energy are asked for one by one
+        if not self.timed and np.array_equal(read, self._x):
             return self._nothing  # at rest, or forces are asked for between steps
+        if not self._begun:
+            self._begin_drift()  # where the last drift ended: nobody has moved x since
+        self._begun = False
         if self.whole:
             np.copyto(there, read)
         else:
@@ -147,6 +165,7 @@ class Engine:
         change = (there if self.whole else there[self.atoms]) - read
         np.add(read, change, out=self._x)
         change *= CARRY_SCALE
+        self._landing = (read.copy(), change)
         return change
 
     def project(self, state: openmm.State) -> FloatArray:
@@ -155,7 +174,7 @@ class Engine:
         read, v = self._read, self._v
         _positions(state, read)
         read -= self._x
-        if not self._timed and not read.any():
+        if not self.timed and not read.any():
             return self._nothing
         read *= SPEED_SCALE
         if self.whole:
@@ -174,7 +193,7 @@ class Engine:
 
     def _times(self, stage: int) -> tuple[float, float, float]:
         """Beginning, end and length of a drift."""
-        if not self._timed:
+        if not self.timed:
             return 0.0, 0.0, 0.0
         integrator = self._integrator()
         dt = 0.0 if integrator is None else _number(integrator.getStepSize())
@@ -207,15 +226,18 @@ class Engine:
 
     def step_multipliers(self) -> FloatArray:
         integrator = self._integrator()
-        mixed = integrator is not None and getattr(integrator, "thermostatted", False)
-        if integrator is None or mixed or len(self._fractions) != 1 or np.isnan(self._push_before).any():
+        # A drift of velocities that were not made tangent has pushed for that as well.
+        whole = self._lean and integrator is not None and integrator.getGlobalVariableByName("led") != 0
+        mixed = getattr(integrator, "thermostatted", False)
+        unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
+        if integrator is None or mixed or unknown:
             raise InputError(
                 "multipliers of a step need two steps of a scheme with one drift, at constant energy; "
                 "multipliers(context) gives those of any state",
                 item="scheme",
             )
         dt = _number(integrator.getStepSize())
-        return np.asarray(self._impulse / dt**2 - self._push_before / dt)
+        return np.asarray(self._impulse / dt**2 - (0.0 if whole else self._push_before / dt))
 
     def explained_error(self, step: int) -> KconsError:
         error = self._error

@@ -67,6 +67,7 @@ class CarriedConstraints:
     evaluates = True
     meets_system = False
     solves_alone = False
+    lean = False
 
     def __init__(
         self,
@@ -165,16 +166,13 @@ class CarriedConstraints:
     # -- the program ----------------------------------------------------------------------------
 
     def declare(self, program: Program) -> None:
-        self._engine.follow(program.integrator)
-        #: Without a projection at the end of the step, the solve for positions must tell of failures itself.
-        self._leapfrog = getattr(program.integrator, "scheme", None) is None
-        #: Whether velocities are projected before the first drift.
-        self._early = getattr(program.integrator, "projects_first", False)
+        self._engine.follow(program.integrator, self.lean)
+        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
+        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
 
-    def begin(self, program: Program) -> None:
-        """Where x is not where the last step ended, and is wanted before the first drift."""
-        if self._early:
-            self.remember(program)
+    def begin_early(self, program: Program) -> None:
+        """Where x is not where the last step ended, and velocities are projected before the first drift."""
+        self.remember(program)
 
     def _guard(self, program: Program, phase: str, words: str) -> None:
         group = self._groups[phase]
@@ -185,12 +183,17 @@ class CarriedConstraints:
         self._engine.begin_run()
 
     def remember(self, program: Program) -> None:
-        self._guard(program, "remember", "carried rows: positions whose gradients are taken")
+        words = "carried rows: positions whose gradients are taken"
+        if not self.lean or self._engine.timed:
+            self._guard(program, "remember", words)
+            return
+        with program.when("looked+moving != 0", "x need not be where the last drift ended"):
+            self._guard(program, "remember", words)
 
     def land(self, program: Program, h: str) -> None:
-        # Where a computation changes x by a force, OpenMM does not take force and energy from one evaluation: failures
-        # wait for the next call of the other phases.
-        if self._leapfrog:
+        # Where a computation changes x by a force, OpenMM does not take force and energy from one evaluation: the
+        # second call gets what the first has found. Or failures wait for the next call of the other phases.
+        if self._early:
             self._guard(program, "land", "carried rows: try to solve for positions")
         change = f"f{self._groups['land']}"
         program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: solve for positions")

@@ -40,7 +40,14 @@ class CompiledQuadricRows(QuadricRows):
         super().__init__(rows, system.getNumParticles())
         # OpenMM takes particles in rising order.
         order = np.argsort(self.atoms)
-        tables = (self.matrices[order], self.centers[order], self.flats[order], self.levels[order])
+        tables: tuple[FloatArray, ...] = (
+            self.matrices[order],
+            self.centers[order],
+            self.flats[order],
+            self.levels[order],
+        )
+        if self.spheres:
+            tables = tables[1::2]
         free = free_groups(system, 2)
         self._note, self._land = free
         self.groups = frozenset(free)
@@ -56,16 +63,22 @@ class CompiledQuadricRows(QuadricRows):
     def _declare_solution(self, p: Program) -> None:
         p.number("s_seen", "0; its computation notes where the drift begins")
         p.number("s_failed", "1 more than the place of a particle without landing, 0 for none")
-        p.vector("s_x", "positions where the drift began")
+        if self._others:
+            p.vector("s_x", "positions where the drift began")
 
     def fly_alone(self, p: Program, u: str, h: str) -> None:
-        p.each("s_x", "x", "to come back to")
-        p.let("s_seen", f"energy{self._note}", "note where the drift begins")
+        if self._others:
+            p.each("s_x", "x", "to come back to")
+        with p.when("behind = 0", "x need not be where the last drift ended"):
+            p.let("s_seen", f"energy{self._note}", "note where the drift begins")
         p.each("x", f"x+{h}*{u}", "fly; not on the surface")
         p.let("s_failed", f"energy{self._land}", "solve for the landing")
         p.let("failed", f"select(s_failed, {self.code}, failed)", "whether there is one")
         p.each("v", f"select(failed, v, {u}+f{self._land}/{h})", "impulse of the surface")
-        p.each("x", f"select(failed, s_x, x+f{self._land})", "onto the surface")
+        landing = f"x+f{self._land}"
+        if self._others:  # those on surfaces are carried back where there is no landing
+            landing = f"select(failed, s_x, {landing})"
+        p.each("x", landing, "onto the surface")
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         if self.circles:
@@ -98,15 +111,24 @@ class _Note:
 
 
 class _Land:
-    """Callback: the way onto the surfaces."""
+    """Callback: the way onto the surfaces; where one particle finds none, all go back to where the drift began."""
 
     def __init__(self, key: str, tables: tuple[FloatArray, ...]) -> None:
         self.key, self.tables = key, tables
 
     def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
         x = _positions(state)
-        way = np.zeros_like(x)
-        return float(_land(_STARTS.get(self.key, x), x, *self.tables, way)), way  # type: ignore[call-arg]
+        start = _STARTS.get(self.key)
+        if start is None:
+            start = x.copy()
+        way = np.empty_like(x)
+        solve = _land_on_spheres if len(self.tables) == 2 else _land
+        failed = solve(start, x, *self.tables, way)  # type: ignore[call-arg, operator]
+        if failed:
+            np.subtract(start, x, out=way)
+        # The same sum as in the program: where the next drift begins if nobody moves x.
+        _STARTS[self.key] = np.add(x, way, out=x)
+        return float(failed), way
 
 
 def _positions(state: Any) -> FloatArray:
@@ -114,6 +136,23 @@ def _positions(state: Any) -> FloatArray:
     out = np.empty((state._getNumParticles(), 3))
     state._getVectorAsNumpy(openmm.State.Positions, out)
     return out
+
+
+@numba.njit(cache=True)
+def _land_on_spheres(start, there, centers, levels, way):  # type: ignore[no-untyped-def]
+    """As `_land`, where Q = 1."""
+    for i in range(len(levels)):
+        x0, y0, z0 = start[i, 0] - centers[i, 0], start[i, 1] - centers[i, 1], start[i, 2] - centers[i, 2]
+        x, y, z = there[i, 0] - centers[i, 0], there[i, 1] - centers[i, 1], there[i, 2] - centers[i, 2]
+        A = x0 * x0 + y0 * y0 + z0 * z0
+        B = x0 * x + y0 * y + z0 * z
+        S = x * x + y * y + z * z - levels[i]
+        root = B * B - A * S
+        if not root >= 0.0:
+            return i + 1 if root < 0.0 else -i - 1
+        factor = -S / (B + np.sqrt(root))
+        way[i, 0], way[i, 1], way[i, 2] = factor * x0, factor * y0, factor * z0
+    return 0
 
 
 @numba.njit(cache=True)

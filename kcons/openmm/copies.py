@@ -18,7 +18,28 @@ if TYPE_CHECKING:
 
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
 RUN_STATE = frozenset(
-    {"failed", "good_steps", "stale", "moved", "stage", "h", "first_stage", "end_stage", "growth", "lost"}
+    [
+        "failed",
+        "good_steps",
+        "stale",
+        "moved",
+        "stage",
+        "h",
+        "per_h",
+        "first_stage",
+        "end_stage",
+        "between",
+        "looked",
+        "behind",
+        "led",
+        "loose",
+        "lean",
+        "moving",
+        "dt_last",
+        "kick",
+        "growth",
+        "lost",
+    ]
 )
 
 

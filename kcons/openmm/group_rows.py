@@ -25,6 +25,7 @@ class GroupRows:
     stays_finite = True
     solves_alone = True
     code = 1
+    lean = False
     meets_system: bool
     groups: frozenset[int]
     names: tuple[str, ...]
@@ -108,7 +109,8 @@ class GroupRows:
 
     def _gradients(self, p: Program, *, sizes: bool, slopes: bool) -> None:
         """row = M_par^+ gradient, its Gram matrix and the inverse of that, at x."""
-        if self.meets_system:
+        keep = self.meets_system and not (self.lean and not slopes)
+        if keep:
             p.each(f"v_kept{self.code}", "v", "v is needed to project the rows")
         v = f"v_kept{self.code}" if self.meets_system else "v"
         for k, group in enumerate(self._groups):
@@ -130,7 +132,7 @@ class GroupRows:
                             p.sum(block.gram(k, j), f"-f{group}*{self._of('row', j)}", "Gram matrix")
                     if sizes and not self.meets_system:
                         p.let(self._of("own", k), block.gram(k, k), "its size")
-        if self.meets_system and not slopes:
+        if keep and not slopes:
             p.each("v", f"v_kept{self.code}", "v again")
         p.let(f"singular{self.code}", f"select(failed, singular{self.code}, 0)", "nothing wrong yet")
         for block in self._blocks:
@@ -199,11 +201,16 @@ class GroupRows:
         begins = "delta(stage)"  # not so where constraints are applied alone
         for k in rows:
             push, impulse = self._of("push", k), self._of("impulse", k)
-            p.let(impulse, f"select({begins}, 0, {impulse})+{push}/{h}", "multiplier times time")
+            before = f"select({begins}, 0, {impulse})"
+            if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
+                before = f"-select(behind*looked, 0.5*dt*{self._of('end', k)}, 0)"
+            p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
             if self._leapfrog:
                 p.let(self._of("lambda", k), f"{push}/({h}*{h})", "multiplier where the drift began")
             else:
                 at = f"select(known{c}, 0.5*({self._of('end', k)}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
+                if self.lean:
+                    at = f"select(behind, {push}/({h}*{h}), {at})"
                 p.let(
                     self._of("lambda", k),
                     f"select({begins}, {at}, {self._of('lambda', k)})",
@@ -281,6 +288,11 @@ class GroupRows:
             p.let(self._of("impulse", k), impulse, "all of this step")
         p.let(f"known{c}", "delta(first_stage)", "the next step begins here")
         self._end_step(p)
+
+    def passed(self, p: Program) -> None:
+        """At the end of a step without `project`."""
+        if any(rate != 0.0 for rate in self._rates):
+            self._end_step(p)
 
     def _end_step(self, p: Program) -> None:
         for k in range(self.n_rows):

@@ -68,6 +68,10 @@ class Guard:
         self.system = context.getSystem()
         check_system(self.system, leapfrog=integrator.scheme is None)
         self.rows = SystemRows.of(self.system)
+        #: Whether something in the System moves x between steps.
+        self.moving = any("Barostat" in type(force).__name__ for force in self.system.getForces())
+        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in self.system.getForces())
         self.started = False
         self.since_check = 0
         self._surroundings: tuple[object, ...] | None = None

@@ -30,6 +30,7 @@ class Part(Protocol):
     - `begin_run()` is called before steps are made.
     - `begin(program)`: what to compute where x is not where the last step ended, for parts that keep something from
       step to step; written where the applied forces are computed anew.
+    - `begin_early(program)`: the same where velocities are projected before the first drift.
     - `stays_finite = True`: after a failure x is still a place where forces can be computed; set-up is faster then.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
@@ -50,6 +51,8 @@ class Part(Protocol):
         asked to do so by `apply_positions` and `apply_velocities`.
     groups : frozenset of int
         Force groups that carry rows, not forces.
+    lean : bool
+        Set by the integrator.
     """
 
     code: int
@@ -57,6 +60,7 @@ class Part(Protocol):
     meets_system: bool
     solves_alone: bool
     groups: frozenset[int]
+    lean: bool
 
     def declare(self, program: Program) -> None:
         """Variables and tables."""

@@ -27,6 +27,10 @@ class Program:
         self._lines: list[tuple[int, str, str]] = []
         self._depth = 0
         self._known: set[str] = {"x", "v", "m", "f", "dt", "energy"}
+        #: Kind, variable and expression of each computation, for `count_step`; 'loop', 'when' and 'end' make blocks.
+        self.operations: list[tuple[str, str, str]] = []
+        self.tables: dict[str, tuple[float, ...]] = {}
+        self.numbers: dict[str, float] = {}
 
     @property
     def integrator(self) -> openmm.CustomIntegrator:
@@ -41,6 +45,7 @@ class Program:
         if name not in self._known:
             self._known.add(name)
             self.integrator.addGlobalVariable(name, value)
+            self.numbers[name] = float(value)
             self.variables.append(f"{name}: {words}")
         return name
 
@@ -56,6 +61,7 @@ class Program:
         """Declare a table of constants, written name(k) in expressions; returns its name."""
         self._known.add(name)
         self.integrator.addTabulatedFunction(name, openmm.Discrete1DFunction(list(values)))
+        self.tables[name] = tuple(values)
         self.variables.append(f"{name}(k): {words}")
         return name
 
@@ -64,35 +70,42 @@ class Program:
     def let(self, variable: str, expression: str, words: str) -> None:
         """variable = expression for one global variable."""
         self.integrator.addComputeGlobal(variable, expression)
+        self.operations.append(("let", variable, expression))
         self._line(f"{variable} = {expression}", words)
 
     def each(self, variable: str, expression: str, words: str) -> None:
         """variable = expression for each degree of freedom."""
         self.integrator.addComputePerDof(variable, expression)
+        self.operations.append(("each", variable, expression))
         self._line(f"{variable} = {expression}", words)
 
     def sum(self, variable: str, expression: str, words: str) -> None:
         """variable = sum of expression over all degrees of freedom."""
         self.integrator.addComputeSum(variable, expression)
+        self.operations.append(("sum", variable, expression))
         self._line(f"{variable} = sum({expression})", words)
 
     def hold_positions(self, words: str) -> None:
         self.integrator.addConstrainPositions()
+        self.operations.append(("hold", "x", ""))
         self._line("constrain positions", words)
 
     def hold_velocities(self, words: str) -> None:
         self.integrator.addConstrainVelocities()
+        self.operations.append(("hold", "v", ""))
         self._line("constrain velocities", words)
 
     def let_others_act(self) -> None:
         """Barostats, CMMotionRemover, Andersen thermostats change the state here."""
         self.integrator.addUpdateContextState()
+        self.operations.append(("others", "", ""))
         self._line("update context state", "barostats and other outside agents may act")
 
     @contextmanager
     def loop(self, condition: str, words: str) -> Iterator[None]:
         """Repeat what is written inside while `condition` holds."""
         self.integrator.beginWhileBlock(condition)
+        self.operations.append(("loop", "", condition))
         self._line(f"while {condition}:", words)
         with self._inside():
             yield
@@ -101,6 +114,7 @@ class Program:
     def when(self, condition: str, words: str) -> Iterator[None]:
         """Do what is written inside if `condition` holds."""
         self.integrator.beginIfBlock(condition)
+        self.operations.append(("when", "", condition))
         self._line(f"if {condition}:", words)
         with self._inside():
             yield
@@ -111,6 +125,7 @@ class Program:
         yield
         self._depth -= 1
         self.integrator.endBlock()
+        self.operations.append(("end", "", ""))
 
     def _line(self, code: str, words: str) -> None:
         self._lines.append((self._depth, code, words))

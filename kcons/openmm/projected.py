@@ -15,11 +15,12 @@ from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.isokinetic import kelvins
+from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.minimization import descend
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
 from kcons.openmm.schemes import LEAPFROG, to_scheme
-from kcons.openmm.steps import StepWriter
+from kcons.openmm.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
 
 
@@ -63,7 +64,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
     """
 
     #: What writes the program.
-    _writer: type[StepWriter] = StepWriter
+    _writer: type[LeanStepWriter] = LeanStepWriter
 
     def __init__(
         self,
@@ -110,17 +111,26 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """The steps of the integrator, in words."""
         return self.program.listing()
 
+    def counts(self, *, seen: bool = True, iterations: int = 2) -> StepCounts:
+        """What a step makes OpenMM do, where all goes well.
+
+        Parameters
+        ----------
+        seen : bool
+            Steps at whose end somebody looks; False for those within a call of `step`.
+        iterations : int
+            How often loops run that solve for positions.
+        """
+        lean = {"between": float(not seen), "lean": 1.0}
+        known = {name: value for name, value in lean.items() if name in self.program.numbers}
+        return count_step(self.program, iterations=iterations, **known)
+
     # -- running --------------------------------------------------------------------------------
 
     @property
     def thermostatted(self) -> bool:
         """Whether velocities change by more than forces and constraints."""
         return type(self.ensemble) is not ConstantEnergy
-
-    @property
-    def projects_first(self) -> bool:
-        """Whether a step projects velocities, or forces, before its first drift."""
-        return self.ensemble.stays_tangent
 
     @property
     def context(self) -> openmm.Context:
@@ -173,11 +183,26 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             self.refresh()
         while steps > 0:
             block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
-            self._run(guard, block)
+            self._run_block(guard, block)
             guard.count(block)
             steps -= block
         if self._plan.kept:
             guard.note_surroundings()
+
+    def _run_block(self, guard: Guard, steps: int) -> None:
+        """Where the program can do less in steps whose end nobody looks at, let it."""
+        unseen = steps - self._plan.observed if self._plan.lazy else 0
+        if self._plan.lean:
+            self.setGlobalVariableByName("lean", float(guard.undisturbed))
+            self.setGlobalVariableByName("moving", float(guard.moving))
+        if unseen > 0 and guard.undisturbed:
+            self.setGlobalVariableByName("between", 1.0)
+            try:
+                self._run(guard, unseen)
+            finally:
+                self.setGlobalVariableByName("between", 0.0)
+            steps -= unseen
+        self._run(guard, steps)
 
     def _run(self, guard: Guard, steps: int) -> None:
         context = guard.context
@@ -203,7 +228,11 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if code:
             context.setStepCount(first + done)
             guard.since_check += done
-            raise self._failure(code, first + done + 1)
+            failure = self._failure(code, first + done + 1)
+            if self._plan.lean and self.getGlobalVariableByName("loose"):
+                self.setGlobalVariableByName("between", 0.0)
+                self.applyVelocityConstraints(context)
+            raise failure
 
     def _failure(self, code: int, step: int) -> KconsError:
         error = self.parts[code - 1].failure(self, step)
@@ -218,6 +247,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """
         if self.parts:
             self.setGlobalVariableByName("stale", 1.0)
+        if self._plan.lean:
+            self.setGlobalVariableByName("behind", 0.0)
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
@@ -292,6 +323,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
         context = guard.context
         time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
+        self.refresh()
         self.setGlobalVariableByName("first_stage", float(first))
         self.setGlobalVariableByName("end_stage", float(end))
         try:

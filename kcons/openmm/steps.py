@@ -116,9 +116,10 @@ class StepWriter:
                     p.each("x_last", "x", "start here")
                     p.each("force", "f", "applied forces")
                     for part in self.parts:
-                        begin = getattr(part, "begin", None)
-                        if begin is not None:
-                            begin(p)
+                        for name in ("begin", "begin_early") if self.ensemble.stays_tangent else ("begin",):
+                            begin = getattr(part, name, None)
+                            if begin is not None:
+                                begin(p)
             else:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")

@@ -158,16 +158,8 @@ class SurfaceIntegrator(ProjectedIntegrator):
         super().__init__(timestep, scheme, parts=together, **arguments)
 
     def _run(self, guard: Guard, steps: int) -> None:
-        # In between, the drift that follows absorbs what velocities have across the surfaces.
-        last = 1 if steps > 1 and self._plan.lazy else 0
         try:
-            if last:
-                self.setGlobalVariableByName("between", 1.0)
-                try:
-                    super()._run(guard, steps - 1)
-                finally:
-                    self.setGlobalVariableByName("between", 0.0)
-            super()._run(guard, last or steps)
+            super()._run(guard, steps)
         except NonFiniteError:
             # A force that is not finite is seen in the step after the one whose velocities it has spoilt.
             if not all(np.isfinite(array).all() for array in positions_and_velocities(guard.context)):

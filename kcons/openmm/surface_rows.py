@@ -42,6 +42,7 @@ class SurfaceRows(ABC):
     evaluates = False
     meets_system = False
     solves_alone = True
+    lean = False
     groups: frozenset[int] = frozenset()
     bonded = True
 

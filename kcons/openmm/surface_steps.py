@@ -8,12 +8,13 @@ rounding grows as 1/h.
 from __future__ import annotations
 
 from kcons.openmm.ensemble import ConstantEnergy
+from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.quadric_rows import QuadricRows
-from kcons.openmm.steps import StepWriter
 from kcons.openmm.surface_rows import SurfaceRows
+from kcons.steppers.rattle import Rattle
 
 
-class SurfaceStepWriter(StepWriter):
+class SurfaceStepWriter(LeanStepWriter):
     """One step where all parts are surfaces; anything else is written as for other parts.
 
     Attributes
@@ -33,7 +34,7 @@ class SurfaceStepWriter(StepWriter):
             super().write()
             return
         p = self.program
-        self.lazy = True
+        self.lazy, self.lean = True, False
         self.surfaces = [part for part in self.parts if isinstance(part, SurfaceRows)]
         self.bonded = any(part.bonded for part in self.surfaces)
         circles = self._circles()
@@ -44,7 +45,7 @@ class SurfaceStepWriter(StepWriter):
         self.circles = circles
         self.force = p.vector("force", "applied forces at x") if self.kept else "f"
         #: x and v stay as they are until the only landing of the step is known: nothing to come back to.
-        self.untouched = len(self.drifts) == 1 and not self.kept and circles is None
+        self.untouched = isinstance(self.scheme, Rattle) and not self.kept and circles is None
         self._declare_run()
         if self.bonded:
             p.vector("xu", "positions before the constraints of the System act on them")
@@ -73,6 +74,8 @@ class SurfaceStepWriter(StepWriter):
         p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
         if self.untouched:
+            p.number("behind", "1 where v lacks the half kick at the end of the last step")
+            p.number("kick", "length of the last kick as a fraction of the step")
             p.vector("u", "velocities of the drift")
             return
         p.number("h", "length of the drift")
@@ -106,7 +109,12 @@ class SurfaceStepWriter(StepWriter):
             p.let("good_steps", "good_steps+select(failed, 0, 1)", "count good steps")
             with p.when("select(failed, 0, between) = 0", "somebody looks at the velocities"):
                 # Otherwise the next drift absorbs what they have across the surfaces.
+                if self.untouched:
+                    p.let("kick", "select(failed, 0.5*behind, kick_share(stage))", "what they lack")
+                    p.each("v", "select(kick, v+kick*dt*f/m, v)", "the rest of the kick")
                 self._project()
+            if self.untouched:
+                p.let("behind", "select(failed, 0, between)", "the next step makes up for it")
             if self.kept:
                 p.each("x_last", "x", "where forces were computed")
 
@@ -114,10 +122,10 @@ class SurfaceStepWriter(StepWriter):
         p = self.program
         p.let("stage", "first_stage", "the drift, or constraints alone")
         with p.when("stage < end_stage", "a drift"):
-            p.each("u", "v+dt*kick_share(first_stage)*f/m", "kick; x and v stay until the landing is known")
+            p.let("kick", "select(behind, 1, kick_share(first_stage))", "with the half kick that is missing")
+            p.each("u", "v+kick*dt*f/m", "kick; x and v stay until the landing is known")
             self._fly("u", "dt")
-            with p.when("failed+first_stage = 0", "a kick follows"):
-                p.each("v", f"v+{self.kicks[1]!r}*dt*f/m", "kick")
+            p.let("stage", "stage+1", "what follows")
 
     def _write_drifts(self) -> None:
         p = self.program

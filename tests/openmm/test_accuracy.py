@@ -39,8 +39,8 @@ ORDERS = {
     "yoshida4": (4, (1.0, 0.5, 0.25)),
     "kahan-li6": (6, (2.0, 1.5, 1.0)),
     "blanes-moan4": (4, (1.5, 1.0, 0.75)),
-    "blanes-moan6": (6, (4.0, 3.0, 2.4)),
-    "blanes-moan6a": (6, (4.0, 3.0, 2.4)),
+    "blanes-moan6": (6, (3.0, 2.4, 2.0)),
+    "blanes-moan6a": (6, (3.0, 2.4, 2.0)),
 }
 
 
@@ -129,23 +129,18 @@ def test_constraints_of_water(scheme, platform):
 # -- back in time -----------------------------------------------------------------------------------
 
 
-#: Velocities take (x - xu)/h of every substep: rounding enters as the sum over the substeps of 1/h. The finest
-#: substeps are 1/100 of a step in blanes-moan6 and 1/1400 in blanes-moan6a.
-FLOOR = {"blanes-moan6": 10.0, "blanes-moan6a": 100.0}
-
-
+@pytest.mark.parametrize("dt", [0.5e-3, 2e-3])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_reversible(scheme):
-    """OpenMM takes no negative steps; velocities are turned round instead."""
+def test_reversible(scheme, dt):
+    """20 steps there and back. OpenMM takes no negative steps; velocities are turned round instead."""
     system, x, v = alanine()
-    dt, steps = {"blanes-moan6": (4e-3, 5), "blanes-moan6a": (4e-3, 1)}.get(scheme, (0.5e-3, 20))
     integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14)
     context = started(system, integrator, x, v)
     integrator.step(1)
     x, v = state_of(context)
-    integrator.step(steps)
+    integrator.step(20)
     context.setVelocities(-state_of(context)[1])
-    integrator.step(steps)
+    integrator.step(20)
     after, back = state_of(context)
     assert np.abs(after - x).max() <= 1e-12
     assert np.abs(back + v).max() <= 1e-10 * np.abs(v).max()
@@ -229,7 +224,7 @@ def test_one_bond_as_the_core_stepper(scheme):
         for _ in range(steps):
             state = stepper.step(core, state, dt)
         integrator.step(steps)
-        assert np.abs(state_of(context)[0] - state.positions).max() <= limit * FLOOR.get(scheme, 1.0)
+        assert np.abs(state_of(context)[0] - state.positions).max() <= limit
 
 
 def test_energy_is_kept():

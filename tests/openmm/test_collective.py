@@ -325,8 +325,9 @@ def test_pushes_are_summed_only_where_rows_meet():
     part = CollectiveRows(system, [bond(2 * k, 2 * k + 1) for k in range(4)], positions=x)
     integrator = ProjectedIntegrator(0.002, parts=[part])
     sums = [k for k in range(integrator.getNumComputations()) if integrator.getComputationStep(k)[0] == 2]
-    # Whether x was moved; the sizes at the start; for each row its rate and its size.
-    assert len(sums) == 1 + 4 + 8
+    # Whether x or v, and x, were moved; the sizes at the start of a call, or of a step within; for each row its rate
+    # and its size.
+    assert len(sums) == 2 + 4 + 4 + 8
 
 
 def test_terms_of_a_force_as_rows():

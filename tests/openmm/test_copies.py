@@ -90,7 +90,7 @@ def test_copies(scheme, how):
     other = started(system, again, *state_of(context))
     integrator.step(3)
     again.step(3)
-    if scheme == "leapfrog":
+    if scheme in ("leapfrog", "rattle"):  # what velocities were before they were completed is not copied
         np.testing.assert_allclose(state_of(context), state_of(other), rtol=1e-9, atol=1e-12)
     else:
         np.testing.assert_array_equal(state_of(context), state_of(other))
