@@ -36,6 +36,8 @@ class CompiledQuadricRows(QuadricRows):
         Gets two forces, in two force groups that no other force uses.
     """
 
+    moves = True
+
     def __init__(self, rows: Sequence[Constraint], system: openmm.System) -> None:
         super().__init__(rows, system.getNumParticles())
         # OpenMM takes particles in rising order.

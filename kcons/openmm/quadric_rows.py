@@ -55,6 +55,9 @@ class QuadricRows(SurfaceRows):
         #: Name of A in the program.
         self._a = "s_a"
         self._others = len(self.atoms) < n_particles
+        #: k in the program: each variable of all particles makes every scalar product slower.
+        alike = not self._others and bool(np.all(self.levels == self.levels[0]))
+        self._k = repr(float(self.levels[0])) if alike else "s_k"
         self._round = not self._others and not self._tilted and bool(np.all(diagonal == 1.0))
 
     # -- expressions ----------------------------------------------------------------------------
@@ -91,7 +94,8 @@ class QuadricRows(SurfaceRows):
     def declare(self, program: Program) -> None:
         p = program
         self._parameter(p, "s_c", "centre of the surface", self.centers)
-        self._parameter(p, "s_k", "level of the quadric 2s(d) = d.Qd + 2g.d - k, d = x - c", self.levels)
+        if self._k == "s_k":
+            self._parameter(p, "s_k", "level of the quadric 2s(d) = d.Qd + 2g.d - k, d = x - c", self.levels)
         if self._tilted:
             for i, axis in enumerate("xyz"):
                 self._parameter(p, f"s_q{axis}", f"column {axis} of Q", self.matrices[:, :, i])
@@ -114,7 +118,7 @@ class QuadricRows(SurfaceRows):
             p.vector("s_a", "A, curvature along the kept gradient")
             p.each("s_a", f"dot({gradient}, {self._bent(gradient)})", "A = G0.Q G0")
         p.each("s_b", f"dot({gradient}, {self._slope(d)})", "B = G0.(Q d + g)")
-        p.each("s_s", f"dot({d}, {self._slope(d, 2)})-s_k", "S = d.(Q d + 2g) - k")
+        p.each("s_s", f"dot({d}, {self._slope(d, 2)})-{self._k}", "S = d.(Q d + 2g) - k")
         self._fail(p, self.solved, "a landing exists where B^2 >= A S")
 
     def remember(self, program: Program) -> None:
@@ -128,7 +132,7 @@ class QuadricRows(SurfaceRows):
     def project(self, program: Program) -> None:
         p = program
         if self._round:
-            p.each("v", "v-(x-s_c)*dot(x-s_c, v)/s_k", "tangent to the spheres")
+            p.each("v", f"v-(x-s_c)*dot(x-s_c, v)/{self._k}", "tangent to the spheres")
             return
         if not self._tilted:
             slope = self._slope("(x-s_c)")
@@ -154,13 +158,14 @@ class QuadricRows(SurfaceRows):
         if not self._projectors:
             super().fly_alone(p, u, h)
             return
-        self._a = "s_k"
+        self._a = self._k
         self.fly(p, u, h)
         # v is made tangent where the drift ends: G1 = Q d + l G0 is the gradient there, and h G1.v = k - B - l k. If it
         # were not, A = k would let an error of |G0| grow where a particle turns by more than 60 degrees a step.
+        k = self._k
         p.each(
             "v",
-            f"select(failed, v, {u}+(s_l*{self._here}-select(s_k, (s_k-s_b-s_l*s_k)/s_k, 0)*({self._bent('s_d')}"
+            f"select(failed, v, {u}+(s_l*{self._here}-select({k}, ({k}-s_b-s_l*{k})/{k}, 0)*({self._bent('s_d')}"
             f"+s_l*{self._here}))/{h}); s_l={self.root}",
             "impulse of the surface, before and after",
         )
@@ -185,10 +190,10 @@ class QuadricRows(SurfaceRows):
         p.each("s_dd", "dot(s_d, s_d)", "length")
         p.each("s_dv", "dot(s_d, v)", "velocity across the sphere")
         p.each("v", f"v-{on}s_d*s_dv/(s_dd{safe})", "along the sphere")
-        p.each("s_w", f"1e-150+{on}sqrt(dot(v, v)/(s_k{safe}))", "w = |v|/R")
+        p.each("s_w", f"1e-150+{on}sqrt(dot(v, v)/({self._k}{safe}))", "w = |v|/R")
         self._fail(p, "step(s_w)*step(1e100-s_w)", "velocities are finite")
         # d is brought to the length R on the way, so that rounding does not add up.
-        size = "select(s_other, 1, sqrt(s_k/(s_dd+s_other)))" if self._others else "sqrt(s_k/s_dd)"
+        size = "select(s_other, 1, sqrt(s_k/(s_dd+s_other)))" if self._others else f"sqrt({self._k}/s_dd)"
         p.each("x", f"select(failed, x, s_c+s_d*{size}*cos(s_w*{h})+v*sin(s_w*{h})/s_w)", "turn the position")
         p.each("v", f"v*cos(s_w*{h})-{on}s_d*{size}*s_w*sin(s_w*{h})", "turn the velocity")
 
@@ -199,7 +204,7 @@ class QuadricRows(SurfaceRows):
             w = self._values(integrator, "s_w")
             return self._error(np.where(w < 1e100, w, np.nan), step, w)
         b, s = self._values(integrator, "s_b"), self._values(integrator, "s_s")
-        a = self.levels if self._a == "s_k" else self._values(integrator, "s_a")
+        a = self.levels if self._a == self._k else self._values(integrator, "s_a")
         return self._error((b * b - a * s) / (np.abs(a * self.levels) + np.finfo(float).tiny), step, s)
 
 

@@ -45,6 +45,8 @@ class SurfaceRows(ABC):
     lean = False
     groups: frozenset[int] = frozenset()
     bonded = True
+    #: Whether `fly_alone` moves x before it needs the velocity of the drift for the last time.
+    moves = False
 
     def __init__(self, rows: Sequence[Constraint], n_particles: int) -> None:
         self.rows = tuple(rows)

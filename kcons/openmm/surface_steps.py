@@ -76,7 +76,8 @@ class SurfaceStepWriter(LeanStepWriter):
         if self.untouched:
             p.number("behind", "1 where v lacks the half kick at the end of the last step")
             p.number("kick", "length of the last kick as a fraction of the step")
-            p.vector("u", "velocities of the drift")
+            if any(part.moves for part in self.surfaces):
+                p.vector("u", "velocities of the drift")
             return
         p.number("h", "length of the drift")
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
@@ -123,8 +124,11 @@ class SurfaceStepWriter(LeanStepWriter):
         p.let("stage", "first_stage", "the drift, or constraints alone")
         with p.when("stage < end_stage", "a drift"):
             p.let("kick", "select(behind, 1, kick_share(first_stage))", "with the half kick that is missing")
-            p.each("u", "v+kick*dt*f/m", "kick; x and v stay until the landing is known")
-            self._fly("u", "dt")
+            u = "v+kick*dt*f/m"  # x and v stay until the landing is known
+            if any(part.moves for part in self.surfaces):
+                p.each("u", u, "kick")
+                u = "u"
+            self._fly(u if u == "u" else f"({u})", "dt")
             p.let("stage", "stage+1", "what follows")
 
     def _write_drifts(self) -> None:

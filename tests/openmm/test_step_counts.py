@@ -107,7 +107,7 @@ def test_spheres_alone(compiled):
     sphere = Sphere([0, 1, 2], [0, 0, 0], 1.0)
     integrator = SurfaceIntegrator(1e-3, surfaces=sphere, system=system, compiled=compiled)
     counts = integrator.counts(seen=False)
-    assert counts.passes == (4 if compiled else 7)
+    assert counts.passes == (4 if compiled else 6)
     assert (counts.force_evaluations, counts.row_evaluations, counts.synchronisations) == (1, int(compiled), 1)
 
 
