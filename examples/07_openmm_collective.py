@@ -83,7 +83,7 @@ def measure_collective(full: bool = False) -> dict[str, Any]:
         integrator.step(2)
         contexts[name] = context
     times: dict[str, list[float]] = {name: [] for name in runs}
-    steps, rounds = (20, 15) if full else (5, 3)
+    steps, rounds = (50, 9) if full else (5, 3)
     for _ in range(rounds):
         for name, (integrator, _, _) in runs.items():
             begin = time.process_time()

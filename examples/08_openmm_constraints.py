@@ -457,14 +457,14 @@ def run(full: bool, console: Console) -> dict:
     each("solver", solvers)
     each("setup", setups)
     if full:
-        steps = [lambda: steps_in_water(900, (1, 20), 20, 21)]
+        steps = [lambda: steps_in_water(900, (1, 20), 50, 11)]
         vacuum = {"nonbondedMethod": app.NoCutoff}
         solvent = {"nonbondedMethod": app.CutoffNonPeriodic, "nonbondedCutoff": 2.0 * unit.nanometer, "obc": True}
-        for name, options, count in (("vacuum", vacuum, 10), ("implicit solvent", solvent, 2)):
+        for name, options, count in (("vacuum", vacuum, 50), ("implicit solvent", solvent, 10)):
             for tolerance in (1e-10, 1e-6):
                 steps.append(
                     lambda name=name, tolerance=tolerance, count=count, options=options: steps_in_dhfr(  # type: ignore[misc]
-                        name, tolerance, count, 15, **options
+                        name, tolerance, count, 11, **options
                     )
                 )
     else:
