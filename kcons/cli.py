@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from kcons.runs import Method
     from kcons.scenes import Scene
     from kcons.scenes.fluid import Fluid
 
@@ -48,11 +49,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
-    scene_help = "one of the built-in scenes; --list shows them"
+    scene_help = "one of the built-in scenes, --list shows them; or a PDB or mmCIF file"
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("scene", nargs="?", help=scene_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
+    molecules = common.add_argument_group("molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files")
+    molecules.add_argument("--constrain", choices=("hbonds", "allbonds", "hangles"), help="(default hbonds for files)")
+    molecules.add_argument(
+        "--forcefield", nargs="+", metavar="XML", help="files of OpenMM (default amber14-all.xml amber14/tip3pfb.xml)"
+    )
+    molecules.add_argument("--add-hydrogens", action="store_true", help="that a file lacks, at pH 7")
+    molecules.add_argument("--platform", help="of OpenMM (default: Reference up to 200 atoms, CPU above)")
     common.add_argument("--list", action="store_true", help="list scenes and methods, and leave")
 
     compare = commands.add_parser(
@@ -68,7 +76,11 @@ def _parser() -> argparse.ArgumentParser:
         help="time steps, comma separated, in the unit the scene shows; "
         "steppers with several force evaluations a step take longer ones at the same cost",
     )
-    compare.add_argument("--methods", type=_names, help="methods, comma separated, or all (default: the usual ones)")
+    compare.add_argument(
+        "--methods",
+        type=_names,
+        help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
+    )
     compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
@@ -104,10 +116,10 @@ def _compare(chosen: argparse.Namespace) -> int:
     from kcons import scenes
 
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
-    folder: Path = chosen.out or Path(f"compare-{chosen.scene}")
+    folder: Path = chosen.out or Path(f"compare-{Path(chosen.scene or '').stem}")
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
-    asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt}
+    asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt, **_molecules(chosen)}
     if chosen.scene in scenes.FLUIDS:
         return _compare_averages(chosen, budget, folder, asked)
     from kcons import compare, methods, report
@@ -117,7 +129,7 @@ def _compare(chosen: argparse.Namespace) -> int:
     _check_scene(chosen)
     with Bars() as watcher:
         watcher.begin("building the scene" + ("" if compare.kernels_cached() else "; compiling kernels (once)"), 1)
-        scene = scenes.build(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
+        scene = _scene(chosen, quick=chosen.quick)
         watcher.end()
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
@@ -136,6 +148,11 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
+    if _molecules(chosen):
+        raise InputError(
+            f"--{next(iter(_molecules(chosen))).replace('_', '-')} is for molecules in OpenMM, not for fluids",
+            item=next(iter(_molecules(chosen))),
+        )
     fluid = _fluid(chosen, quick=chosen.quick)
     if chosen.dt is not None:
         fluid = fluid.with_time_steps(chosen.dt)
@@ -163,19 +180,39 @@ def _say_written(paths: list[Path]) -> None:
 def _check_scene(chosen: argparse.Namespace) -> None:
     from kcons import scenes
 
-    names = (*scenes.SCENES, *scenes.FLUIDS)
+    known = ", ".join((*scenes.SCENES, *scenes.FLUIDS))
     if chosen.scene is None:
-        raise InputError(f"name a scene: {', '.join(names)}", item="scene")
-    if chosen.scene not in names:
-        raise InputError(f"there is no scene {chosen.scene!r}; there are {', '.join(names)}", item="scene")
+        raise InputError(f"name a scene: {known}; or a PDB file", item="scene")
+    if scenes.is_file(chosen.scene):
+        if not Path(chosen.scene).is_file():
+            raise InputError(f"there is no file {chosen.scene}", item="scene")
+        if chosen.size is not None:
+            raise InputError("a file has the size it has; leave --size out", item="size")
+    elif chosen.scene not in scenes.SCENES and chosen.scene not in scenes.FLUIDS:
+        raise InputError(f"there is no scene {chosen.scene!r}; there are {known}; or give a PDB file", item="scene")
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
 
-def _scene(chosen: argparse.Namespace) -> Scene:
+def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
+    """What was said about molecules in OpenMM."""
+    said = {
+        "constrain": chosen.constrain,
+        "force_field": chosen.forcefield,
+        "add_hydrogens": chosen.add_hydrogens or None,
+        "platform": chosen.platform,
+    }
+    return {name: value for name, value in said.items() if value is not None}
+
+
+def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
     from kcons import scenes
 
-    return scenes.build(chosen.scene, chosen.size, chosen.seed)
+    if scenes.is_file(chosen.scene):
+        return scenes.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
+    if chosen.add_hydrogens:
+        raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
+    return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
 def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
@@ -229,9 +266,10 @@ def _list() -> int:
     print("scenes")
     for name, entry in scenes.SCENES.items():
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
+    print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
     print("methods")
     for name, method in methods.METHODS.items():
-        print(f"  {name:<16} {method.title}{'' if method.usual else ' (only when named)'}")
+        print(f"  {name:<27} {method.title}{_when(method)}")
     print("scenes at a temperature, whose averages are compared")
     for name, entry in scenes.FLUIDS.items():
         print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
@@ -239,6 +277,13 @@ def _list() -> int:
     for name, thermostat in sampling.METHODS.items():
         print(f"  {name:<21} {thermostat.title}")
     return 0
+
+
+def _when(method: Method) -> str:
+    """When a method runs."""
+    if not method.usual:
+        return " (only when named)"
+    return "" if method.host != "openmm" or method.guest else " (in OpenMM's scenes, or when named)"
 
 
 if __name__ == "__main__":

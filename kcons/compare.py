@@ -24,7 +24,8 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.methods import CoreStepper, Method, Run, chosen
+from kcons.methods import chosen
+from kcons.runs import Method, Run
 from kcons.scenes import Reference, Scene
 from kcons.steppers import Rattle, State, System
 
@@ -37,7 +38,7 @@ FIRST_STEP_DOUBT = 0.5
 #: A host is interrupted within a step after so many budgets.
 PATIENCE = 3
 
-Status = Literal["ok", "floor", "partial", "failed", "not run"]
+Status = Literal["ok", "floor", "thermostat", "partial", "failed", "not run"]
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,9 @@ class Measurement:
     ----------
     setting : float
         Time step in the scene's shown unit, or relative tolerance of an adaptive method.
-    status : {'ok', 'floor', 'partial', 'failed', 'not run'}
-        'floor': nothing is held, only the cost is stated. 'partial': stopped for the budget; cost only.
+    status : {'ok', 'floor', 'thermostat', 'partial', 'failed', 'not run'}
+        'floor': nothing is held, only the cost is stated. 'thermostat': the trajectory is not to be that of the
+        reference, so that there is no error. 'partial': stopped for the budget; cost only.
     error : float
         Root-mean-square distance an atom from the reference at the horizon.
     constraint_residual, velocity_residual : float
@@ -57,7 +59,7 @@ class Measurement:
     energy_slope, energy_slope_error : float
         Linear fit of the total energy against time and its standard error, a degree of freedom and `long_time`.
     step_seconds, constraint_seconds : float
-        Median wall time of a step, and of the constraints' part of it.
+        Median wall time of a step, and of the constraints' part of it where a host tells.
     setup_seconds : float
         Before the first step, and what the first step took beyond the others.
     evaluations_per_time, seconds_per_time : float
@@ -99,6 +101,8 @@ class Comparison:
     environment : mapping
         Machine, versions, commit, date.
     measurements : list of Measurement
+    remarks : list of str
+        What a reader should know of the methods that ran.
     """
 
     scene: Mapping[str, Any]
@@ -106,6 +110,7 @@ class Comparison:
     settings: Mapping[str, Any]
     environment: Mapping[str, Any]
     measurements: Sequence[Measurement] = field(default_factory=list)
+    remarks: Sequence[str] = ()
 
     def of(self, method: str, status: Status = "ok") -> list[Measurement]:
         """Measurements of one method, coarsest first."""
@@ -132,6 +137,7 @@ class Comparison:
             "reference": dict(self.reference),
             "settings": dict(self.settings),
             "environment": dict(self.environment),
+            "remarks": list(self.remarks),
             "observed_order": {name: order for name, order in orders.items() if order is not None},
             "measurements": [asdict(m) for m in self.measurements],
         }
@@ -164,7 +170,8 @@ def compare(
     ----------
     scene : Scene
     methods : iterable of str, optional
-        Names out of `kcons.methods.METHODS`, or 'all' alone; the usual ones by default.
+        Names out of `kcons.methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
+        ones for the scene.
     budget : float
         Seconds for each method over all its time steps. One that is predicted to exceed it is stopped
         after a step, which is reported as such.
@@ -181,7 +188,9 @@ def compare(
     """
     if not budget > 0:
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
-    picked = chosen(methods)
+    picked = chosen(methods, scene)
+    if scene.openmm is not None:
+        scene.openmm.patience = budget
     watching = watcher or Watcher()
     watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
     warm_up(scene, picked)
@@ -219,6 +228,7 @@ def compare(
         },
         reference={"how": reference.how, "error": reference.error},
         settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {})},
+        remarks=list(dict.fromkeys(m.remark for m in picked if m.remark)),
         environment=environment(),
         measurements=measurements,
     )
@@ -229,15 +239,13 @@ def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
     motion = scene.motion
     x, v = scene.positions, scene.velocities
     f = scene.potential.forces(x)
-    dt = min(scene.time_steps)
-    system, start = System(motion, scene.potential.forces), State(x, v)
-    Rattle().step(system, start, dt)
+    Rattle().step(System(motion, scene.potential.forces), State(x, v), min(scene.time_steps))
     motion.acceleration(x, v, f)
     motion.project_forces(x, f)
     for method in methods:
-        if isinstance(method, CoreStepper) and method.refuses(scene) is None:
+        if method.refuses(scene) is None:
             with suppress(Exception):  # what goes wrong is shown where it is measured
-                method.make(dt).step(system, start, dt)
+                method.warm_up(scene)
 
 
 # -- one method -------------------------------------------------------------------------------------
@@ -281,13 +289,14 @@ def _all_settings(
 
 @dataclass
 class _Log:
-    """What is written down at every step."""
+    """What is written down at every advance: by one step, or by several of a host that runs by itself."""
 
     times: list[float] = field(default_factory=list)
     energies: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     constraints: list[float] = field(default_factory=list)
     evaluations: int = 0
+    steps: int = 0
 
 
 class _OverBudgetError(Exception):
@@ -319,14 +328,14 @@ def _measure(
             status = "partial" if note else "ok"
     except _OverBudgetError:
         status = "partial"
-        note = f"step {len(log.seconds) + 1} was not done after {duration(perf_counter() - begun)}"
+        note = f"step {log.steps + 1} was not done after {duration(perf_counter() - begun)}"
     except UnsupportedError as error:
         return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
     except Exception as error:  # whatever a peer raises is a result, and is shown
         status = "failed"
         first = (str(error).strip().splitlines() or [""])[0]
-        note = textwrap.shorten(f"step {len(log.seconds) + 1}: {type(error).__name__}: {first}", 300)
-    common = dict(common, steps=len(log.seconds), setup_seconds=setup, **_costs(scene, method, run, log))
+        note = textwrap.shorten(f"step {log.steps + 1}: {type(error).__name__}: {first}", 300)
+    common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
     if run is None or not log.seconds:
         return Measurement(status=status, note=note, **common)
     if not method.holds:
@@ -335,6 +344,9 @@ def _measure(
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
         return Measurement(status="failed", note="positions are not finite", **common)
     sigma, tangency = scene.residuals(x, v, run.time)
+    if not method.follows:
+        shown: Status = "thermostat" if status == "ok" else status
+        return Measurement(status=shown, note=note, constraint_residual=sigma, velocity_residual=tangency, **common)
     slope, slope_error = _energy_slope(scene, log)
     return Measurement(
         status=status,
@@ -355,27 +367,35 @@ def _run_to_horizon(
     potential, masses = scene.potential, scene.masses[:, None]
 
     def write_down() -> None:
-        v = run.velocities
         log.times.append(run.time)
-        log.energies.append(potential.watched_energy(run.positions) + 0.5 * float(np.sum(masses * v * v)))
+        energy = run.own_energy()
+        if energy is None:
+            v = run.velocities
+            energy = potential.watched_energy(run.positions) + 0.5 * float(np.sum(masses * v * v))
+        log.energies.append(energy)
+
+    def evaluations_so_far() -> int:
+        own = run.own_evaluations()
+        return potential.evaluations if own is None else own
 
     write_down()
     while not run.finished:
         if not holds:
             run.rewind()
-        evaluations, held = potential.evaluations, run.constraints.seconds
+        evaluations, held = evaluations_so_far(), run.constraints.seconds
         start = perf_counter()
         run.advance()
         now = perf_counter()
-        log.seconds.append(now - start)
-        log.constraints.append(run.constraints.seconds - held)
-        log.evaluations += potential.evaluations - evaluations
+        log.seconds.append((now - start) / run.steps)
+        log.constraints.append((run.constraints.seconds - held) / run.steps)
+        log.evaluations += evaluations_so_far() - evaluations
+        log.steps += run.steps
         write_down()
         watcher.advance(run.time)
         if run.finished:
             break
         first = len(log.seconds) == 1
-        to_go = (scene.horizon - run.time) / (run.time - log.times[-2])
+        to_go = run.steps * (scene.horizon - run.time) / (run.time - log.times[-2])
         doubtful = first and log.seconds[0] < FIRST_STEP_DOUBT
         if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
             return _too_slow(log.seconds[-1], budget)
@@ -391,19 +411,21 @@ def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str
         return {}
     # The first step pays for what a host sets up lazily.
     counted = slice(1, None) if len(log.seconds) > 1 else slice(None)
-    step = float(np.median(log.seconds[counted]))
+    step = run.own_step_seconds() or float(np.median(log.seconds[counted]))
     elapsed = run.time / scene.units.long_time_unit
     return {
         "step_seconds": step,
-        "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds else None,
+        "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds and run.divided else None,
         "evaluations_per_time": log.evaluations / elapsed,
-        "seconds_per_time": step * len(log.seconds) / elapsed,
+        "seconds_per_time": step * log.steps / elapsed,
     }
 
 
 def _energy_slope(scene: Scene, log: _Log) -> tuple[float | None, float | None]:
     """Least-squares slope of the energy and its standard error, a degree of freedom and `long_time`."""
     if len(log.times) < 4:
+        return None, None
+    if not np.all(np.isfinite(log.energies)):
         return None, None
     t = np.array(log.times) / scene.units.long_time_unit
     e = np.array(log.energies) / max(scene.motion.degrees_of_freedom, 1)

@@ -1,17 +1,11 @@
-"""Drivers: one method on one scene, a step at a time.
-
-A `Method` says what it is and what it cannot run; `start` gives a `Run`, which advances by one step and
-knows how much of its time went into constraints.
-"""
+"""The methods: steppers of kcons on arrays, ASE's dynamics, SciPy, and by name those of OpenMM."""
 
 from __future__ import annotations
 
 import inspect
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -28,37 +22,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.motion import Motion
+from kcons.openmm_methods import OPENMM_METHODS
+from kcons.runs import ENGINE_CALLS, Method, Run, matched_steps
 from kcons.scenes import Scene
 from kcons.steppers import Rattle, State, Stepper, System
-
-
-class Stopwatch:
-    """Wall time spent inside some methods of one object; calls within calls count once."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._depth = 0
-
-    def watch(self, target: Any, names: Iterable[str]) -> None:
-        """Replace the methods of this one object by timed ones."""
-        for name in names:
-            if hasattr(target, name):
-                setattr(target, name, self._timed(getattr(target, name)))
-
-    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any, **options: Any) -> Any:
-            if self._depth:
-                return method(*args, **options)
-            self._depth += 1
-            start = perf_counter()
-            try:
-                return method(*args, **options)
-            finally:
-                self.seconds += perf_counter() - start
-                self._depth -= 1
-
-        return timed
-
 
 #: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
 STEPPERS: Mapping[str, type[Stepper]] = {
@@ -81,83 +48,8 @@ USUAL_STEPPERS = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan
 #: Rate of a stepper's feedback, in inverse time steps: fast, and well within what is stable.
 FEEDBACK = 0.1
 
-#: What the engine is asked for in the course of a step.
-ENGINE_CALLS = (
-    "project_positions",
-    "project_velocities",
-    "project_forces",
-    "restore_positions",
-    "acceleration",
-    "multipliers",
-    "constraint_force",
-)
 #: ASE's hooks.
 ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribute_forces_md")
-
-
-class Run(ABC):
-    """A trajectory in the making."""
-
-    time: float = 0.0
-
-    def __init__(self) -> None:
-        self.constraints = Stopwatch()
-
-    @abstractmethod
-    def advance(self) -> None:
-        """One step."""
-
-    def rewind(self) -> None:
-        """Go back to the start, forces known, while time and steps go on counting."""
-        raise NotImplementedError
-
-    @property
-    @abstractmethod
-    def finished(self) -> bool:
-        """Whether the horizon is reached."""
-
-    @property
-    @abstractmethod
-    def positions(self) -> FloatArray: ...
-
-    @property
-    @abstractmethod
-    def velocities(self) -> FloatArray: ...
-
-
-@dataclass(frozen=True)
-class Method(ABC):
-    """A way to run a scene.
-
-    Attributes
-    ----------
-    name, title : str
-    holds : bool
-        False for the floor, which holds nothing: its cost is the least there is. It makes the first step
-        again and again, since with nothing held the system would soon fly apart.
-    adaptive : bool
-        Whether its setting is a tolerance instead of a time step.
-    usual : bool
-        Whether it runs unless methods are named.
-    """
-
-    name: str
-    title: str
-    holds: bool = True
-    adaptive: bool = False
-    usual: bool = True
-
-    def refuses(self, scene: Scene) -> str | None:
-        """Why this method cannot run the scene, or None."""
-        return scene.refusals.get(self.name)
-
-    def settings(self, scene: Scene) -> tuple[float, ...]:
-        """Time steps or tolerances to run, the cheapest first."""
-        return tuple(scene.tolerances if self.adaptive else scene.time_steps)
-
-    @abstractmethod
-    def start(self, scene: Scene, setting: float) -> Run:
-        """Everything up to the first step."""
 
 
 # -- kcons ------------------------------------------------------------------------------------------
@@ -220,11 +112,12 @@ class CoreStepper(Method):
         return self.make(1.0)
 
     def settings(self, scene: Scene) -> tuple[float, ...]:
-        steps = scene.time_steps
-        evaluations = self.stepper.force_evaluations
-        first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
-        counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
-        return tuple(scene.horizon / count for count in counts)
+        return matched_steps(scene, self.stepper.force_evaluations)
+
+    def warm_up(self, scene: Scene) -> None:
+        dt = min(scene.time_steps)
+        system, start = System(scene.motion, scene.potential.forces), State(scene.positions, scene.velocities)
+        self.make(dt).step(system, start, dt)
 
     def start(self, scene: Scene, setting: float) -> Run:
         # What does not keep the positions on the surface cannot have rows that depend on each other there.
@@ -427,18 +320,21 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         *of_steppers(STEPPERS),
-        AseKcons("ase-kcons", "ASE Verlet + kcons"),
-        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths"),
-        AseInternals("ase-internals", "ASE Verlet + FixInternals"),
-        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True),
+        AseKcons("ase-kcons", "ASE Verlet + kcons", host="ase"),
+        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
+        AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
+        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy"),
         CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
-        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False),
+        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
+        *OPENMM_METHODS,
     )
 }
 
 
-def chosen(names: Iterable[str] | None = None) -> list[Method]:
-    """Methods by name, the usual ones by default; the name 'all' stands for all.
+def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> list[Method]:
+    """Methods by name, by default the usual ones for the scene.
+
+    'all' alone stands for all, 'openmm' for the usual ones of OpenMM that can run the scene.
 
     Raises
     ------
@@ -446,15 +342,34 @@ def chosen(names: Iterable[str] | None = None) -> list[Method]:
         Unknown name.
     """
     if names is None:
-        return [method for method in METHODS.values() if method.usual]
+        return usual(scene)
     wanted = list(names)
     if wanted == ["all"]:
         return list(METHODS.values())
-    picked = []
+    picked: dict[str, Method] = {}
     for name in wanted:
-        if name not in METHODS:
-            raise InputError(f"there is no method {name!r}; there are {', '.join(METHODS)}", item="methods")
-        picked.append(METHODS[name])
+        if name == "openmm":
+            group = [m for m in METHODS.values() if m.usual and m.host == name]
+            able = [m for m in group if scene is None or m.refuses(scene) is None]
+            picked |= {m.name: m for m in able or group}
+        elif name in METHODS:
+            picked[name] = METHODS[name]
+        else:
+            known = ", ".join((*METHODS, "openmm", "all"))
+            raise InputError(f"there is no method {name!r}; there are {known}", item="methods")
     if not picked:
         raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
-    return picked
+    return list(picked.values())
+
+
+def usual(scene: Scene | None = None) -> list[Method]:
+    """What runs where no method is named: the usual ones, of OpenMM only those that can run the scene.
+
+    All of OpenMM's on scenes that are at home there, and nothing else; elsewhere those that are guests.
+    """
+    found = [method for method in METHODS.values() if method.usual]
+    if scene is None or scene.openmm is None:
+        return [method for method in found if method.host != "openmm"]
+    if scene.openmm.home:
+        return [method for method in found if method.host == "openmm" and method.refuses(scene) is None]
+    return [m for m in found if m.host != "openmm" or (m.guest and m.refuses(scene) is None)]

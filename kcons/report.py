@@ -131,7 +131,7 @@ def _verdict(m: Measurement, note: int | None) -> str | Text:
     """The error, or in a word why there is none and which note tells more."""
     if m.status == "ok":
         return "" if m.error is None else f"{m.error:.2e}"
-    if m.status == "floor":
+    if m.status in ("floor", "thermostat"):
         return "-"
     word = f"{m.steps} step{'s' if m.steps > 1 else ''} only" if m.status == "partial" and m.steps else m.status
     return Text(f"{word} [{note}]" if note else word, style="red" if m.status == "failed" else "yellow")
@@ -156,7 +156,7 @@ def explanation(comparison: Comparison) -> str:
         "good": f", good to {error:.0e} {units['length']}" if error else "",
         **units,
     }
-    lines = [line.format(**known) for line in EXPLANATION]
+    lines = [*(line.format(**known) for line in EXPLANATION), *comparison.remarks]
     lines[:0] = [f"[{number}] {note}" for note, number in _note_numbers(comparison).items()]
     orders = []
     for name, title in {m.method: m.title for m in comparison.measurements}.items():

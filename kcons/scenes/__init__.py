@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.errors import InputError
@@ -13,7 +14,12 @@ from kcons.scenes.scene import Reference, Scene, Units
 if TYPE_CHECKING:
     from kcons.scenes.fluid import Fluid
 
-__all__ = ["FLUIDS", "SCENES", "Entry", "Reference", "Scene", "Units", "build", "build_fluid"]
+__all__ = ["FLUIDS", "SCENES", "Entry", "Reference", "Scene", "Units", "build", "build_fluid", "from_file", "is_file"]
+
+#: Files that are read as molecules.
+SUFFIXES = (".pdb", ".ent", ".cif", ".pdbx", ".mmcif")
+#: What can be chosen for molecules with forces of OpenMM only.
+STRUCTURE_OPTIONS = frozenset({"constrain", "force_field", "platform", "add_hydrogens"})
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,12 @@ SCENES: Mapping[str, Entry] = {
         "bead", "the same while the ellipse turns: a constraint that moves", 1, 1, "bead", {"on": "rotating-ellipse"}
     ),
     "bead-torus": Entry("bead", "free bead on a torus", 1, 1, "bead", {"on": "torus"}),
+    "alanine": Entry("structure", "alanine dipeptide, all bonds held; OpenMM", 1, 1, "molecule"),
+    "dhfr": Entry("structure", "a protein, 2489 atoms, all bonds held; OpenMM", 1, 1, "system", {"structure": "dhfr"}),
+    "dhfr-water": Entry(
+        "structure", "the same in water, 23558 atoms; OpenMM", 1, 1, "system", {"structure": "dhfr-water"}
+    ),
+    "villin": Entry("structure", "protein in water, 8867 atoms; OpenMM", 1, 1, "system", {"structure": "villin"}),
     "slab": Entry("slab", "rigid CO on Cu(111), lower layers fixed, EMT forces", 1, 1, "molecules"),
 }
 
@@ -116,6 +128,40 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
         raise InputError(f"there is no scene {name!r}; there are {', '.join(SCENES)}", item="scene") from None
     if size is None:
         size = entry.quick_size if quick else entry.size
+    if entry.module != "structure" and set(options) & STRUCTURE_OPTIONS:
+        names = ", ".join(key for key, other in SCENES.items() if other.module == "structure")
+        raise InputError(
+            f"what to hold, the force field and the platform can be chosen for {names} and PDB files, not for {name!r}",
+            item=sorted(set(options) & STRUCTURE_OPTIONS)[0],
+        )
     module = import_module(f"kcons.scenes.{entry.module}")
     scene: Scene = module.build(size, seed, **{**entry.options, **options})
     return scene.shortened(2) if quick else scene
+
+
+def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:
+    """The molecules of a PDB or mmCIF file, with forces of OpenMM.
+
+    Parameters
+    ----------
+    path : path
+    seed : int
+    quick : bool
+        Half the horizon.
+    **options
+        What `kcons.scenes.structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax.
+
+    Raises
+    ------
+    InputError, UnsupportedError
+        The file cannot be read, or does not fit the force field.
+    """
+    from kcons.scenes import structure
+
+    scene = structure.from_file(path, seed, **options)
+    return scene.shortened(2) if quick else scene
+
+
+def is_file(name: str) -> bool:
+    """Whether a name is that of a structure file and not of a scene."""
+    return name not in SCENES and Path(name).suffix.lower() in SUFFIXES

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from ase import units
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion
+from kcons.scenes.openmm_host import ASE_LENGTH, ASE_TIME, OpenMMHost, system_of
 from kcons.scenes.potential import Evaluate, Potential
 from kcons.scenes.scene import Scene, thermal_velocities
 
@@ -63,6 +67,7 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> Scene:
         horizon=pace * 80 * units.fs,
         time_steps=tuple(pace * dt * units.fs for dt in (10.0, 5.0, 2.5, 1.25)),
         bonds=pairs,
+        openmm=OpenMMHost(lambda: _system(x, pairs, masses)),
     )
 
 
@@ -86,14 +91,33 @@ def positions(size: int, shape: str, seed: int = 1) -> FloatArray:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(BOND * steps, axis=0)])
 
 
-def _springs(site: FloatArray) -> Evaluate:
+def _sites(start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Stiffness along each axis, and the sites."""
     # Different along each axis, so that no direction is special.
     k = STIFFNESS * np.array([1.0, 1.5, 0.6])
     # Off the start: the forces act from the first step on.
-    centre = site + 0.1 * np.sin(np.arange(site.size)).reshape(site.shape)
+    return k, start + 0.1 * np.sin(np.arange(start.size)).reshape(start.shape)
+
+
+def _springs(start: FloatArray) -> Evaluate:
+    k, centre = _sites(start)
 
     def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
         d = x - centre
         return 0.5 * float(np.sum(k * d * d)), -k * d
 
     return evaluate
+
+
+def _system(start: FloatArray, pairs: IntArray, masses: FloatArray) -> Any:
+    import openmm
+
+    k, centre = _sites(start)
+    field = openmm.CustomExternalForce("0.5*(kx*(x-x0)^2+ky*(y-y0)^2+kz*(z-z0)^2)")
+    for name, value in zip(("kx", "ky", "kz"), k / ASE_TIME**2, strict=True):
+        field.addGlobalParameter(name, value)
+    for name in ("x0", "y0", "z0"):
+        field.addPerParticleParameter(name)
+    for atom, site in enumerate(centre * ASE_LENGTH):
+        field.addParticle(atom, site.tolist())
+    return system_of(masses, field, pairs=pairs, lengths=BOND * ASE_LENGTH)

@@ -6,6 +6,7 @@ Solution for the two: each dumbbell's own equations of motion for its centre and
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from ase import units
@@ -18,6 +19,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.scenes.minimal import integrated
+from kcons.scenes.openmm_host import OpenMMHost, system_of
 from kcons.scenes.potential import Evaluate, Potential
 from kcons.scenes.scene import Reference, Scene, Units, thermal_velocities
 
@@ -99,6 +101,7 @@ def _collision() -> Scene:
         units=REDUCED,
         bonds=_pairs(2),
         solution=encounter,
+        openmm=OpenMMHost(_collision_system, length=1.0, time=1.0),
     )
 
 
@@ -109,6 +112,16 @@ def attraction(x: FloatArray) -> tuple[float, FloatArray]:
     s6 = squared**-3
     push = (24.0 * (2.0 * s6 * s6 - s6) / squared)[..., None] * d
     return 4.0 * float(np.sum(s6 * s6 - s6)), np.concatenate([push.sum(axis=1), -push.sum(axis=0)])
+
+
+def _collision_system() -> Any:
+    import openmm
+
+    force = openmm.CustomBondForce("4*(r^-12-r^-6)")
+    for i in (0, 1):
+        for j in (2, 3):
+            force.addBond(i, j)
+    return system_of(MASSES, force, pairs=_pairs(2), lengths=LENGTHS)
 
 
 def encounter(time: float) -> Reference:
@@ -177,6 +190,7 @@ def _box(size: int, seed: int) -> Scene:
         units=REDUCED,
         bonds=_pairs(size),
         cell=np.full(3, side),
+        openmm=OpenMMHost(lambda: _box_system(masses, side, cutoff), length=1.0, time=1.0),
     )
 
 
@@ -205,3 +219,22 @@ def _with_cutoff(side: float, cutoff: float) -> Evaluate:
         return float(energy @ switch), f
 
     return evaluate
+
+
+def _box_system(masses: FloatArray, side: float, cutoff: float) -> Any:
+    import openmm
+
+    begin = SWITCH * cutoff
+    force = openmm.CustomNonbondedForce(
+        f"4*(r^-12-r^-6)*t^5*(126-420*t+540*t^2-315*t^3+70*t^4);t=min(max(({cutoff!r}-r)/{cutoff - begin!r},0),1)"
+    )
+    force.setNonbondedMethod(openmm.CustomNonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(cutoff)
+    pairs = _pairs(len(masses) // 2)
+    for _ in masses:
+        force.addParticle()
+    for i, j in pairs.tolist():
+        force.addExclusion(i, j)
+    system = system_of(masses, force, pairs=pairs, lengths=BOND)
+    system.setDefaultPeriodicBoxVectors(*(np.eye(3) * side))
+    return system

@@ -12,6 +12,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.target import FloatArray
 from kcons.scenes.minimal import integrated, single, spin, turned
+from kcons.scenes.openmm_host import OpenMMHost, system_of
 from kcons.scenes.potential import Potential
 from kcons.scenes.scene import BARE, Reference, Scene
 
@@ -63,6 +64,7 @@ def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> Scene:
     """
     single(size, f"{start} is one rigid body")
     v = VELOCITIES[start]
+    lengths = np.linalg.norm(POSITIONS[PAIRS[:, 0]] - POSITIONS[PAIRS[:, 1]], axis=1)
     # Half of the tennis racket's horizon lies before its first flip.
     horizon = 10.0 if start == "rotor" else 20.0
     what = "turning about its middle axis (tennis racket)" if start == "tennis-racket" else "in free flight"
@@ -80,6 +82,7 @@ def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> Scene:
         units=BARE,
         bonds=PAIRS,
         solution=lambda time: flight(POSITIONS, v, MASSES, time),
+        openmm=OpenMMHost(lambda: system_of(MASSES, pairs=PAIRS, lengths=lengths), length=1.0, time=1.0),
     )
 
 

@@ -14,6 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion
+from kcons.scenes.openmm_host import OpenMMHost
 from kcons.scenes.potential import Potential, PotentialCalculator
 from kcons.steppers import BlanesMoan6, State, System
 
@@ -97,6 +98,10 @@ class Scene:
         The reference at a given time, in closed form or by an independent integrator; without it the scene is
         converged at a step far below those compared.
     cell : ndarray, shape (3,) or (3, 3), or None
+    openmm : OpenMMHost, optional
+        How OpenMM runs it: the same masses and forces as a System.
+    reference_pace : float
+        The finest step compared, times this, decides about the work of a converged reference.
     """
 
     name: str
@@ -117,6 +122,8 @@ class Scene:
     refusals: Mapping[str, str] = field(default_factory=dict)
     solution: Callable[[float], Reference] | None = None
     cell: FloatArray | None = None
+    openmm: OpenMMHost | None = None
+    reference_pace: float = 1.0
 
     @cached_property
     def motion(self) -> Motion:
@@ -179,7 +186,7 @@ class Scene:
         """The solution at the horizon."""
         if self.solution is not None:
             return self.solution(self.horizon)
-        return converged(self, min(self.time_steps), progress=progress)
+        return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
         """Root-mean-square distance an atom."""

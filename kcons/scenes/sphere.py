@@ -6,6 +6,8 @@ equation of motion integrated to twelve digits.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -13,6 +15,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.scenes.openmm_host import OpenMMHost, system_of
 from kcons.scenes.potential import Evaluate, Potential
 from kcons.scenes.scene import REDUCED, Reference, Scene
 
@@ -60,11 +63,12 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
         there: FloatArray = np.add(centers, ends, dtype=np.float64)
         return Reference(there, error, "the pendulum's own equation, DOP853 at rtol 2.3e-14")
 
+    spheres = Sphere(np.arange(size), centers, RADIUS)
     what = f"spherical pendulums, g = {gravity:g}" if gravity else "free particles on spheres"
     return Scene(
         name="sphere-pendulum" if gravity else "sphere",
         title=f"{size} {what}; units R, τ = R/v0, ε = m v0²",
-        constraint_set=ConstraintSet(Sphere(np.arange(size), centers, RADIUS), x, masses),
+        constraint_set=ConstraintSet(spheres, x, masses),
         positions=x,
         velocities=v,
         potential=Potential(_weight(gravity), "uniform field" if gravity else "no forces"),
@@ -75,6 +79,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
         units=REDUCED,
         refusals={"ase-bonds": NO_SPHERE, "ase-internals": NO_SPHERE},
         solution=pendulums if gravity else great_circles,
+        openmm=OpenMMHost(lambda: _system(masses, gravity), length=1.0, time=1.0, surfaces=[spheres]),
     )
 
 
@@ -100,3 +105,12 @@ def _weight(gravity: float) -> Evaluate:
         return gravity * float(x[:, 2].sum()), f
 
     return evaluate
+
+
+def _system(masses: FloatArray, gravity: float) -> Any:
+    import openmm
+
+    field = openmm.CustomExternalForce(f"{gravity!r}*z")
+    for k in range(len(masses)):
+        field.addParticle(k)
+    return system_of(masses, *([field] if gravity else []))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from importlib import resources
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 from ase import Atoms, units
@@ -12,9 +13,11 @@ from ase.calculators.tip3p import TIP3P
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion
+from kcons.scenes.openmm_host import ASE_LENGTH, OpenMMHost
 from kcons.scenes.potential import Potential, of_calculator
 from kcons.scenes.scene import Scene, thermal_velocities
 from kcons.steppers import Rattle, State, System
@@ -78,6 +81,7 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> Scene:
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=pairs,
         cell=cell,
+        openmm=None if forces == "ase" else OpenMMHost(lambda: _held(box, masses, pairs, lengths), platform="CPU"),
     )
 
 
@@ -119,7 +123,7 @@ def _relaxed(motion: Motion, potential: Potential, x: FloatArray, seed: int) -> 
 
 
 def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Potential:
-    cutoff = min(CUTOFF, 0.49 * box)
+    cutoff = _cutoff(box)
     if forces == "ase":
         atoms = Atoms(["O", "H", "H"] * (len(x) // 3), positions=x, cell=[box] * 3, pbc=True, masses=masses)
         return of_calculator(atoms, TIP3P(rc=cutoff, width=min(1.0, cutoff / 3)), "ASE's TIP3P, cut off")
@@ -129,9 +133,15 @@ def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Po
 
 
 def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Potential:
-    import openmm
-
     from kcons.scenes import openmm_potential
+
+    potential = openmm_potential.of_system(_system(box, cutoff, masses))
+    potential.name = f"PME, {potential.name}"
+    return potential
+
+
+def _system(box: float, cutoff: float, masses: FloatArray) -> Any:
+    import openmm
 
     system = openmm.System()
     force = openmm.NonbondedForce()
@@ -151,6 +161,16 @@ def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Poten
     force.setUseDispersionCorrection(False)
     system.addForce(force)
     system.setDefaultPeriodicBoxVectors(*(np.eye(3) * box / 10))
-    potential = openmm_potential.of_system(system)
-    potential.name = f"PME, {potential.name}"
-    return potential
+    return system
+
+
+def _held(box: float, masses: FloatArray, pairs: IntArray, lengths: FloatArray) -> Any:
+    """The same with its distances held by OpenMM."""
+    system = _system(box, _cutoff(box), masses)
+    for (i, j), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
+        system.addConstraint(i, j, length * ASE_LENGTH)
+    return system
+
+
+def _cutoff(box: float) -> float:
+    return min(CUTOFF, 0.49 * box)

@@ -1,0 +1,172 @@
+"""The contract of a method: what it is, what it cannot run, and a run that advances step by step.
+
+`kcons.methods` and `kcons.openmm_methods` fulfil it; `kcons.compare` knows nothing else of them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+from kcons.constraints.target import FloatArray
+from kcons.scenes import Scene
+
+#: What the engine is asked for in the course of a step.
+ENGINE_CALLS = (
+    "project_positions",
+    "project_velocities",
+    "project_forces",
+    "restore_positions",
+    "acceleration",
+    "multipliers",
+    "constraint_force",
+)
+
+
+class Stopwatch:
+    """Wall time spent inside some methods of one object; calls within calls count once."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth = 0
+
+    def watch(self, target: Any, names: Iterable[str]) -> None:
+        """Replace the methods of this one object by timed ones."""
+        for name in names:
+            if hasattr(target, name):
+                setattr(target, name, self._timed(getattr(target, name)))
+
+    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **options: Any) -> Any:
+            if self._depth:
+                return method(*args, **options)
+            self._depth += 1
+            start = perf_counter()
+            try:
+                return method(*args, **options)
+            finally:
+                self.seconds += perf_counter() - start
+                self._depth -= 1
+
+        return timed
+
+
+class Run(ABC):
+    """A trajectory in the making.
+
+    Attributes
+    ----------
+    time : float
+    steps : int
+        Steps that the last `advance` made.
+    constraints : Stopwatch
+        Wall time of the constraints.
+    divided : bool
+        Whether that time can be told from the rest of a step.
+    """
+
+    time: float = 0.0
+    steps: int = 1
+    divided: bool = True
+
+    def __init__(self) -> None:
+        self.constraints = Stopwatch()
+
+    @abstractmethod
+    def advance(self) -> None:
+        """One step, or as many as `steps` then says."""
+
+    def rewind(self) -> None:
+        """Go back to the start, forces known, while time and steps go on counting."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def finished(self) -> bool:
+        """Whether the horizon is reached."""
+
+    @property
+    @abstractmethod
+    def positions(self) -> FloatArray: ...
+
+    @property
+    @abstractmethod
+    def velocities(self) -> FloatArray: ...
+
+    # -- what only a host knows that runs by itself ----------------------------------------------
+
+    def own_energy(self) -> float | None:
+        """Total energy as the host states it; None where it follows from positions and velocities."""
+        return None
+
+    def own_evaluations(self) -> int | None:
+        """Force evaluations so far; None where the scene's potential counts them."""
+        return None
+
+    def own_step_seconds(self) -> float | None:
+        """Time of a step, where single steps are too short to be timed by the caller.
+
+        Asked for at the end: the state may be spoilt by it.
+        """
+        return None
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """A way to run a scene.
+
+    Attributes
+    ----------
+    name, title : str
+    holds : bool
+        False for the floor, which holds nothing: its cost is the least there is. It makes the first step
+        again and again, since with nothing held the system would soon fly apart.
+    adaptive : bool
+        Whether its setting is a tolerance instead of a time step.
+    usual : bool
+        Whether it runs unless methods are named.
+    host : str
+        Whose it is: 'kcons', 'ase', 'scipy' or 'openmm'.
+    guest : bool
+        Whether it runs, unless methods are named, on scenes that are at home in another host too.
+    follows : bool
+        Whether it is to follow the reference trajectory. A thermostat does not: no error can be stated.
+    remark : str
+        What a reader of its numbers should know.
+    """
+
+    name: str
+    title: str
+    holds: bool = True
+    adaptive: bool = False
+    usual: bool = True
+    host: str = "kcons"
+    guest: bool = False
+    follows: bool = True
+    remark: str = ""
+
+    def refuses(self, scene: Scene) -> str | None:
+        """Why this method cannot run the scene, or None."""
+        return scene.refusals.get(self.name)
+
+    def settings(self, scene: Scene) -> tuple[float, ...]:
+        """Time steps or tolerances to run, the cheapest first."""
+        return tuple(scene.tolerances if self.adaptive else scene.time_steps)
+
+    def warm_up(self, scene: Scene) -> None:  # noqa: B027 - most have nothing to compile
+        """Compile or load what the first step would wait for."""
+
+    @abstractmethod
+    def start(self, scene: Scene, setting: float) -> Run:
+        """Everything up to the first step."""
+
+
+def matched_steps(scene: Scene, evaluations: int) -> tuple[float, ...]:
+    """Time steps that cost as many force evaluations as the scene's steps cost RATTLE."""
+    steps = scene.time_steps
+    first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
+    counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
+    return tuple(scene.horizon / count for count in counts)
