@@ -71,7 +71,7 @@ class _HostRun(Run):
         host = scene.openmm
         assert host is not None
         self._scene, self._host, self._context, self._integrator = scene, host, context, integrator
-        self._dt, self._evaluations = dt, evaluations
+        self._dt, self._evaluations, self._half_step = dt, evaluations, half_step
         self._done, self._planned = 0, round(scene.horizon / dt)
         self._stride = 1 if records is None else max(1, self._planned // records)
         self._groups = integrator.getIntegrationForceGroups()
@@ -111,8 +111,13 @@ class _HostRun(Run):
     def velocities(self) -> FloatArray:
         return (self._state()[1] if self._end is None else self._end[1]) / self._host.speed
 
-    def own_energy(self) -> float:
-        # The same force groups as in a step: asking for others would make the next step compute forces anew.
+    def own_energy(self) -> float | None:
+        if not self._half_step:
+            return None
+        if hasattr(self._integrator, "scheme"):
+            # To ask would compute the forces that the next step is to pay for.
+            return float("nan")
+        # OpenMM's own integrators compute forces anew in every step. They know how to move velocities by half a step.
         state = self._context.getState(energy=True, groups=self._groups)
         energy = state.getKineticEnergy() + state.getPotentialEnergy()
         return float(energy._value) / self._host.speed**2

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
 from kcons import cli
+
+needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 
 
 def run(*arguments):
@@ -171,3 +175,46 @@ def test_importing_the_command_imports_no_host():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+# -- molecules in OpenMM ----------------------------------------------------------------------------
+
+ALANINE = Path(__file__).parent / "data" / "alanine-dipeptide-implicit.pdb"
+
+
+@needs_openmm
+def test_own_file_in_openmm(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = "openmm-verlet,openmm-kcons-rattle"
+    assert run("compare", ALANINE, "--constrain", "allbonds", "--methods", names, "--dt", "2,1") == 0
+    printed = capsys.readouterr().out
+    assert "AllBonds: 21 distances" in printed
+    assert "OpenMM + kcons rattle" in printed
+    data = json.loads((tmp_path / f"compare-{ALANINE.stem}" / "compare.json").read_text())
+    assert data["settings"]["constrain"] == "allbonds"
+    assert data["observed_order"]["openmm-kcons-rattle"] == pytest.approx(2.0, abs=0.2)
+    assert data["remarks"]
+
+
+@needs_openmm
+def test_plan_of_own_file(capsys):
+    assert run("plan", ALANINE, "--constrain", "hangles") == 0
+    assert "HAngles: 30 distances" in capsys.readouterr().out
+
+
+@needs_openmm
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("compare", "missing.pdb"), "there is no file missing.pdb"),
+        (("compare", ALANINE, "--size", "3"), "leave --size out"),
+        (("compare", ALANINE, "--forcefield", "nowhere.xml"), "force field nowhere.xml"),
+        (("plan", ALANINE, "--platform", "Abacus"), "no platform 'Abacus'"),
+        (("compare", "chain", "--constrain", "hbonds"), "not for 'chain'"),
+        (("compare", "alanine", "--add-hydrogens"), "is for files"),
+    ],
+)
+def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, text):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    assert text in capsys.readouterr().err

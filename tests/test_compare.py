@@ -28,8 +28,8 @@ def spheres():
     return compare.compare(scenes.build("sphere-pendulum", 2), budget=30)
 
 
-def test_all_methods_are_there(result):
-    usual = [name for name, method in methods.METHODS.items() if method.usual]
+def test_all_methods_are_there(chain, result):
+    usual = [method.name for method in methods.usual(chain)]
     assert list(dict.fromkeys(m.method for m in result.measurements)) == usual
     assert {m.status for m in result.measurements} == {"ok", "floor"}
 

@@ -39,6 +39,10 @@ STORED = {
 SMALL = {"water": 8, "chain": 5, "chain-straight": 5, "chain-175": 5, "chain-free": 5, "sphere": 2, "ethanol": 1}
 SMALL["sphere-pendulum"] = 2
 SMALL.update(dict.fromkeys(STORED, 1), dumbbells=2, slab=1)
+if find_spec("openmm") is not None:
+    SMALL["alanine"] = 1
+#: Molecules with forces of OpenMM, see test_structure.
+MOLECULES = {"alanine", "dhfr", "dhfr-water", "villin"}
 
 
 def small(name, **options):
@@ -54,7 +58,7 @@ def end(scene, dt):
 
 
 def test_every_scene_is_covered_here():
-    assert set(SMALL) == set(scenes.SCENES)
+    assert set(SMALL) | MOLECULES == set(scenes.SCENES)
 
 
 @pytest.mark.parametrize("name", SMALL)
