@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons import compare, methods, scenes
+from kcons import compare, methods, runs, scenes
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System, run
 
@@ -296,7 +296,7 @@ def test_stopwatch_counts_nested_calls_once():
         def inner(self):
             time.sleep(0.01)
 
-    watch, thing = methods.Stopwatch(), Object()
+    watch, thing = runs.Stopwatch(), Object()
     watch.watch(thing, ("outer", "inner", "absent"))
     start = time.perf_counter()
     thing.outer()

@@ -185,7 +185,7 @@ def test_molecule_that_is_cut(tmp_path):
     path = tmp_path / "cut.pdb"
     with path.open("w") as file:
         app.PDBFile.writeFile(pdb.topology, x * unit.nanometer, file)
-    with pytest.raises(InputError, match="CH3 of ACE 1 and H1 of ACE 1 are 2.5 nm apart") as caught:
+    with pytest.raises(InputError, match=r"CH3 of ACE 1 and H1 of ACE 1 are 2\.5 nm apart") as caught:
         scenes.from_file(path)
     assert "make molecules whole" in str(caught.value)
     assert sorted(caught.value.atoms) == [0, 1]
