@@ -3,6 +3,7 @@
     python examples/11_openmm_compare.py                  alanine dipeptide, half a minute
     python examples/11_openmm_compare.py --full --out F   and two proteins, twenty minutes; F receives JSON
     python examples/11_openmm_compare.py --show F         the tables of an earlier result
+    python examples/11_openmm_compare.py --summary F      what it comes to
 
 The same from the command line, for one of them: kcons compare villin; for your own: kcons compare my.pdb
 One thread. Errors and force evaluations do not depend on the machine. Wall times in the tables do; for the steps a
@@ -116,21 +117,31 @@ def run(full: bool) -> dict[str, Any]:
 
 
 def show(results: dict[str, Any], console: Console) -> None:
+    """Table and explanation of each scene."""
     for found in results.values():
         result = read(found)
         console.print(report.table(result))
         console.print(report.explanation(result), highlight=False, markup=False)
+
+
+def summary(results: dict[str, Any]) -> str:
+    """What reaches an error, and how fast the steps are."""
+    lines = []
+    for found in results.values():
+        units = found["scene"]["units"]
+        lines += [found["scene"]["title"], f"  error after {found['scene']['horizon']:g} {units['time']}"]
         for row in found.get("targets", []):
-            if row["best"] is not None:
-                mark = "about " if row["extrapolated"] else ""
-                gain = row["own"] / row["evaluations"]
-                console.print(
-                    f"error ≤ {row['target']:.0e}: {row['best']} at {row['step']:.4g} fs, {row['evaluations']:,.0f} "
-                    f"force evaluations a ps; OpenMM's own {mark}{row['own']:,.0f}, {gain:.1f} times as many"
-                )
+            start = f"  ≤ {row['target']:.0e} {units['length']}:"
+            own = f"OpenMM's own {'about ' if row['extrapolated'] else ''}{row['own']:,.0f} force evaluations a ps"
+            if "best" in row:
+                gain = f"{row['own'] / row['evaluations']:.1f} times as many as the {row['evaluations']:,.0f} of"
+                lines.append(f"{start} {own}, {gain} {row['best']} at {row['step']:.3g} fs")
+            else:
+                lines.append(f"{start} {own}")
+        lines.append("  steps of 1 fs, in turn")
         for name, row in found["steps in turn"].items():
-            console.print(f"{name:<32} {row['ms']:.4g} ms a step, {row['ratio']:.2f} of the steps a second")
-        console.print()
+            lines.append(f"  {name:<32}{row['ms']:>9.4g} ms, {row['ratio']:.2f} of the steps a second")
+    return "\n".join(lines)
 
 
 def read(found: dict[str, Any]) -> Comparison:
@@ -152,13 +163,18 @@ def main() -> None:
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--show", type=Path)
+    parser.add_argument("--summary", type=Path)
     chosen = parser.parse_args()
     console = Console(width=160)
     if chosen.show is not None:
         show(json.loads(chosen.show.read_text()), console)
         return
+    if chosen.summary is not None:
+        print(summary(json.loads(chosen.summary.read_text())))
+        return
     results = slim(run(chosen.full))
     show(results, console)
+    print(summary(results))
     if chosen.out is not None:
         chosen.out.write_text(json.dumps(results, indent=0, ensure_ascii=False) + "\n")
 
