@@ -28,6 +28,23 @@ STYLES: dict[str, tuple[str, str | int]] = {
     "dop853": ("#009E73", "D"),
     "verlet": ("#333333", 6),
     "ase-verlet": ("#999999", 6),
+    # OpenMM: its own in reds, the darker the tighter; kcons in it in blues, its solver in greens.
+    "openmm-verlet-1e-4": ("#fcbba1", "<"),
+    "openmm-verlet": ("#fb6a4a", "^"),
+    "openmm-verlet-1e-6": ("#ef3b2c", ">"),
+    "openmm-verlet-1e-8": ("#cb181d", "v"),
+    "openmm-verlet-1e-10": ("#99000d", "1"),
+    "openmm-verlet-1e-12": ("#67000d", "2"),
+    "openmm-middle": ("#fe9929", "x"),
+    "openmm-nose-hoover": ("#993404", "+"),
+    "openmm-kcons-rattle": ("#9ecae1", "o"),
+    "openmm-kcons-suzuki4": ("#6baed6", "P"),
+    "openmm-kcons-blanes-moan4": ("#4292c6", "h"),
+    "openmm-kcons-kahan-li6": ("#2171b5", "*"),
+    "openmm-kcons-blanes-moan6": ("#084594", "p"),
+    "openmm-held-rattle": ("#74c476", "s"),
+    "openmm-held-blanes-moan6": ("#006d2c", "D"),
+    "openmm-free": ("#cccccc", 6),
 }
 
 #: For methods that have no style of their own, in their order.
