@@ -177,31 +177,65 @@ def thermal_run(name: str, kind: str, temperature: float, steps: int) -> tuple[n
     return kinetic, potential
 
 
-def convergence_run(name: str, kind: str, step: float) -> tuple[float, np.ndarray]:
-    """The conserved energy over 16 ps. Langevin without friction: its noise has no order."""
+#: Steps in fs, starts, and length in fs of the flights by which the order is measured.
+CONVERGENCE, STARTS, FLIGHT = (4.0, 2.0, 1.0), 40, 480
+
+
+def without_noise(kind: str, atoms: Atoms, step: float, temperature: float) -> Any:
+    """Langevin without friction: its noise has no order."""
+    if kind == "Langevin":
+        return ConstrainedLangevin(atoms, step * units.fs, temperature, 0.0, rng=1)
+    return dynamics(kind, atoms, step * units.fs, temperature)
+
+
+def conserved(kind: str, atoms: Atoms, step: float, temperature: float, length: float) -> np.ndarray:
+    """The conserved energy in eV every 8 fs."""
+    moving = without_noise(kind, atoms, step, temperature)
+    values: list[float] = []
+    moving.attach(lambda: values.append(moving.get_conserved_energy()), interval=round(8 / step))
+    moving.run(round(length / step))
+    return np.array(values)
+
+
+def warmed(name: str) -> tuple[Atoms, Any]:
     atoms, _, _ = MOLECULES[name]()
     temperature = TEMPERATURES[name][0]
     draw_velocities(atoms, temperature, 8)
     warm = ConstrainedLangevin(atoms, 1 * units.fs, temperature, 0.02 / units.fs, rng=1)
     warm.run(2000)
-    draw_velocities(atoms, temperature, 8, zero_momentum=True)
-    if kind == "Langevin":
-        moving: Any = ConstrainedLangevin(atoms, step * units.fs, temperature, 0.0, rng=1)
-    else:
-        moving = dynamics(kind, atoms, step * units.fs, temperature)
-    values: list[float] = []
-    moving.attach(lambda: values.append(moving.get_conserved_energy()), interval=round(8 / step))
-    moving.run(round(16_000 / step))
-    return step, np.array(values)
+    return atoms, warm
 
 
-def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
-    """p of the kinetic energy, standard errors of the ensembles at two temperatures, and convergence."""
+def flights(name: str, kind: str) -> list[np.ndarray]:
+    """Deviations of the conserved energy from its mean over short flights, for each time step from the same starts.
+
+    Long runs are chaotic: with each step they meet other collisions, and a few of these decide the deviation.
+    """
+    atoms, warm = warmed(name)
+    found: list[list[np.ndarray]] = [[] for _ in CONVERGENCE]
+    for k in range(STARTS):
+        warm.run(250)
+        for step, series in zip(CONVERGENCE, found, strict=True):
+            flying = atoms.copy()
+            flying.calc = atoms.calc
+            draw_velocities(flying, TEMPERATURES[name][0], k, zero_momentum=True)
+            values = conserved(kind, flying, step, TEMPERATURES[name][0], FLIGHT)
+            series.append(values - values.mean())
+    return [np.concatenate(series) for series in found]
+
+
+def slope(name: str, kind: str, step: float) -> float:
+    """Drift of the conserved energy over 16 ps, in eV/ps."""
+    atoms, _ = warmed(name)
+    draw_velocities(atoms, TEMPERATURES[name][0], 8, zero_momentum=True)
+    values = conserved(kind, atoms, step, TEMPERATURES[name][0], 16_000)
+    return float(np.polyfit(np.arange(len(values)) * 8e-3, values, 1)[0])
+
+
+def ase_units() -> Any:
     import physical_validation as pv
 
-    atoms, size, rows = MOLECULES[name]()
-    n = len(atoms) // size
-    unit = pv.data.UnitData(
+    return pv.data.UnitData(
         kb=KB,
         energy_str="eV",
         energy_conversion=96.48533,
@@ -216,6 +250,15 @@ def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
         time_str="fs",
         time_conversion=1e-3,
     )
+
+
+def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
+    """p of the kinetic energy, standard errors of the ensembles at two temperatures, and convergence."""
+    import physical_validation as pv
+
+    atoms, size, rows = MOLECULES[name]()
+    n = len(atoms) // size
+    unit = ase_units()
     momentum = 0 if kind == "Langevin" else 3
     system = pv.data.SystemData(
         natoms=len(atoms),
@@ -239,18 +282,20 @@ def judged(name: str, kind: str, steps: int) -> dict[str, Any]:
     results["samples"] = len(cold.observables.kinetic_energy)
     results["kinetic_p"] = [float(pv.kinetic_energy.distribution(d, strict=True, verbosity=0)) for d in (cold, warm)]
     results["ensemble_sigma"] = [float(s) for s in pv.ensemble.check(cold, warm, verbosity=0)]
-    fine = []
-    slopes = []
-    for step in (4.0, 2.0, 1.0):
-        _, values = convergence_run(name, kind, step)
-        fine.append(
-            pv.data.SimulationData(units=unit, dt=step, observables=pv.data.ObservableData(constant_of_motion=values))
-        )
-        slopes.append(float(np.polyfit(np.arange(len(values)) * 8e-3, values, 1)[0]))
-    results["convergence"] = float(pv.integrator.convergence(fine, verbose=False))
-    results["spread_eV"] = [float(np.std(f.observables.constant_of_motion)) for f in fine]
-    results["slope_eV_per_ps"] = slopes
-    return results
+    results["slope_eV_per_ps"] = [slope(name, kind, step) for step in CONVERGENCE]
+    return {**results, **order(name, kind, unit)}
+
+
+def order(name: str, kind: str, unit: Any) -> dict[str, Any]:
+    """How far from quadratic in the time step the deviation of the conserved energy is."""
+    import physical_validation as pv
+
+    fine = [
+        pv.data.SimulationData(units=unit, dt=step, observables=pv.data.ObservableData(constant_of_motion=values))
+        for step, values in zip(CONVERGENCE, flights(name, kind), strict=True)
+    ]
+    spread = [float(np.std(f.observables.constant_of_motion)) for f in fine]
+    return {"convergence": float(pv.integrator.convergence(fine, verbose=False)), "spread_eV": spread}
 
 
 # -- all of it --------------------------------------------------------------------------------------
