@@ -314,7 +314,7 @@ def jobs(full: bool) -> dict[str, Job]:
             taken = steps // 3 if thermostat == "Langevin" else steps
             found[f"{thermostat}, {name}"] = "runs", partial(sampled, which, thermostat, taken)
     for convention in ("g - 1", "g"):
-        found[f"{convention}, trap"] = "trap", partial(trap, convention, 400_000 if full else 4000)
+        found[f"{convention}, trap"] = "trap", partial(trap, convention, 800_000 if full else 4000)
     if full:
         for name in MOLECULES:
             for kind in ("Nose-Hoover", "Langevin"):
