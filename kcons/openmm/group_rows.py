@@ -144,6 +144,11 @@ class GroupRows:
             self._gradients_kept(p)
             p.let(f"known{self.code}", "0", "no projection was here")
 
+    def renew(self, p: Program) -> None:
+        """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
+        self._gradients_kept(p, sizes=False)
+        p.let(f"known{self.code}", "0", "no projection was here")
+
     def remember(self, p: Program) -> None:
         if self._drives:
             self._set_clock(p)
@@ -152,9 +157,9 @@ class GroupRows:
         if self._start == f"start{self.code}":
             p.each(self._start, "x", "to start again from")
 
-    def _gradients_kept(self, p: Program) -> None:
+    def _gradients_kept(self, p: Program, sizes: bool = True) -> None:
         """Gradients for the drift; v stays."""
-        self._gradients(p, sizes=True, slopes=False)
+        self._gradients(p, sizes=sizes, slopes=False)
         singular = f"select(singular{self.code}, {self.code}, 0)"
         p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.openmm.ensemble import ConstantEnergy
-from kcons.openmm.program import Program
 from kcons.openmm.steps import StepWriter
 from kcons.steppers.rattle import Rattle
 
@@ -134,11 +133,11 @@ class LeanStepWriter(StepWriter):
                 p.each("u", "v+select(behind, 1, kick_share(first_stage))*dt*force/m", "the applied forces act (kick)")
                 if any(hasattr(part, "begin") for part in self.parts):
                     with p.when("moved+stale != 0", "others did"):
-                        self._begin(p)
+                        self._each("begin")
             with p.when("looked = 0", "in the middle of many steps"):
                 p.each("x_last", "x", "to come back to")
                 p.each("u", "v+dt*f/m", "the applied forces act (both half kicks)")
-                self._begin(p)
+                self._each("renew")
             p.let("stale", "0", "forces belong to x")
             p.let("led", "behind", "for multipliers")
             p.let("dt_last", "dt", "to see whether it is changed")
@@ -172,19 +171,16 @@ class LeanStepWriter(StepWriter):
         p.let("looked", "1-between", "does somebody look?")
         with p.when("looked = 0", "nobody does"):
             p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
-            for part in self.parts:
-                passed = getattr(part, "passed", None)
-                if passed is not None:
-                    passed(p)
+            self._each("passed")
         with p.when("looked != 0", "somebody does"):
             p.each("x_last", "x", "where forces were computed")
             p.each("v_last", "v", "to see whether others change it")
 
-    def _begin(self, p: Program) -> None:
+    def _each(self, method: str) -> None:
+        """Call a method of the parts that have it."""
         for part in self.parts:
-            begin = getattr(part, "begin", None)
-            if begin is not None:
-                begin(p)
+            if hasattr(part, method):
+                getattr(part, method)(self.program)
 
     def _drift_with(self, u: str, h: str) -> None:
         p = self.program
