@@ -6,6 +6,8 @@ shape, spanned by ``s01`` and ``s02``. Two bond vectors describe the triangle
 3-by-3 solve and four updates.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
@@ -56,7 +58,7 @@ def _tabulate(table, a, b, c):
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def _positions(
+def triangle_positions(
     points,
     references,
     velocities,
@@ -193,7 +195,7 @@ def _positions(
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def _tangents(points, vectors, atoms, slots, rates, inv_mass, lattice, kind, multipliers, undo):
+def triangle_tangents(points, vectors, atoms, slots, rates, inv_mass, lattice, kind, multipliers, undo):
     driven = rates.shape[0] > 0
     report = multipliers.shape[0] > 0
     w0, w1, w2 = inv_mass[0], inv_mass[1], inv_mass[2]
@@ -317,6 +319,16 @@ class RigidTriangles:
             self._undo = aligned(18 * len(self._slots))
         return self._undo
 
+    def tables(self) -> tuple[NDArray[Any], ...]:
+        """What kernels that call `triangle_positions` and `triangle_tangents` need.
+
+        Returns
+        -------
+        tuple of ndarray
+            Atoms, slots, lengths of shape (n, 3), inverse masses and room to undo, as these kernels take them.
+        """
+        return self._atoms, self._slots, self.lengths.reshape(-1, 3), self._inv_mass, self._undo_room()
+
     def positions(
         self,
         x_new: NDArray[np.float64],
@@ -348,7 +360,7 @@ class RigidTriangles:
             Nothing has changed where it is not converged.
         """
         cell, kind = lattice_kind(lattice)
-        ok, residual, iterations, row = _positions(
+        ok, residual, iterations, row = triangle_positions(
             x_new,
             x_ref,
             NO_POINTS if velocities is None else velocities,
@@ -384,7 +396,7 @@ class RigidTriangles:
             As in `positions`.
         """
         cell, kind = lattice_kind(lattice)
-        ok, residual, iterations, row = _tangents(
+        ok, residual, iterations, row = triangle_tangents(
             x,
             y,
             self._atoms,

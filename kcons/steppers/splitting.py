@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,8 +54,8 @@ class Splitting:
         self.flight = tuple(flight)
         self.exact_flight = exact_flight
         self.kick_first = len(self.kicks) > len(self.drifts)
-        self._pieces = _pieces(self.drifts, self.flight)
-        self._whole_pieces = _pieces(self.drifts, (1.0,))
+        self._stages = _stages(self.drifts, self.flight)
+        self._whole_stages = _stages(self.drifts, (1.0,))
 
     @property
     def force_evaluations(self) -> int:
@@ -86,15 +87,15 @@ class Splitting:
             return still
         start = system.with_forces(state) if self.kick_first else state
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            step = _Step(system, start, dt, len(self._pieces) * len(self.flight) > 1, self.exact_flight)
-            pieces = self._whole_pieces if step.exact else self._pieces
+            step = _Step(system, start, dt, len(self.drifts) * len(self.flight) > 1, self.exact_flight)
+            stages = self._whole_stages if step.exact else self._stages
             try:
                 if system.velocity_dependent:
-                    step.with_friction(self.drifts, pieces)
+                    step.with_friction(self.drifts, stages)
                 elif self.kick_first:
-                    step.kick_first(self.kicks, pieces)
+                    step.kick_first(self.kicks, stages)
                 else:
-                    step.drift_first(self.kicks, pieces)
+                    step.drift_first(self.kicks, stages)
             except ConvergenceError as error:
                 raise explained(error, system, state, dt, step.number) from error
             except (InputError, NonFiniteError):
@@ -103,16 +104,25 @@ class Splitting:
             return step.end()
 
 
-#: One RATTLE drift: its fraction of the step, and the fraction of the step at which it ends.
-Piece = tuple[float, float]
+class Stage(NamedTuple):
+    """A drift, as the RATTLE drifts that it consists of."""
+
+    #: Fractions of the step.
+    fractions: tuple[float, ...]
+    #: The same, for kernels.
+    array: FloatArray
+    #: Fractions of the step at which they end.
+    ends: tuple[float, ...]
 
 
-def _pieces(drifts: Sequence[float], flight: Sequence[float]) -> list[list[Piece]]:
-    """For each drift, the RATTLE drifts it consists of."""
+def _stages(drifts: Sequence[float], flight: Sequence[float]) -> list[Stage]:
     flat = [a * w for a in drifts for w in flight]
     nodes = [math.fsum(flat[:k]) for k in range(1, len(flat))] + [1.0]
-    flown = list(zip(flat, nodes, strict=True))
-    return [flown[k : k + len(flight)] for k in range(0, len(flat), len(flight))]
+    n = len(flight)
+    return [
+        Stage(tuple(flat[k : k + n]), np.array(flat[k : k + n]), tuple(nodes[k : k + n]))
+        for k in range(0, len(flat), n)
+    ]
 
 
 class _Step:
@@ -125,6 +135,7 @@ class _Step:
         circles = system.great_circles if exact_flight else None
         self.exact = circles is not None
         self.flight: Drift = system.drift if circles is None else circles
+        self.flights = None if self.exact else system.flights
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
         x = start.positions
@@ -138,37 +149,38 @@ class _Step:
 
     # -- stages ---------------------------------------------------------------------------------
 
-    def kick_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
+    def kick_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """K D K ... D K."""
         self.kick(kicks[0])
-        for fraction, stage in zip(kicks[1:-1], pieces[:-1], strict=True):
+        for fraction, stage in zip(kicks[1:-1], stages[:-1], strict=True):
             self.drift(stage)
             self.evaluate()
             self.kick(fraction)
-        self.drift(pieces[-1])
+        self.drift(stages[-1])
         self.evaluate(keep=True)
         self.kick(kicks[-1])
         self.project()
 
-    def drift_first(self, kicks: Sequence[float], pieces: list[list[Piece]]) -> None:
+    def drift_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """D K D ... K D; the forces of the last kick are not those of the end."""
-        self.drift(pieces[0])
-        for fraction, stage in zip(kicks, pieces[1:], strict=True):
+        self.drift(stages[0])
+        for fraction, stage in zip(kicks, stages[1:], strict=True):
             self.evaluate()
             self.kick(fraction)
             self.drift(stage)
         self.forces = None
         self.project()
 
-    def with_friction(self, weights: Sequence[float], pieces: list[list[Piece]]) -> None:
+    def with_friction(self, weights: Sequence[float], stages: list[Stage]) -> None:
         """Forces depend on v: half a kick with f(x0, v0), and half a one with f(x1, v1), solved for v1.
 
         Step and adjoint in one: symmetric, so that compositions keep their order.
         """
-        for weight, stage in zip(weights, pieces, strict=True):
+        for weight, stage in zip(weights, stages, strict=True):
             self.kick(0.5 * weight)
             self.drift(stage)
             self.settle(0.5 * weight)
+        check_finite(self.point.v, "velocity", self.number)
 
     def kick(self, fraction: float) -> None:
         if self.system.force is None:
@@ -176,22 +188,35 @@ class _Step:
         assert self.forces is not None
         self.point.kick(fraction * self.dt, self.forces)
 
-    def drift(self, stage: list[Piece]) -> None:
+    def drift(self, stage: Stage) -> None:
         start, dt, point = self.start, self.dt, self.point
-        first, spare = point.x, None
-        for fraction, end in stage:
-            # Positions that the force function has seen are never written to again.
-            before, self.out = point.x, np.empty_like(first) if spare is None else spare
-            then = self.now
-            self.now = self.time if end == 1.0 else start.time + (end * dt + start.time_remainder)
-            self.flight.move(point, self.out, then, self.now, fraction * dt)
-            spare = None if before is first else before
+        # Positions that the force function has seen are never written to again.
+        self.out = out = np.empty_like(point.x)
+        left = len(stage.ends)
+        if self.flights is not None:
+            self.now = self.ended(stage.ends[-1])
+            bad = self.flights.stage(point, stage.array * dt, out, self.now)
+            if bad:
+                self.refuse(bad)
+            return
+        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
+            then, self.now = self.now, self.ended(end)
+            left -= 1
+            self.flight.move(point, point.work[2] if left % 2 else out, then, self.now, fraction * dt)
+
+    def ended(self, end: float) -> float:
+        """The time at the fraction `end` of the step."""
+        return self.time if end == 1.0 else self.start.time + (end * self.dt + self.start.time_remainder)
 
     def evaluate(self, *, keep: bool = False) -> None:
         """Forces where the step is now; to be kept, or for the next kick only."""
         if self.system.force is None:
             return
-        self.forces = self.system.forces(self.positions, self.point.v, self.now, self.number, copy=keep)
+        point = self.point
+        # Compiled stages look for NaN themselves.
+        self.forces = self.system.forces(
+            self.positions, point.v, self.now, self.number, copy=keep, finite=self.flights is None
+        )
 
     def settle(self, fraction: float) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""
@@ -220,9 +245,15 @@ class _Step:
 
     def project(self) -> None:
         point = self.point
+        if self.flights is not None:
+            bad = self.flights.end(point, self.now)
+            if bad:
+                self.refuse(bad)
+            return
         point.land()
         check_finite(point.x, "position", self.number)
         self.system.motion.project_velocities(point.x, point.v, time=self.now, out=point.v)
+        check_finite(point.v, "velocity", self.number)
 
     # -- the end --------------------------------------------------------------------------------
 
@@ -233,14 +264,21 @@ class _Step:
 
     def end(self) -> State:
         x, v = self.point.x, self.point.v
-        check_finite(v, "velocity", self.number)
         positions, remainder = x, None
         if self.shift is not None:
             positions = x + self.shift
             remainder = x - (positions - self.shift)
         elif self.system.is_far(x):  # by now: from here on relative to one atom
-            remainder = np.zeros_like(x) if self.point.x_low is None else self.point.x_low
+            remainder = np.zeros_like(x) if self.point.x_low is None else self.point.x_low.copy()
         return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
+
+    def refuse(self, item: str) -> None:
+        """Raise for what a compiled stage found."""
+        point = self.point
+        if item == "force":
+            assert self.forces is not None
+            check_finite(self.forces, item, self.number)
+        check_finite(point.x if item == "position" else point.v, item, self.number)
 
     def refuse_overflow(self) -> None:
         """Name overflow as what it is, where the engine met it first."""

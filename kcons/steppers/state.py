@@ -20,6 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
+from kcons.steppers.flights import Flights, all_finite
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -260,10 +261,13 @@ class System:
             v = tangent
         return State(x, v, time, remainder=remainder)
 
-    def forces(self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True) -> FloatArray:
+    def forces(
+        self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True, finite: bool = True
+    ) -> FloatArray:
         """Applied forces, checked, shape (n_atoms, 3); `step` is named if they are not finite.
 
-        Without `copy` they are good until the next evaluation only: calculators like to reuse their array.
+        Without `copy` they are good until the next evaluation only: calculators like to reuse their array. Without
+        `finite` the caller looks for NaN and infinity.
         """
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
@@ -279,7 +283,8 @@ class System:
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
                 item="forces",
             )
-        check_finite(f, "force", step)
+        if finite:
+            check_finite(f, "force", step)
         return f
 
     def with_forces(self, state: State) -> State:
@@ -310,6 +315,11 @@ class System:
     def drift(self) -> Drift:
         """Constrained flight by one RATTLE step."""
         return rattle_drift(self.motion, self.inverse_masses)
+
+    @cached_property
+    def flights(self) -> Flights | None:
+        """Compiled stages for the same flight; None where `drift` does it piece by piece."""
+        return Flights.of(self.motion)
 
     @cached_property
     def great_circles(self) -> GreatCircles | None:
@@ -355,7 +365,7 @@ def _fixed_atoms(motion: Motion) -> IntArray:
 
 def check_finite(values: FloatArray, item: str, step: int) -> None:
     """Raise `NonFiniteError` unless every number is finite."""
-    if _all_finite(values):
+    if all_finite(values):
         return
     atom = int(np.argmax(~np.isfinite(values).all(axis=1)))
     raise NonFiniteError(
@@ -376,13 +386,3 @@ def _beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
             if not abs(x[i, k] - x[anchor, k]) < far:
                 return False
     return True
-
-
-@numba.njit(cache=True, nogil=True)
-def _all_finite(values):  # type: ignore[no-untyped-def]
-    # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
-    bits = values.ravel().view(np.int64)
-    worst = np.int64(0)
-    for i in range(bits.size):
-        worst = max(worst, bits[i] & 0x7FF0000000000000)
-    return worst != 0x7FF0000000000000

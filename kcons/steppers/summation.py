@@ -12,6 +12,9 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 
+#: Stands for the work arrays where a step adds up nothing.
+_NO_WORK = np.empty((0, 0, 3))
+
 
 class Point:
     """Where a step is: position x + x_low, velocity v + push; arrays of shape (n_atoms, 3).
@@ -22,17 +25,23 @@ class Point:
     A kick is kept until the next drift, which takes it in the same pass over the arrays.
     """
 
-    __slots__ = ("_force", "_fresh", "_kick", "push", "v", "weights", "x", "x_low")
+    __slots__ = ("_force", "_kick", "fresh", "push", "v", "weights", "work", "x", "x_low")
 
     def __init__(self, x: FloatArray, v: FloatArray, weights: FloatArray, *, exact: bool) -> None:
         self.x = x
         #: Velocities as they were given, not yet a copy, until the first drift.
         self.v = v
+        #: Whether that is so; `x_low` and `push` then hold nothing yet.
+        self.fresh = True
         #: 1/m for each coordinate.
         self.weights = weights
-        self.x_low: FloatArray | None = np.empty_like(x) if exact else None
-        self.push = np.empty_like(x) if exact else v
-        self._fresh = True
+        self.x_low: FloatArray | None
+        #: `x_low`, `push` and room for positions that nobody sees, shape (3, n_atoms, 3); else (0, 0, 3).
+        if exact:
+            self.work = np.empty((3, *x.shape))
+            self.x_low, self.push = self.work[0], self.work[1]
+        else:
+            self.work, self.x_low, self.push = _NO_WORK, None, v
         self._kick = 0.0
         self._force = weights  # any finite numbers: they are multiplied by 0
 
@@ -42,46 +51,50 @@ class Point:
             self.land()
         self._kick, self._force = h, f
 
-    def fly(self, h: float, out: FloatArray) -> FloatArray:
-        """Put x + h v into `out`; returns the array that takes changes of the velocity on the way."""
+    def take_kick(self) -> tuple[float, FloatArray]:
+        """The kick that has not been done yet, for whoever does it now."""
         kick, force = self._kick, self._force
         self._kick, self._force = 0.0, self.weights
+        return kick, force
+
+    def fly(self, h: float, out: FloatArray) -> FloatArray:
+        """Put x + h v into `out`; returns the array that takes changes of the velocity on the way."""
+        kick, force = self.take_kick()
         if self.x_low is None:
             before = self.v
-            if self._fresh:
+            if self.fresh:
                 self.v = self.push = np.empty_like(before)
-            _fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
-        elif self._fresh:
+            fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
+        elif self.fresh:
             before, self.v = self.v, np.empty_like(self.v)
-            _fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
+            fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
         else:
-            _fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
-        self._fresh = False
+            fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
+        self.fresh = False
         return self.push
 
     def remainder(self, atoms: IntArray) -> FloatArray:
         """What rounding has taken from the positions of some atoms so far, shape (len(atoms), 3)."""
-        if self._fresh or self.x_low is None:
+        if self.fresh or self.x_low is None:
             return np.zeros((len(atoms), 3))
         return self.x_low[atoms]
 
     def land(self) -> None:
         """Put the whole velocity into `v`, and forget what rounding takes."""
-        kick, force = self._kick, self._force
-        self._kick, self._force = 0.0, self.weights
-        if self._fresh:
+        kick, force = self.take_kick()
+        if self.fresh:
             self.v = self.v.copy()
             if self.x_low is None:
                 self.push = self.v
             else:
                 self.x_low.fill(0.0)
                 self.push.fill(0.0)
-            self._fresh = False
+            self.fresh = False
         if self.x_low is None:
             if kick:
-                _kick(self.v, kick, force, self.weights)
+                add_kick(self.v, kick, force, self.weights)
         else:
-            _land(self.v, self.push, kick, force, self.weights)
+            land(self.v, self.push, kick, force, self.weights)
 
     def restart(self, v: FloatArray) -> None:
         """Go on with other velocities, after `land`."""
@@ -92,14 +105,14 @@ class Point:
 
 
 @numba.njit(cache=True, nogil=True)
-def _kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
+def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
     b, g, w = v.ravel(), f.ravel(), weights.ravel()
     for i in range(b.size):
         b[i] += kick * w[i] * g[i]
 
 
 @numba.njit(cache=True, nogil=True)
-def _land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
+def land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
     b, p, g, w = v.ravel(), push.ravel(), f.ravel(), weights.ravel()
     for i in range(b.size):
         b[i] += p[i] + kick * w[i] * g[i]
@@ -107,7 +120,7 @@ def _land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
+def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """Take the kick and `push` into the velocity, then out = x + h v; sums by Dekker's addition.
 
     It is exact where the change is the smaller number. Where a coordinate crosses 0 it is not; the error is then one
@@ -128,7 +141,7 @@ def _fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
+def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """The same from a start without remainders; `x_low`, `v` and `push` are only written to."""
     a, a_low, b0, b, p, c = x.ravel(), x_low.ravel(), v0.ravel(), v.ravel(), push.ravel(), out.ravel()
     g, w = f.ravel(), weights.ravel()
@@ -145,7 +158,7 @@ def _fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
+def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
     a, b0, b, c, g, w = x.ravel(), v0.ravel(), v.ravel(), out.ravel(), f.ravel(), weights.ravel()
     for i in range(a.size):
         b[i] = b0[i] + kick * w[i] * g[i]

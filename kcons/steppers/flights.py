@@ -1,0 +1,276 @@
+"""Whole stages in one compiled call, where rigid triangles at rest are all that is held.
+
+A call from Python to a kernel costs as much as the kernel's work on ten molecules of water or more. A stage - a kick,
+then flights that are each brought back onto the constraints - is therefore one call here, and so is the end of a step.
+The kernels are those of `Point` and of the engine, with all of their residual checks; what they cannot solve is left
+as it was for the engine, which has more means and names the row.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.motion import MANY_ITERATIONS, Motion
+from kcons.solvers.groups import lattice_kind
+from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tangents
+from kcons.steppers.summation import Point, add_kick, fly, fly_first, fly_once, land
+
+#: What a kernel reports.
+_DONE, _FORCE, _POSITION, _VELOCITY, _ENGINE = range(5)
+_WHAT = ("", "force", "position", "velocity")
+
+
+class Flights:
+    """Stages of a step for one engine.
+
+    Parameters
+    ----------
+    motion : Motion
+    triangles : RigidTriangles
+        The solver of all its rows.
+    """
+
+    def __init__(self, motion: Motion, triangles: RigidTriangles) -> None:
+        self.motion = motion
+        self._tables = triangles.tables()
+
+    @classmethod
+    def of(cls, motion: Motion) -> Flights | None:
+        """For the rows of `motion`, or None if they hold anything else."""
+        triangles = motion.triangles
+        return None if triangles is None else cls(motion, triangles)
+
+    def stage(self, point: Point, intervals: FloatArray, out: FloatArray, time: float) -> str:
+        """The kick that `point` has not taken yet, then flights of `intervals`; the last ends in `out`, now point.x.
+
+        Parameters
+        ----------
+        point : Point
+        intervals : ndarray, shape (n_flights,)
+            One only where `point` adds up nothing.
+        out : ndarray, shape (n_atoms, 3)
+        time : float
+            For messages: nothing that is held here moves.
+
+        Returns
+        -------
+        str
+            Empty, or "force" where that of the kick is not finite.
+
+        Raises
+        ------
+        ConvergenceError
+            As a flight by the engine.
+        """
+        kick, force = point.take_kick()
+        x, v, fresh = point.x, point.v, point.fresh
+        if fresh:
+            point.v = np.empty_like(v)
+            if point.x_low is None:
+                point.push = point.v
+            point.fresh = False
+        lattice, kind = lattice_kind(self.motion.lattice)
+        first = 0
+        while True:
+            status, first, iterations = _stage(
+                intervals, first, x, v, point.v, point.work, kick, force, point.weights, fresh, out,
+                lattice, kind, *self._tables,
+            )  # fmt: skip
+            if status == _DONE:
+                self.motion.took(iterations)
+                point.x = out
+                return ""
+            if status != _ENGINE:
+                return _WHAT[status]
+            ends, starts = out, x
+            if len(intervals) > 1:
+                spare = point.work[2]
+                ends, starts = (out, spare) if (len(intervals) - first) % 2 else (spare, out)
+            self.motion.project_positions(
+                ends, starts if first else x, time=time, velocities=point.push, dt=float(intervals[first]), out=ends
+            )
+            first, kick, force, v, fresh = first + 1, 0.0, point.weights, point.v, False
+
+    def end(self, point: Point, time: float) -> str:
+        """The kick that `point` has not taken yet, and the velocities projected, after a stage.
+
+        Returns
+        -------
+        str
+            Empty, or what is not finite: "force", "position" or "velocity".
+
+        Raises
+        ------
+        ConvergenceError
+            As `Motion.project_velocities`.
+        """
+        kick, force = point.take_kick()
+        lattice, kind = lattice_kind(self.motion.lattice)
+        status = _end(
+            point.x, point.v, point.work, kick, force, point.weights, lattice, kind, *self._tables
+        )  # fmt: skip
+        if status == _ENGINE:
+            self.motion.project_velocities(point.x, point.v, time=time, out=point.v)
+            return ""
+        return _WHAT[status]
+
+
+@numba.njit(cache=True, nogil=True)
+def all_finite(values):  # type: ignore[no-untyped-def]
+    """Whether no number is NaN or infinite."""
+    # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
+    bits = values.ravel().view(np.int64)
+    worst = np.int64(0)
+    for i in range(bits.size):
+        worst = max(worst, bits[i] & 0x7FF0000000000000)
+    return worst != 0x7FF0000000000000
+
+
+@numba.njit(cache=True, nogil=True)
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, lattice, kind, atoms, slots, lengths, inv_mass, undo):  # type: ignore[no-untyped-def]
+    """Fly into `out` and land there; iterations, -1 if it did not land."""
+    if work.shape[0] == 0:
+        push = v
+        fly_once(x, v0, kick, force, weights, h, v, out)
+    else:
+        push = work[1]
+        if fresh:
+            fly_first(x, work[0], v0, v, push, kick, force, weights, h, out)
+        else:
+            fly(x, work[0], v, push, kick, force, weights, h, out)
+    landed, _, iterations, _ = triangle_positions(
+        out, x, push, 1.0 / h, atoms, slots, lengths, inv_mass, lattice, kind, push[:0], undo
+    )
+    return iterations if landed else -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _stage(
+    intervals,
+    first,
+    x,
+    v0,
+    v,
+    work,
+    kick,
+    force,
+    weights,
+    fresh,
+    out,
+    lattice,
+    kind,
+    atoms,
+    slots,
+    lengths,
+    inv_mass,
+    undo,
+):  # type: ignore[no-untyped-def]
+    """Flights from number `first` on; they end in `out` and in work[2] by turns, the last one in `out`."""
+    if not all_finite(force):
+        return _FORCE, first, 0
+    n, took = intervals.size, 0
+    for i in range(first, n):
+        h = intervals[i]
+        # Written out: the first start may be an array of another type (read-only).
+        if i == 0:
+            if n % 2:
+                took = _flight(
+                    x,
+                    v0,
+                    v,
+                    work,
+                    kick,
+                    force,
+                    weights,
+                    fresh,
+                    h,
+                    out,
+                    lattice,
+                    kind,
+                    atoms,
+                    slots,
+                    lengths,
+                    inv_mass,
+                    undo,
+                )
+            else:
+                took = _flight(
+                    x,
+                    v0,
+                    v,
+                    work,
+                    kick,
+                    force,
+                    weights,
+                    fresh,
+                    h,
+                    work[2],
+                    lattice,
+                    kind,
+                    atoms,
+                    slots,
+                    lengths,
+                    inv_mass,
+                    undo,
+                )
+        elif (n - i) % 2:
+            took = _flight(
+                work[2],
+                v,
+                v,
+                work,
+                0.0,
+                weights,
+                weights,
+                False,
+                h,
+                out,
+                lattice,
+                kind,
+                atoms,
+                slots,
+                lengths,
+                inv_mass,
+                undo,
+            )
+        else:
+            took = _flight(
+                out,
+                v,
+                v,
+                work,
+                0.0,
+                weights,
+                weights,
+                False,
+                h,
+                work[2],
+                lattice,
+                kind,
+                atoms,
+                slots,
+                lengths,
+                inv_mass,
+                undo,
+            )
+        if not 0 <= took <= MANY_ITERATIONS:
+            return _ENGINE, i, took
+    return _DONE, n, took
+
+
+@numba.njit(cache=True, nogil=True)
+def _end(x, v, work, kick, force, weights, lattice, kind, atoms, slots, lengths, inv_mass, undo):  # type: ignore[no-untyped-def]
+    if not all_finite(force):
+        return _FORCE
+    if work.shape[0] == 0:
+        add_kick(v, kick, force, weights)
+    else:
+        land(v, work[1], kick, force, weights)
+    if not all_finite(x):
+        return _POSITION
+    converged, _, _, _ = triangle_tangents(x, v, atoms, slots, v[:0], inv_mass, lattice, kind, v[:0], undo)
+    if not converged:
+        return _ENGINE
+    return _DONE if all_finite(v) else _VELOCITY
