@@ -8,6 +8,7 @@ from contextlib import suppress
 from operator import is_
 from typing import Any, Literal
 
+import numba
 import numpy as np
 from ase import Atoms, units
 from ase.md.md import MolecularDynamics
@@ -24,6 +25,8 @@ from kcons.steppers import Rattle, State, Stepper, System
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 _FAR = 128.0
+
+_FLOAT = np.dtype(np.float64)
 
 
 class ConstrainedDynamics(MolecularDynamics):
@@ -159,8 +162,14 @@ class ConstrainedDynamics(MolecularDynamics):
             self._put(state.positions, self._momenta)
             self._name_step(error, self.nsteps + 1)
             raise
-        self._momenta = after.velocities * self._weights[0]
-        self._put(after.positions, self._momenta)
+        arrays = self.atoms.arrays
+        x, p = arrays["positions"], arrays["momenta"]
+        self._momenta = momenta = np.empty_like(after.velocities)
+        if _plain(x) and _plain(p):
+            write_back(after.positions, after.velocities, self._weights[0], x, p, momenta)
+        else:
+            np.multiply(after.velocities, self._weights[0], out=momenta)
+            self._put(after.positions, momenta)
         self._state, self.time, self._resumed = after, after.time, None
 
     def _name_step(self, error: BaseException, number: int) -> None:
@@ -190,10 +199,19 @@ class ConstrainedDynamics(MolecularDynamics):
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
         cell = atoms.cell.array.tobytes() + atoms.pbc.tobytes()
-        same = last is not None and cell == self._cell and bool((last.positions == x).all())
-        if last is not None and same and (self._momenta == p).all():
+        same = unmoved = last is not None and cell == self._cell
+        if last is not None and same:
             # Velocities always come from the momenta, as after a restart from a file.
-            v = p / self._weights[1] if self._resumed is None else self._resumed
+            v = np.empty_like(last.velocities)
+            if _plain(x) and _plain(p):
+                unmoved = read_off(x, p, last.positions, self._momenta, self._weights[1], v)
+            else:
+                np.divide(p, self._weights[1], out=v)
+                unmoved = bool((last.positions == x).all() and (self._momenta == p).all())
+            same = unmoved or bool((last.positions == x).all())
+        if last is not None and unmoved:
+            if self._resumed is not None:
+                v = self._resumed
             remainder = last.time_remainder if last.time == self.time else 0.0
             keeps = (last.remainder, remainder, last.thermostat)
             return State(last.positions, v, self.time, last.forces, self.nsteps, *keeps)
@@ -283,6 +301,32 @@ class ConstrainedDynamics(MolecularDynamics):
             return applied_forces(self.atoms)
         forces: ArrayLike = self.atoms.get_forces(apply_constraint=False)
         return forces
+
+
+def _plain(values: Any) -> bool:
+    return values.dtype is _FLOAT and values.flags.c_contiguous
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def read_off(x, p, last_x, last_p, divisors, v):  # type: ignore[no-untyped-def]
+    """Put p/divisors into `v`; whether `x` and `p` are still the last ones."""
+    a, b, a0, b0, d, c = x.ravel(), p.ravel(), last_x.ravel(), last_p.ravel(), divisors.ravel(), v.ravel()
+    other = 0
+    for i in range(a.size):
+        c[i] = b[i] / d[i]
+        other |= (a[i] != a0[i]) | (b[i] != b0[i])
+    return other == 0
+
+
+@numba.njit(cache=True, nogil=True)
+def write_back(positions, velocities, masses, x, p, momenta):  # type: ignore[no-untyped-def]
+    """Put the state into the arrays of the atoms, and a copy of the momenta into `momenta`."""
+    a, b, m, c, d, e = positions.ravel(), velocities.ravel(), masses.ravel(), x.ravel(), p.ravel(), momenta.ravel()
+    for i in range(a.size):
+        momentum = m[i] * b[i]
+        c[i] = a[i]
+        d[i] = momentum
+        e[i] = momentum
 
 
 def _check_timestep(timestep: float) -> None:

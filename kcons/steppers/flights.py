@@ -8,6 +8,8 @@ as it was for the engine, which has more means and names the row.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -42,17 +44,35 @@ class Flights:
         triangles = motion.triangles
         return None if triangles is None else cls(motion, triangles)
 
-    def stage(self, point: Point, intervals: FloatArray, out: FloatArray, time: float) -> str:
-        """The kick that `point` has not taken yet, then flights of `intervals`; the last ends in `out`, now point.x.
+    def tables(self) -> tuple[Any, ...]:
+        """What the kernels need to know, for one step: the cell as it is now, and the solver's tables."""
+        return (*lattice_kind(self.motion.lattice), *self._tables)
+
+    def stage(
+        self,
+        point: Point,
+        kick: float,
+        force: FloatArray,
+        intervals: FloatArray,
+        out: FloatArray,
+        time: float,
+        tables: tuple[Any, ...],
+    ) -> str:
+        """A kick, then flights of `intervals`; the last ends in `out`, which becomes point.x.
 
         Parameters
         ----------
         point : Point
+            Without a kick that it has not taken yet.
+        kick, force
+            As for `Point.kick`.
         intervals : ndarray, shape (n_flights,)
             One only where `point` adds up nothing.
         out : ndarray, shape (n_atoms, 3)
         time : float
             For messages: nothing that is held here moves.
+        tables : tuple
+            From `tables`, in this step.
 
         Returns
         -------
@@ -64,37 +84,34 @@ class Flights:
         ConvergenceError
             As a flight by the engine.
         """
-        kick, force = point.take_kick()
         x, v, fresh = point.x, point.v, point.fresh
         if fresh:
             point.v = np.empty_like(v)
             if point.x_low is None:
                 point.push = point.v
             point.fresh = False
-        lattice, kind = lattice_kind(self.motion.lattice)
-        first = 0
-        while True:
-            status, first, iterations = _stage(
-                intervals, first, x, v, point.v, point.work, kick, force, point.weights, fresh, out,
-                lattice, kind, *self._tables,
-            )  # fmt: skip
-            if status == _DONE:
-                self.motion.took(iterations)
-                point.x = out
-                return ""
-            if status != _ENGINE:
-                return _WHAT[status]
+        status, at, iterations = _stage(
+            intervals, 0, x, v, point.v, point.work, kick, force, point.weights, fresh, out, *tables
+        )
+        while status == _ENGINE:
             ends, starts = out, x
             if len(intervals) > 1:
                 spare = point.work[2]
-                ends, starts = (out, spare) if (len(intervals) - first) % 2 else (spare, out)
-            self.motion.project_positions(
-                ends, starts if first else x, time=time, velocities=point.push, dt=float(intervals[first]), out=ends
+                ends, starts = (out, spare) if (len(intervals) - at) % 2 else (spare, out)
+            h = float(intervals[at])
+            self.motion.project_positions(ends, starts if at else x, time=time, velocities=point.push, dt=h, out=ends)
+            status, at, iterations = _stage(
+                intervals, at + 1, x, v, point.v, point.work, 0.0, point.weights, point.weights, False, out, *tables
             )
-            first, kick, force, v, fresh = first + 1, 0.0, point.weights, point.v, False
+        if status == _DONE:
+            if iterations >= 0:
+                self.motion.took(iterations)
+            point.x = out
+            return ""
+        return _WHAT[status]
 
-    def end(self, point: Point, time: float) -> str:
-        """The kick that `point` has not taken yet, and the velocities projected, after a stage.
+    def end(self, point: Point, kick: float, force: FloatArray, time: float, tables: tuple[Any, ...]) -> str:
+        """A kick, and the velocities projected, after a stage.
 
         Returns
         -------
@@ -106,11 +123,7 @@ class Flights:
         ConvergenceError
             As `Motion.project_velocities`.
         """
-        kick, force = point.take_kick()
-        lattice, kind = lattice_kind(self.motion.lattice)
-        status = _end(
-            point.x, point.v, point.work, kick, force, point.weights, lattice, kind, *self._tables
-        )  # fmt: skip
+        status = _end(point.x, point.v, point.work, kick, force, point.weights, *tables)
         if status == _ENGINE:
             self.motion.project_velocities(point.x, point.v, time=time, out=point.v)
             return ""
@@ -170,7 +183,7 @@ def _stage(
     """Flights from number `first` on; they end in `out` and in work[2] by turns, the last one in `out`."""
     if not all_finite(force):
         return _FORCE, first, 0
-    n, took = intervals.size, 0
+    n, took = intervals.size, -1
     for i in range(first, n):
         h = intervals[i]
         # Written out: the first start may be an array of another type (read-only).

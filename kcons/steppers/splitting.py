@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.steppers.drifts import Drift
+from kcons.steppers.flights import Flights
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
+_NO_INTERVALS = np.empty((0, 0))
 
 
 class Splitting:
@@ -56,6 +58,7 @@ class Splitting:
         self.kick_first = len(self.kicks) > len(self.drifts)
         self._stages = _stages(self.drifts, self.flight)
         self._whole_stages = _stages(self.drifts, (1.0,))
+        self._fractions = np.array([stage.fractions for stage in self._stages])
 
     @property
     def force_evaluations(self) -> int:
@@ -89,6 +92,9 @@ class Splitting:
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
             step = _Step(system, start, dt, len(self.drifts) * len(self.flight) > 1, self.exact_flight)
             stages = self._whole_stages if step.exact else self._stages
+            if step.flights is not None:
+                step.intervals = self._fractions * dt
+                step.tables = step.flights.tables()
             try:
                 if system.velocity_dependent:
                     step.with_friction(self.drifts, stages)
@@ -107,10 +113,9 @@ class Splitting:
 class Stage(NamedTuple):
     """A drift, as the RATTLE drifts that it consists of."""
 
+    number: int
     #: Fractions of the step.
     fractions: tuple[float, ...]
-    #: The same, for kernels.
-    array: FloatArray
     #: Fractions of the step at which they end.
     ends: tuple[float, ...]
 
@@ -119,10 +124,7 @@ def _stages(drifts: Sequence[float], flight: Sequence[float]) -> list[Stage]:
     flat = [a * w for a in drifts for w in flight]
     nodes = [math.fsum(flat[:k]) for k in range(1, len(flat))] + [1.0]
     n = len(flight)
-    return [
-        Stage(tuple(flat[k : k + n]), np.array(flat[k : k + n]), tuple(nodes[k : k + n]))
-        for k in range(0, len(flat), n)
-    ]
+    return [Stage(k // n, tuple(flat[k : k + n]), tuple(nodes[k : k + n])) for k in range(0, len(flat), n)]
 
 
 class _Step:
@@ -135,7 +137,10 @@ class _Step:
         circles = system.great_circles if exact_flight else None
         self.exact = circles is not None
         self.flight: Drift = system.drift if circles is None else circles
+        #: Where stages are compiled: the lengths of their flights, and what the kernels need.
         self.flights = None if self.exact else system.flights
+        self.intervals: FloatArray = _NO_INTERVALS
+        self.tables: tuple[Any, ...] = ()
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
         x = start.positions
@@ -151,6 +156,9 @@ class _Step:
 
     def kick_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """K D K ... D K."""
+        if self.flights is not None:
+            self.compiled_kick_first(kicks, stages, self.flights)
+            return
         self.kick(kicks[0])
         for fraction, stage in zip(kicks[1:-1], stages[:-1], strict=True):
             self.drift(stage)
@@ -160,6 +168,28 @@ class _Step:
         self.evaluate(keep=True)
         self.kick(kicks[-1])
         self.project()
+
+    def compiled_kick_first(self, kicks: Sequence[float], stages: list[Stage], flights: Flights) -> None:
+        """The same in few calls, each of which costs as much as its work on a few molecules."""
+        system, start, point, dt, shift, tables = self.system, self.start, self.point, self.dt, self.shift, self.tables
+        driven = system.force is not None
+        forces = self.forces if self.forces is not None and driven else system.weights
+        x = point.x
+        left = len(stages)
+        for kick, stage, intervals in zip(kicks, stages, self.intervals, strict=False):
+            left -= 1
+            self.out = x = np.empty_like(x)
+            now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else self.time
+            bad = flights.stage(point, kick * dt if driven else 0.0, forces, intervals, x, now, tables)
+            if bad:
+                self.refuse(bad)
+            if driven:
+                seen = x if shift is None else x + shift
+                self.forces = forces = system.forces(seen, point.v, now, self.number, copy=not left, finite=False)
+        self.now = now
+        bad = flights.end(point, kicks[-1] * dt if driven else 0.0, forces, now, tables)
+        if bad:
+            self.refuse(bad)
 
     def drift_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """D K D ... K D; the forces of the last kick are not those of the end."""
@@ -189,16 +219,16 @@ class _Step:
         self.point.kick(fraction * self.dt, self.forces)
 
     def drift(self, stage: Stage) -> None:
-        start, dt, point = self.start, self.dt, self.point
+        dt, point = self.dt, self.point
         # Positions that the force function has seen are never written to again.
         self.out = out = np.empty_like(point.x)
-        left = len(stage.ends)
         if self.flights is not None:
-            self.now = self.ended(stage.ends[-1])
-            bad = self.flights.stage(point, stage.array * dt, out, self.now)
+            self.now = now = self.ended(stage.ends[-1])
+            bad = self.flights.stage(point, *point.take_kick(), self.intervals[stage.number], out, now, self.tables)
             if bad:
                 self.refuse(bad)
             return
+        left = len(stage.ends)
         for fraction, end in zip(stage.fractions, stage.ends, strict=True):
             then, self.now = self.now, self.ended(end)
             left -= 1
@@ -246,7 +276,7 @@ class _Step:
     def project(self) -> None:
         point = self.point
         if self.flights is not None:
-            bad = self.flights.end(point, self.now)
+            bad = self.flights.end(point, *point.take_kick(), self.now, self.tables)
             if bad:
                 self.refuse(bad)
             return

@@ -29,6 +29,8 @@ FAR = 8.0
 #: speed) that is still taken for rounding; the first step removes it.
 START_TOLERANCE = 1e-9
 
+_FLOAT = np.dtype(np.float64)
+
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -272,12 +274,10 @@ class System:
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
         raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
-        try:
-            f: FloatArray = (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"the force function returned no array of numbers at step {step}: {error}", item="forces"
-            ) from None
+        if not copy and type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.flags.c_contiguous:
+            f: FloatArray = raw
+        else:
+            f = self._force_array(raw, copy, step)
         if f.shape != (self.n_atoms, 3):
             raise InputError(
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
@@ -286,6 +286,15 @@ class System:
         if finite:
             check_finite(f, "force", step)
         return f
+
+    @staticmethod
+    def _force_array(raw: ArrayLike, copy: bool, step: int) -> FloatArray:
+        try:
+            return (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"the force function returned no array of numbers at step {step}: {error}", item="forces"
+            ) from None
 
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
