@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from operator import is_
 from typing import Any, Literal
 
@@ -103,7 +104,6 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
-        self._resumed: FloatArray | None = None  # velocities of a state that was given, until the first step
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
@@ -159,18 +159,22 @@ class ConstrainedDynamics(MolecularDynamics):
         try:
             after = self.stepper.step(system, state, self.dt)
         except BaseException as error:
-            self._put(state.positions, self._momenta)
+            atoms = self.atoms.arrays
+            atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
             self._name_step(error, self.nsteps + 1)
             raise
-        arrays = self.atoms.arrays
-        x, p = arrays["positions"], arrays["momenta"]
-        self._momenta = momenta = np.empty_like(after.velocities)
-        if _plain(x) and _plain(p):
-            write_back(after.positions, after.velocities, self._weights[0], x, p, momenta)
-        else:
-            np.multiply(after.velocities, self._weights[0], out=momenta)
-            self._put(after.positions, momenta)
-        self._state, self.time, self._resumed = after, after.time, None
+        self._momenta, v = self._put(after.positions, after.velocities)
+        self.time = after.time
+        self._state = State(
+            after.positions,
+            v,
+            after.time,
+            after.forces,
+            after.step,
+            after.remainder,
+            after.time_remainder,
+            after.thermostat,
+        )
 
     def _name_step(self, error: BaseException, number: int) -> None:
         if getattr(error, "step", None) is None:
@@ -188,10 +192,22 @@ class ConstrainedDynamics(MolecularDynamics):
                 self._name_step(error, self.nsteps)
                 raise
 
-    def _put(self, positions: FloatArray, momenta: FloatArray) -> None:
+    def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Give the atoms positions and momenta; returns the momenta, and the velocities that belong to them.
+
+        Velocities always come from the momenta, as after a restart from a file.
+        """
         arrays = self.atoms.arrays
-        arrays["positions"][...] = positions
-        arrays["momenta"][...] = momenta
+        x, p = arrays["positions"], arrays["momenta"]
+        masses, divisors = self._weights
+        momenta, v = np.empty_like(velocities), np.empty_like(velocities)
+        if _plain(x) and _plain(p):
+            write_back(positions, velocities, masses, divisors, x, p, momenta, v)
+        else:
+            np.multiply(velocities, masses, out=momenta)
+            np.divide(momenta, divisors, out=v)
+            x[...], p[...] = positions, momenta
+        return momenta, v
 
     def _start(self, system: System) -> State:
         """The state that the atoms are in; what it carries besides is kept as long as nobody moved them."""
@@ -201,23 +217,17 @@ class ConstrainedDynamics(MolecularDynamics):
         cell = atoms.cell.array.tobytes() + atoms.pbc.tobytes()
         same = unmoved = last is not None and cell == self._cell
         if last is not None and same:
-            # Velocities always come from the momenta, as after a restart from a file.
-            v = np.empty_like(last.velocities)
             if _plain(x) and _plain(p):
-                unmoved = read_off(x, p, last.positions, self._momenta, self._weights[1], v)
+                unmoved = equal_pairs(x, last.positions, p, self._momenta)
             else:
-                np.divide(p, self._weights[1], out=v)
                 unmoved = bool((last.positions == x).all() and (self._momenta == p).all())
-            same = unmoved or bool((last.positions == x).all())
-        if last is not None and unmoved:
-            if self._resumed is not None:
-                v = self._resumed
-            remainder = last.time_remainder if last.time == self.time else 0.0
-            keeps = (last.remainder, remainder, last.thermostat)
-            return State(last.positions, v, self.time, last.forces, self.nsteps, *keeps)
-        masses, divisors = self._weights
-        v = p / divisors
-        self._resumed = None
+            if unmoved:
+                if last.step == self.nsteps and last.time == self.time:
+                    return last
+                remainder = last.time_remainder if last.time == self.time else 0.0
+                return replace(last, time=self.time, step=self.nsteps, time_remainder=remainder)
+            same = bool((last.positions == x).all())
+        v = p / self._weights[1]
         require_on_surface(system.motion.constraint_set, x, self.time)
         state = system.initial_state(x, v, time=self.time, project=True)
         forces = last.forces if last is not None and same and not system.velocity_dependent else self._forces
@@ -225,14 +235,16 @@ class ConstrainedDynamics(MolecularDynamics):
         if not np.array_equal(state.positions, x):
             forces = None
         thermostat = self._thermostat_after_change(last)
-        state = State(
-            state.positions, state.velocities, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat
+        if np.array_equal(state.velocities, v):
+            self._momenta = p.copy()
+            x[...] = state.positions
+        else:
+            self._momenta, v = self._put(state.positions, state.velocities)
+        self._state = State(
+            state.positions, v, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat
         )
-        moved = not np.array_equal(state.velocities, v)
-        self._momenta = state.velocities * masses if moved else p.copy()
-        self._put(state.positions, self._momenta)
-        self._state, self._cell = state, cell
-        return state
+        self._cell = cell
+        return self._state
 
     def _resume(self, state: State) -> None:
         """Go on from `state` exactly; the atoms are changed only if it fits them."""
@@ -246,9 +258,8 @@ class ConstrainedDynamics(MolecularDynamics):
                 f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?", item="state"
             )
         self.time, self.nsteps = float(state.time), int(state.step)
-        self._momenta = v * self._weights[0]
-        self._put(x, self._momenta)
-        self._state, self._resumed = state, v
+        self._momenta, _ = self._put(x, v)
+        self._state = replace(state, positions=x, velocities=v, time=self.time, step=self.nsteps)
         self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
@@ -307,26 +318,27 @@ def _plain(values: Any) -> bool:
     return values.dtype is _FLOAT and values.flags.c_contiguous
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def read_off(x, p, last_x, last_p, divisors, v):  # type: ignore[no-untyped-def]
-    """Put p/divisors into `v`; whether `x` and `p` are still the last ones."""
-    a, b, a0, b0, d, c = x.ravel(), p.ravel(), last_x.ravel(), last_p.ravel(), divisors.ravel(), v.ravel()
+@numba.njit(cache=True, nogil=True)
+def equal_pairs(x, x0, p, p0):  # type: ignore[no-untyped-def]
+    """Whether x == x0 and p == p0."""
+    a, a0, b, b0 = x.ravel(), x0.ravel(), p.ravel(), p0.ravel()
     other = 0
     for i in range(a.size):
-        c[i] = b[i] / d[i]
         other |= (a[i] != a0[i]) | (b[i] != b0[i])
     return other == 0
 
 
-@numba.njit(cache=True, nogil=True)
-def write_back(positions, velocities, masses, x, p, momenta):  # type: ignore[no-untyped-def]
-    """Put the state into the arrays of the atoms, and a copy of the momenta into `momenta`."""
-    a, b, m, c, d, e = positions.ravel(), velocities.ravel(), masses.ravel(), x.ravel(), p.ravel(), momenta.ravel()
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def write_back(positions, velocities, masses, divisors, x, p, momenta, v):  # type: ignore[no-untyped-def]
+    """Put positions and momenta into `x` and `p`, the momenta also into `momenta`, and p/divisors into `v`."""
+    a, b, m, d = positions.ravel(), velocities.ravel(), masses.ravel(), divisors.ravel()
+    c, e, f, g = x.ravel(), p.ravel(), momenta.ravel(), v.ravel()
     for i in range(a.size):
         momentum = m[i] * b[i]
         c[i] = a[i]
-        d[i] = momentum
         e[i] = momentum
+        f[i] = momentum
+        g[i] = momentum / d[i]
 
 
 def _check_timestep(timestep: float) -> None:

@@ -52,16 +52,16 @@ class ThermostattedDynamics(ConstrainedDynamics):
         if not isinstance(self.stepper, Isokinetic | NoseHooverChain):
             return
         state = self._start(self._systems())
-        momenta = self.atoms.arrays["momenta"].copy()
+        arrays = self.atoms.arrays
+        momenta = arrays["momenta"].copy()
         try:
             begun = self.stepper.start(self._systems(), state)
         finally:  # forces were asked for elsewhere too
-            self._put(state.positions, momenta)
+            arrays["positions"][...], arrays["momenta"][...] = state.positions, momenta
         if begun.velocities is not state.velocities:
-            momenta, self._resumed = begun.velocities * self._weights[0], None
-            self._put(state.positions, momenta)
-        self._momenta = momenta
-        self._state = begun
+            momenta, v = self._put(state.positions, begun.velocities)
+            begun = replace(begun, velocities=v)
+        self._momenta, self._state = momenta, begun
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).

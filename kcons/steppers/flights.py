@@ -141,9 +141,13 @@ def all_finite(values):  # type: ignore[no-untyped-def]
     return worst != 0x7FF0000000000000
 
 
+# The tables are those of `Flights.tables`: lattice, kind, atoms, slots, lengths, inverse masses, room to undo.
+
+
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, lattice, kind, atoms, slots, lengths, inv_mass, undo):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, *tables):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land."""
+    lattice, kind, atoms, slots, lengths, inv_mass, undo = tables
     if work.shape[0] == 0:
         push = v
         fly_once(x, v0, kick, force, weights, h, v, out)
@@ -160,121 +164,31 @@ def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, lattice, kind, 
 
 
 @numba.njit(cache=True, nogil=True)
-def _stage(
-    intervals,
-    first,
-    x,
-    v0,
-    v,
-    work,
-    kick,
-    force,
-    weights,
-    fresh,
-    out,
-    lattice,
-    kind,
-    atoms,
-    slots,
-    lengths,
-    inv_mass,
-    undo,
-):  # type: ignore[no-untyped-def]
+def _stage(intervals, first, x, v0, v, work, kick, force, weights, fresh, out, *tables):  # type: ignore[no-untyped-def]
     """Flights from number `first` on; they end in `out` and in work[2] by turns, the last one in `out`."""
     if not all_finite(force):
         return _FORCE, first, 0
     n, took = intervals.size, -1
     for i in range(first, n):
-        h = intervals[i]
-        # Written out: the first start may be an array of another type (read-only).
-        if i == 0:
-            if n % 2:
-                took = _flight(
-                    x,
-                    v0,
-                    v,
-                    work,
-                    kick,
-                    force,
-                    weights,
-                    fresh,
-                    h,
-                    out,
-                    lattice,
-                    kind,
-                    atoms,
-                    slots,
-                    lengths,
-                    inv_mass,
-                    undo,
-                )
-            else:
-                took = _flight(
-                    x,
-                    v0,
-                    v,
-                    work,
-                    kick,
-                    force,
-                    weights,
-                    fresh,
-                    h,
-                    work[2],
-                    lattice,
-                    kind,
-                    atoms,
-                    slots,
-                    lengths,
-                    inv_mass,
-                    undo,
-                )
-        elif (n - i) % 2:
-            took = _flight(
-                work[2],
-                v,
-                v,
-                work,
-                0.0,
-                weights,
-                weights,
-                False,
-                h,
-                out,
-                lattice,
-                kind,
-                atoms,
-                slots,
-                lengths,
-                inv_mass,
-                undo,
-            )
+        h, last = intervals[i], (n - i) % 2 == 1
+        # Written out: where a step starts the array may be of another type (read-only).
+        if i == 0 and last:
+            took = _flight(x, v0, v, work, kick, force, weights, fresh, h, out, *tables)
+        elif i == 0:
+            took = _flight(x, v0, v, work, kick, force, weights, fresh, h, work[2], *tables)
+        elif last:
+            took = _flight(work[2], v, v, work, 0.0, weights, weights, False, h, out, *tables)
         else:
-            took = _flight(
-                out,
-                v,
-                v,
-                work,
-                0.0,
-                weights,
-                weights,
-                False,
-                h,
-                work[2],
-                lattice,
-                kind,
-                atoms,
-                slots,
-                lengths,
-                inv_mass,
-                undo,
-            )
+            took = _flight(out, v, v, work, 0.0, weights, weights, False, h, work[2], *tables)
         if not 0 <= took <= MANY_ITERATIONS:
             return _ENGINE, i, took
     return _DONE, n, took
 
 
 @numba.njit(cache=True, nogil=True)
-def _end(x, v, work, kick, force, weights, lattice, kind, atoms, slots, lengths, inv_mass, undo):  # type: ignore[no-untyped-def]
+def _end(x, v, work, kick, force, weights, *tables):  # type: ignore[no-untyped-def]
+    """A kick, then the velocities projected."""
+    lattice, kind, atoms, slots, _, inv_mass, undo = tables
     if not all_finite(force):
         return _FORCE
     if work.shape[0] == 0:
