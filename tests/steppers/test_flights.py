@@ -1,0 +1,236 @@
+"""Compiled stages: the same steps as piece by piece, and the engine where they cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance, FixedAtoms, MovingTarget
+from kcons.errors import ConvergenceError, KconsError, NonFiniteError
+from kcons.motion import MANY_ITERATIONS, Motion
+from kcons.steppers import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Geodesic,
+    KahanLi6,
+    Rattle,
+    State,
+    Suzuki4,
+    System,
+    run,
+)
+
+STEPPERS = [Rattle(), Geodesic(4), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
+PAIRS = [[0, 1], [0, 2], [1, 2]]
+SHAPE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0]])
+
+
+def springs(x, t):
+    """Each atom in a harmonic well of its own strength, and an attraction of neighbouring molecules."""
+    return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
+
+
+def triangles(
+    n: int = 11, *, ions: int = 0, at: float = 0.0, force=springs, piecewise: bool = False, **options
+) -> tuple[System, State]:
+    """Rigid triangles that turn, and free atoms after them; 11 fill one group of lanes and part of a second."""
+    rng = np.random.default_rng(3)
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    x = (np.einsum("ak,nkj->naj", SHAPE, turn) + 3.0 * np.arange(n)[:, None, None] / n).reshape(-1, 3)
+    x = np.concatenate([x, rng.normal(size=(ions, 3))]) + at
+    masses = np.concatenate([np.tile([16.0, 1.0, 1.0], n), np.full(ions, 23.0)])
+    rows = Distance((3 * np.arange(n)[:, None, None] + np.array(PAIRS)).reshape(-1, 2))
+    system = System(Motion(ConstraintSet([rows], x, masses, **options), x), force)
+    assert system.flights is not None
+    if piecewise:
+        system.flights = None
+    return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
+
+
+def distance(a: State, b: State) -> float:
+    return max(float(np.abs(a.positions - b.positions).max()), float(np.abs(a.velocities - b.velocities).max()))
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"ions": 5}, {"force": None}, {"cell": np.diag([9.0, 8.0, 7.0]), "pbc": True}],
+    ids=["plain", "ions", "free", "periodic"],
+)
+def test_steps_are_those_made_piece_by_piece(stepper, options) -> None:
+    (system, state), (other, _) = triangles(**options), triangles(**options, piecewise=True)
+    for dt in (0.05, -0.02, 0.03):
+        following, expected = stepper.step(system, state, dt), stepper.step(other, state, dt)
+        assert distance(following, expected) <= 1e-14
+        assert distance(following, state) > 1e-3
+        assert (following.forces is None) == (expected.forces is None)
+        if following.forces is not None:
+            np.testing.assert_allclose(following.forces, expected.forces, rtol=0, atol=1e-13)
+        state = following
+    held = system.motion.constraint_set
+    assert np.abs(held.value(state.positions)).max() <= 1e-14
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+def test_far_from_the_origin(stepper) -> None:
+    system, state = triangles(at=1e6, force=None)
+    assert state.remainder is not None
+    end = run(system, state, 0.05, 50, stepper=stepper)
+    assert end.remainder is not None and not np.shares_memory(end.remainder, state.remainder)
+    assert system.kinetic_energy(end.velocities) == pytest.approx(system.kinetic_energy(state.velocities), rel=1e-13)
+
+
+def test_friction_takes_compiled_drifts() -> None:
+    def force(x, v, t):
+        return springs(x, t) - 0.1 * v
+
+    (system, state), (other, _) = triangles(), triangles(piecewise=True)
+    for each in (system, other):
+        each.force, each.velocity_dependent = force, True
+    for stepper in (Rattle(), Suzuki4()):
+        assert distance(stepper.step(system, state, 0.05), stepper.step(other, state, 0.05)) <= 1e-14
+
+
+def test_what_came_in_stays_as_it_was() -> None:
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def force(x, t):
+        seen.append((x, x.copy()))
+        return springs(x, t)
+
+    system, state = triangles(force=force)
+    state = system.with_forces(state)
+    arrays = (state.positions, state.velocities, state.forces)
+    before = [a.copy() for a in arrays]
+    for array in arrays:
+        array.flags.writeable = False
+    for stepper in STEPPERS:
+        stepper.step(system, state, 0.05)
+    assert all(np.array_equal(a, b) for a, b in zip(arrays, before, strict=True))
+    assert len(seen) == 1 + sum(stepper.force_evaluations for stepper in STEPPERS)
+    assert all(np.array_equal(a, b) for a, b in seen)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("at_call", [1, 2, 3])
+def test_a_force_that_is_not_finite(stepper, bad, at_call) -> None:
+    calls = 0
+
+    def force(x, t):
+        nonlocal calls
+        calls += 1
+        f = springs(x, t)
+        if calls == at_call:
+            f[7, 1] = bad
+        return f
+
+    system, state = triangles(force=force)
+    system.force = springs
+    state = run(system, state, 0.01, 4, stepper=stepper)
+    system.force = force
+    before = state.positions.copy(), state.velocities.copy()
+    with pytest.raises(NonFiniteError, match="non-finite force at step 5 on atom 7") as caught:
+        for _ in range(3):
+            state_5 = stepper.step(system, state, 0.01)
+            assert state_5.step == 5
+    assert caught.value.step == 5
+    assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+
+
+@pytest.mark.parametrize("piecewise", [False, True])
+def test_numbers_that_overflow(piecewise) -> None:
+    alone = (np.arange(34) == 33)[:, None]  # the free atom, of which the engine knows nothing
+    system, state = triangles(ions=1, force=None, piecewise=piecewise)
+    for stepper in (Rattle(), BlanesMoan6()):
+        with pytest.raises(NonFiniteError, match="non-finite position at step 1 on atom 33"):
+            stepper.step(system, State(state.positions, alone * np.full(3, 1.7e308)), 10.0)
+
+    system, state = triangles(ions=1, force=lambda x, t: alone * np.full(3, 1e308), piecewise=piecewise)
+    start = State(state.positions, alone * np.full(3, 1.797e308), forces=np.zeros((34, 3)))
+    with pytest.raises(NonFiniteError, match="non-finite velocity at step 1 on atom 33"):
+        Rattle().step(system, start, 1.0)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+def test_a_step_without_solution_names_row_and_step(stepper) -> None:
+    errors = []
+    for piecewise in (False, True):
+        system, state = triangles(piecewise=piecewise)
+        with pytest.raises(ConvergenceError) as caught:
+            run(system, state, 30.0, 3, stepper=stepper)
+        errors.append(caught.value)
+    assert errors[0].step == errors[1].step and errors[0].step is not None
+    assert errors[0].row == errors[1].row and errors[0].row is not None
+    assert "time step too large" in str(errors[0])
+
+
+def test_the_engine_takes_over_in_the_middle_of_a_stage() -> None:
+    """Steps so long that some flights take many iterations or a rescue, and some have no solution."""
+    taken = failed = 0
+    for stepper in STEPPERS:
+        for dt in np.geomspace(0.5, 8.0, 40):
+            (system, state), (other, _) = triangles(force=None), triangles(force=None, piecewise=True)
+            calls = []
+            engine = system.motion.project_positions
+
+            def counted(*args, engine=engine, calls=calls, **kwargs):
+                calls.append(kwargs["dt"])
+                return engine(*args, **kwargs)
+
+            system.motion.project_positions = counted
+            outcomes = []
+            for each in (system, other):
+                try:
+                    outcomes.append(stepper.step(each, state, float(dt)))
+                except KconsError as error:
+                    outcomes.append(error)
+            one, two = outcomes
+            if isinstance(two, State):
+                assert isinstance(one, State)
+                assert distance(one, two) <= 1e-10
+                assert np.abs(system.motion.constraint_set.value(one.positions)).max() <= 1e-13
+                taken += bool(calls)
+            else:
+                assert type(one) is type(two) and one.row == two.row
+                failed += 1
+    assert taken >= 5 and failed >= 5
+
+
+def test_only_for_triangles_at_rest() -> None:
+    x = SHAPE + 0.0
+    m = np.array([16.0, 1.0, 1.0])
+
+    def flights(*rows, x=x, m=m):
+        return System(Motion(ConstraintSet(rows, x, m), x)).flights
+
+    assert flights(Distance(PAIRS)) is not None
+    assert flights(Distance(PAIRS[:2])) is None
+    assert flights(Distance(PAIRS), FixedAtoms([0])) is None
+    lengths = np.linalg.norm(x[[0, 0, 1]] - x[[1, 2, 2]], axis=1)
+    moving = MovingTarget(lambda t: lengths + 0.1 * t)
+    assert flights(Distance(PAIRS, moving)) is None
+    many = np.concatenate([x, np.arange(30.0).reshape(10, 3)])
+    assert flights(Distance(PAIRS), x=many, m=np.ones(13)) is None
+    assert flights(x=x) is None
+
+
+def test_a_new_cell_is_seen() -> None:
+    cell = np.diag([9.0, 8.0, 7.0])
+    (system, state), (other, _) = (triangles(cell=cell, pbc=True, piecewise=p) for p in (False, True))
+    for each in (system, other):
+        each.motion.set_cell(1.05 * cell, True)
+    # Molecules whose atoms are in different cells.
+    rng = np.random.default_rng(0)
+    x = state.positions + rng.integers(-1, 2, size=state.positions.shape) * 1.05 * np.diag(cell)
+    state = State(x, state.velocities)
+    assert distance(BlanesMoan4().step(system, state, 0.05), BlanesMoan4().step(other, state, 0.05)) <= 1e-13
+
+
+def test_reports_show_iterations() -> None:
+    system, state = triangles()
+    end = Rattle().step(system, state, 0.05)
+    found = system.motion.report(end.positions, condition=False)
+    assert all(3 <= kind.iterations <= MANY_ITERATIONS for kind in found.kinds)
