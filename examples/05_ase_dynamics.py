@@ -150,46 +150,71 @@ class Clock:
     """Adds up the time that this thread works in functions, without the time it waits for others."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self.seconds, self.calls = 0.0, 0
 
     def wrap(self, call: Callable) -> Callable:
         def timed(*args, **kwargs):
             start = time.thread_time()
             result = call(*args, **kwargs)
             self.seconds += time.thread_time() - start
+            self.calls += 1
             return result
 
         return timed
 
 
+def cost_of_a_clock(calls: int = 500) -> tuple[float, float]:
+    """What reading the clocks adds to a timed call, and to whatever contains it."""
+
+    def nothing(*args, **kwargs):
+        pass
+
+    clock = Clock()
+    timed = clock.wrap(nothing)
+    seconds = []
+    for call in (nothing, timed):
+        start = time.thread_time()
+        for _ in range(calls):
+            call(1, 2, dt=3)
+        seconds.append((time.thread_time() - start) / calls)
+    return clock.seconds / calls - seconds[0], seconds[1] - seconds[0]
+
+
 class Timed:
-    """One dynamics object, whole steps and their parts."""
+    """One dynamics object: whole steps, and the forces in them."""
 
     def __init__(self, dynamics: MolecularDynamics) -> None:
         self.dynamics = dynamics
         self.forces, self.projections = Clock(), Clock()
-        self.samples: list[tuple[float, float, float]] = []
         dynamics.run(3)
         if isinstance(dynamics, ConstrainedDynamics):
             system = dynamics._systems()
-            motion = system.motion
-            motion.project_positions = self.projections.wrap(motion.project_positions)
-            motion.project_velocities = self.projections.wrap(motion.project_velocities)
             system.force = self.forces.wrap(system.force)
 
-    def sample(self, steps: int) -> None:
-        self.forces.seconds = self.projections.seconds = 0.0
+    def sample(self, steps: int, clock: tuple[float, float]) -> tuple[float, float, float]:
+        """Seconds a step, in its forces and in its projections, without those of the clocks."""
+        self.dynamics.run(2)
+        for part in (self.forces, self.projections):
+            part.seconds, part.calls = 0.0, 0
         start = time.thread_time()
         self.dynamics.run(steps)
         whole = time.thread_time() - start
-        self.samples.append((whole / steps, self.forces.seconds / steps, self.projections.seconds / steps))
+        inside, added = clock
+        whole -= added * (self.forces.calls + self.projections.calls)
+        forces, projections = (part.seconds - inside * part.calls for part in (self.forces, self.projections))
+        return whole / steps, forces / steps, projections / steps
 
-    def result(self) -> dict:
-        whole, forces, projections = (1e6 * float(t) for t in np.median(self.samples, axis=0))
-        found = {"step_us": whole}
-        if forces:
-            found |= {"forces_us": forces, "projections_us": projections}
-        return found
+
+class PieceByPiece(Timed):
+    """The same with each projection a call of the engine, also where stages of a step are compiled into one call."""
+
+    def __init__(self, dynamics: MolecularDynamics) -> None:
+        super().__init__(dynamics)
+        system = dynamics._systems()
+        system.flights = None
+        motion = system.motion
+        motion.project_positions = self.projections.wrap(motion.project_positions)
+        motion.project_velocities = self.projections.wrap(motion.project_velocities)
 
 
 def cost(n: int, repeats: int) -> list[dict]:
@@ -198,16 +223,30 @@ def cost(n: int, repeats: int) -> list[dict]:
     def ours(stepper: Stepper) -> MolecularDynamics:
         return ConstrainedDynamics(waters(n, 5.0), FS, stepper)
 
-    runs = {
-        "VelocityVerlet, nothing held": Timed(VelocityVerlet(waters(n, 5.0, hold=False), FS)),
-        "VelocityVerlet": Timed(VelocityVerlet(waters(n, 5.0), FS)),
+    runs: dict[str, tuple[Timed, ...]] = {
+        "VelocityVerlet, nothing held": (Timed(VelocityVerlet(waters(n, 5.0, hold=False), FS)),),
+        "VelocityVerlet": (Timed(VelocityVerlet(waters(n, 5.0), FS)),),
     }
     for stepper in (Rattle(), Suzuki4(), BlanesMoan4(), KahanLi6(), BlanesMoan6()):
-        runs[f"ConstrainedDynamics, {stepper!r}"] = Timed(ours(stepper))
+        runs[f"ConstrainedDynamics, {stepper!r}"] = (Timed(ours(stepper)), PieceByPiece(ours(stepper)))
+    samples: dict[str, list[list[float]]] = {name: [] for name in runs}
     for _ in range(repeats):
-        for timed in runs.values():
-            timed.sample(1)
-    return [{"waters": n, "dynamics": name, **timed.result()} for name, timed in runs.items()]
+        clock = tuple(np.median([cost_of_a_clock() for _ in range(5)], axis=0))
+        for name, pair in runs.items():
+            whole, forces, _ = pair[0].sample(3, clock)
+            row = [whole]
+            if len(pair) > 1:
+                projections = pair[1].sample(3, clock)[2]
+                # Forces of the same object: they vary by more than all of the rest.
+                row += [forces, projections, whole / (forces + 1.3 * projections)]
+            samples[name].append(row)
+    rows = []
+    for name, found in samples.items():
+        middle = [float(t) for t in np.median(found, axis=0)]
+        rows.append({"waters": n, "dynamics": name, "step_us": 1e6 * middle[0]})
+        if len(middle) > 1:
+            rows[-1] |= {"forces_us": 1e6 * middle[1], "projections_us": 1e6 * middle[2], "ratio": middle[3]}
+    return rows
 
 
 # -- statistics -------------------------------------------------------------------------------------
@@ -292,13 +331,12 @@ def run(full: bool) -> dict:
 
 def show(result: dict) -> None:
     print("Microseconds of CPU a step of 1 fs, rigid waters, a calculator that does nothing; medians")
-    print("(left over: kicks, drifts, checks and ASE's loop, as a multiple of the projections)")
-    print("waters  dynamics                                whole   forces  projections  left over")
+    print("(projections: as calls of the engine, one by one; last column: whole / (forces + 1.3 projections))")
+    print("waters  dynamics                                whole   forces  projections      ratio")
     for r in result["cost"]:
         line = f"{r['waters']:6d}  {r['dynamics']:36s} {r['step_us']:8.0f}"
         if "forces_us" in r:
-            rest = r["step_us"] - r["forces_us"] - r["projections_us"]
-            line += f" {r['forces_us']:8.0f} {r['projections_us']:12.0f} {rest / r['projections_us']:10.2f}"
+            line += f" {r['forces_us']:8.0f} {r['projections_us']:12.0f} {r['ratio']:10.2f}"
         print(line)
     steps = result["far"][0]["steps"]
     print(f"\nKinetic energy lost by a free rigid CO in {steps} steps (relative)")
