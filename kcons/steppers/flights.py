@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.solvers.groups import lattice_kind
 from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tangents
-from kcons.steppers.summation import Point, add_kick, fly, fly_first, fly_once, land
+from kcons.steppers.summation import Point, add_kick, all_finite, fly, fly_first, fly_once, land
 
 #: What a kernel reports.
 _DONE, _FORCE, _POSITION, _VELOCITY, _ENGINE = range(5)
@@ -130,33 +130,24 @@ class Flights:
         return _WHAT[status]
 
 
-@numba.njit(cache=True, nogil=True)
-def all_finite(values):  # type: ignore[no-untyped-def]
-    """Whether no number is NaN or infinite."""
-    # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
-    bits = values.ravel().view(np.int64)
-    worst = np.int64(0)
-    for i in range(bits.size):
-        worst = max(worst, bits[i] & 0x7FF0000000000000)
-    return worst != 0x7FF0000000000000
-
-
 # The tables are those of `Flights.tables`: lattice, kind, atoms, slots, lengths, inverse masses, room to undo.
 
 
 @numba.njit(cache=True, nogil=True)
 def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, *tables):  # type: ignore[no-untyped-def]
-    """Fly into `out` and land there; iterations, -1 if it did not land."""
+    """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     lattice, kind, atoms, slots, lengths, inv_mass, undo = tables
     if work.shape[0] == 0:
         push = v
-        fly_once(x, v0, kick, force, weights, h, v, out)
+        sound = fly_once(x, v0, kick, force, weights, h, v, out)
     else:
         push = work[1]
         if fresh:
-            fly_first(x, work[0], v0, v, push, kick, force, weights, h, out)
+            sound = fly_first(x, work[0], v0, v, push, kick, force, weights, h, out)
         else:
-            fly(x, work[0], v, push, kick, force, weights, h, out)
+            sound = fly(x, work[0], v, push, kick, force, weights, h, out)
+    if not sound:
+        return -2
     landed, _, iterations, _ = triangle_positions(
         out, x, push, 1.0 / h, atoms, slots, lengths, inv_mass, lattice, kind, push[:0], undo
     )
@@ -166,8 +157,6 @@ def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, *tables):  # ty
 @numba.njit(cache=True, nogil=True)
 def _stage(intervals, first, x, v0, v, work, kick, force, weights, fresh, out, *tables):  # type: ignore[no-untyped-def]
     """Flights from number `first` on; they end in `out` and in work[2] by turns, the last one in `out`."""
-    if not all_finite(force):
-        return _FORCE, first, 0
     n, took = intervals.size, -1
     for i in range(first, n):
         h, last = intervals[i], (n - i) % 2 == 1
@@ -181,7 +170,7 @@ def _stage(intervals, first, x, v0, v, work, kick, force, weights, fresh, out, *
         else:
             took = _flight(out, v, v, work, 0.0, weights, weights, False, h, work[2], *tables)
         if not 0 <= took <= MANY_ITERATIONS:
-            return _ENGINE, i, took
+            return (_FORCE if took == -2 else _ENGINE), i, took
     return _DONE, n, took
 
 
@@ -189,12 +178,9 @@ def _stage(intervals, first, x, v0, v, work, kick, force, weights, fresh, out, *
 def _end(x, v, work, kick, force, weights, *tables):  # type: ignore[no-untyped-def]
     """A kick, then the velocities projected."""
     lattice, kind, atoms, slots, _, inv_mass, undo = tables
-    if not all_finite(force):
+    sound = add_kick(v, kick, force, weights) if work.shape[0] == 0 else land(v, work[1], kick, force, weights)
+    if not sound:
         return _FORCE
-    if work.shape[0] == 0:
-        add_kick(v, kick, force, weights)
-    else:
-        land(v, work[1], kick, force, weights)
     if not all_finite(x):
         return _POSITION
     converged, _, _, _ = triangle_tangents(x, v, atoms, slots, v[:0], inv_mass, lattice, kind, v[:0], undo)

@@ -103,6 +103,7 @@ class Splitting:
                 else:
                     step.drift_first(self.kicks, stages)
             except ConvergenceError as error:
+                step.refuse_unsound()
                 raise explained(error, system, state, dt, step.number) from error
             except (InputError, NonFiniteError):
                 step.refuse_overflow()
@@ -233,6 +234,7 @@ class _Step:
             then, self.now = self.now, self.ended(end)
             left -= 1
             self.flight.move(point, point.work[2] if left % 2 else out, then, self.now, fraction * dt)
+        self.refuse_unsound()
 
     def ended(self, end: float) -> float:
         """The time at the fraction `end` of the step."""
@@ -243,10 +245,8 @@ class _Step:
         if self.system.force is None:
             return
         point = self.point
-        # Compiled stages look for NaN themselves.
-        self.forces = self.system.forces(
-            self.positions, point.v, self.now, self.number, copy=keep, finite=self.flights is None
-        )
+        # The kick looks for NaN.
+        self.forces = self.system.forces(self.positions, point.v, self.now, self.number, copy=keep, finite=False)
 
     def settle(self, fraction: float) -> None:
         """v = projected(v + h M^-1 f(x, v)), by iteration."""
@@ -281,6 +281,7 @@ class _Step:
                 self.refuse(bad)
             return
         point.land()
+        self.refuse_unsound()
         check_finite(point.x, "position", self.number)
         self.system.motion.project_velocities(point.x, point.v, time=self.now, out=point.v)
         check_finite(point.v, "velocity", self.number)
@@ -306,12 +307,19 @@ class _Step:
         """Raise for what a compiled stage found."""
         point = self.point
         if item == "force":
+            point.sound = False
             assert self.forces is not None
             check_finite(self.forces, item, self.number)
         check_finite(point.x if item == "position" else point.v, item, self.number)
 
+    def refuse_unsound(self) -> None:
+        """Raise if the force of a kick was not finite."""
+        if not self.point.sound:
+            self.refuse("force")
+
     def refuse_overflow(self) -> None:
         """Name overflow as what it is, where the engine met it first."""
+        self.refuse_unsound()
         point = self.point
         for array, item in ((self.out, "position"), (point.v, "velocity"), (point.push, "velocity")):
             check_finite(array, item, self.number)

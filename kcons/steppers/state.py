@@ -20,7 +20,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
-from kcons.steppers.flights import Flights, all_finite
+from kcons.steppers.flights import Flights
+from kcons.steppers.summation import all_finite
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0

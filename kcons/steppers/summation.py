@@ -25,7 +25,7 @@ class Point:
     A kick is kept until the next drift, which takes it in the same pass over the arrays.
     """
 
-    __slots__ = ("_force", "_kick", "fresh", "push", "v", "weights", "work", "x", "x_low")
+    __slots__ = ("_force", "_kick", "fresh", "push", "sound", "v", "weights", "work", "x", "x_low")
 
     def __init__(self, x: FloatArray, v: FloatArray, weights: FloatArray, *, exact: bool) -> None:
         self.x = x
@@ -42,6 +42,8 @@ class Point:
             self.x_low, self.push = self.work[0], self.work[1]
         else:
             self.work, self.x_low, self.push = _NO_WORK, None, v
+        #: Whether the forces of all kicks that were done are finite.
+        self.sound = True
         self._kick = 0.0
         self._force = weights  # any finite numbers: they are multiplied by 0
 
@@ -64,13 +66,15 @@ class Point:
             before = self.v
             if self.fresh:
                 self.v = self.push = np.empty_like(before)
-            fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
+            sound = fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
         elif self.fresh:
             before, self.v = self.v, np.empty_like(self.v)
-            fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
+            sound = fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
         else:
-            fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
+            sound = fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
         self.fresh = False
+        if not sound:
+            self.sound = False
         return self.push
 
     def remainder(self, atoms: IntArray) -> FloatArray:
@@ -91,32 +95,49 @@ class Point:
                 self.push.fill(0.0)
             self.fresh = False
         if self.x_low is None:
-            if kick:
-                add_kick(self.v, kick, force, self.weights)
+            sound = not kick or add_kick(self.v, kick, force, self.weights)
         else:
-            land(self.v, self.push, kick, force, self.weights)
+            sound = land(self.v, self.push, kick, force, self.weights)
+        if not sound:
+            self.sound = False
 
     def restart(self, v: FloatArray) -> None:
         """Go on with other velocities, after `land`."""
         np.copyto(self.v, v)
 
 
-# Flat loops over few arrays: only these are compiled to vector instructions.
+# Flat loops over few arrays: only these are compiled to vector instructions. All say whether the force of the kick is
+# finite: one more call for that, after a long calculation of forces, costs what the engine takes for ten molecules.
+
+
+@numba.njit(cache=True, nogil=True)
+def all_finite(values):  # type: ignore[no-untyped-def]
+    """Whether no number is NaN or infinite."""
+    # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
+    bits = values.ravel().view(np.int64)
+    worst = np.int64(0)
+    for i in range(bits.size):
+        worst = max(worst, bits[i] & 0x7FF0000000000000)
+    return worst != 0x7FF0000000000000
 
 
 @numba.njit(cache=True, nogil=True)
 def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
+    sound = kick == 0.0 or all_finite(f)
     b, g, w = v.ravel(), f.ravel(), weights.ravel()
     for i in range(b.size):
         b[i] += kick * w[i] * g[i]
+    return sound
 
 
 @numba.njit(cache=True, nogil=True)
 def land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
+    sound = kick == 0.0 or all_finite(f)
     b, p, g, w = v.ravel(), push.ravel(), f.ravel(), weights.ravel()
     for i in range(b.size):
         b[i] += p[i] + kick * w[i] * g[i]
         p[i] = 0.0
+    return sound
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
@@ -126,6 +147,7 @@ def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped
     It is exact where the change is the smaller number. Where a coordinate crosses 0 it is not; the error is then one
     of the rounding of the change, not of the coordinate.
     """
+    sound = kick == 0.0 or all_finite(f)
     a, a_low, b, p, c = x.ravel(), x_low.ravel(), v.ravel(), push.ravel(), out.ravel()
     g, w = f.ravel(), weights.ravel()
     for i in range(a.size):
@@ -138,11 +160,13 @@ def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped
         there = a[i] + change
         a_low[i] = change - (there - a[i])
         c[i] = there
+    return sound
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """The same from a start without remainders; `x_low`, `v` and `push` are only written to."""
+    sound = kick == 0.0 or all_finite(f)
     a, a_low, b0, b, p, c = x.ravel(), x_low.ravel(), v0.ravel(), v.ravel(), push.ravel(), out.ravel()
     g, w = f.ravel(), weights.ravel()
     for i in range(a.size):
@@ -155,11 +179,14 @@ def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[
         there = a[i] + change
         a_low[i] = change - (there - a[i])
         c[i] = there
+    return sound
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
+    sound = kick == 0.0 or all_finite(f)
     a, b0, b, c, g, w = x.ravel(), v0.ravel(), v.ravel(), out.ravel(), f.ravel(), weights.ravel()
     for i in range(a.size):
         b[i] = b0[i] + kick * w[i] * g[i]
         c[i] = a[i] + h * b[i]
+    return sound
