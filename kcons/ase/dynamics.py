@@ -240,9 +240,7 @@ class ConstrainedDynamics(MolecularDynamics):
             x[...] = state.positions
         else:
             self._momenta, v = self._put(state.positions, state.velocities)
-        self._state = State(
-            state.positions, v, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat
-        )
+        self._state = State(state.positions, v, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat)
         self._cell = cell
         return self._state
 

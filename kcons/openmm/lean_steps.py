@@ -40,7 +40,7 @@ class LeanStepWriter(StepWriter):
     filtered = False
 
     def write(self) -> None:
-        plain = isinstance(self.ensemble, ConstantEnergy)
+        plain = type(self.ensemble) is ConstantEnergy
         self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
         self.lazy = self.lean or (self.scheme is None and not self.parts)
         self.observed = 2 if self.lean else 1

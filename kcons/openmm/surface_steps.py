@@ -29,7 +29,7 @@ class SurfaceStepWriter(LeanStepWriter):
     lazy = False
 
     def write(self) -> None:
-        fused = self.scheme is not None and isinstance(self.ensemble, ConstantEnergy)
+        fused = self.scheme is not None and type(self.ensemble) is ConstantEnergy
         if not fused or not all(isinstance(part, SurfaceRows) for part in self.parts):
             super().write()
             return

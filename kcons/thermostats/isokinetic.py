@@ -18,7 +18,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
-from kcons.steppers.splitting import Piece
+from kcons.steppers.splitting import Stage
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
@@ -257,7 +257,7 @@ class Isokinetic(Splitting):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
             run = _Step(system, self._share(system), begin, dt)
             try:
-                return run.through(self.kicks, self._pieces)
+                return run.through(self.kicks, self._stages)
             except ConvergenceError as error:
                 raise explained(error, system, state, dt, run.number) from error
 
@@ -385,13 +385,13 @@ class _Step:
             self.drive, self.u = _split(system, x, start.velocities, self.now)
             self._settle()
 
-    def through(self, kicks: tuple[float, ...], pieces: list[list[Piece]]) -> State:
+    def through(self, kicks: tuple[float, ...], stages: list[Stage]) -> State:
         self.first_kick(kicks[0] * self.dt)
-        for fraction, stage in zip(kicks[1:], pieces, strict=True):
+        for fraction, stage in zip(kicks[1:], stages, strict=True):
             if self.drive is None:
                 self.drift(stage)
             else:
-                for piece in stage:
+                for piece in zip(stage.fractions, stage.ends, strict=True):
                     self.driven_drift(piece)
             if self.system.force is not None:
                 self.forces = self.system.forces(self.positions, self.velocities, self.now, self.number)
@@ -467,10 +467,10 @@ class _Step:
 
     # -- drifts ---------------------------------------------------------------------------------
 
-    def drift(self, stage: list[Piece]) -> None:
+    def drift(self, stage: Stage) -> None:
         system = self.system
-        point = Point(self.x, self.u, system.weights, exact=len(stage) > 1)
-        for fraction, end in stage:
+        point = Point(self.x, self.u, system.weights, exact=len(stage.ends) > 1)
+        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
             then, self.now = self.now, self._time_at(end)
             system.drift.move(point, np.empty_like(self.x), then, self.now, fraction * self.dt)
         point.land()
@@ -478,7 +478,7 @@ class _Step:
         self.x = point.x
         self.u = system.motion.project_velocities(self.x, point.v, time=self.now, out=point.v)
 
-    def driven_drift(self, piece: Piece) -> None:
+    def driven_drift(self, piece: tuple[float, float]) -> None:
         """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
 
         So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
