@@ -41,7 +41,7 @@ ORDERS = {
     "blanes-moan6a": (6, (12, 16, 20)),
 }
 TIME = 2.0
-assert set(ORDERS) == set(SCHEMES)
+assert set(ORDERS) == {name for name in SCHEMES if not name.startswith("isokinetic")}
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
