@@ -104,8 +104,8 @@ def test_nothing_is_missing():
 @pytest.mark.parametrize("thermostat", ["Langevin", "Nose-Hoover"])
 @pytest.mark.parametrize("system", ["rigid water", "chains"])
 def test_physical_validation_anew(system, thermostat):
-    """Shorter than the committed runs; needs the package physical_validation."""
+    """The committed runs once more; needs the package physical_validation."""
     spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "10_thermostats.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    judged(example.judged(system, thermostat, 40_000))
+    judged(example.judged(system, thermostat, 100_000))
