@@ -15,7 +15,9 @@ from steppers.systems import angle_of, growing_rod, rotor, spherical_pendulum, s
 @pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_observed_order(substeps: int, problem: GlobalError) -> None:
-    assert observed_order(Geodesic(substeps), problem, [16, 32, 64, 128]) == pytest.approx(2, abs=0.15)
+    # Projections with velocity rows take ten milliseconds.
+    steps = [8, 16, 32] if problem in VELOCITY_ROWS else [16, 32, 64, 128]
+    assert observed_order(Geodesic(substeps), problem, steps) == pytest.approx(2, abs=0.15)
 
 
 def test_one_substep_is_rattle() -> None:

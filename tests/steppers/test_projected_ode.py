@@ -16,7 +16,8 @@ SCHEMES = pytest.mark.parametrize("stepper", PROJECTED, ids=repr)
 @SCHEMES
 @pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)
 def test_observed_order(stepper, problem: GlobalError) -> None:
-    dts = 1.0 / np.array([64, 128, 256])
+    # The rod that grows is late in reaching its order.
+    dts = 1.0 / np.array([64, 128, 256] if problem is HOLONOMIC[2] else [32, 64, 128])
     errors = [problem(stepper, dt) for dt in dts]
     assert slope(dts, errors) == pytest.approx(stepper.order, abs=0.15)
 
@@ -35,10 +36,9 @@ def test_constraints_drift_without_projection_and_not_with_it() -> None:
 
 
 def test_feedback_bounds_the_drift() -> None:
-    free = [violation(ProjectedRungeKutta4(), 0.05, n) for n in (500, 2000)]
-    fed = [violation(Baumgarte(2.0), 0.05, n) for n in (500, 2000)]
+    free = [violation(ProjectedRungeKutta4(), 0.05, n) for n in (200, 800)]
     assert free[1] > 3 * free[0]
-    assert fed[1] < free[1] / 10
+    assert violation(Baumgarte(2.0), 0.05, 800) < free[1] / 10
 
 
 def test_feedback_brings_a_violation_down() -> None:

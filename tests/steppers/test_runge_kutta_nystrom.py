@@ -22,11 +22,27 @@ STEPS = {
 }
 
 
-@SPLITTINGS
-@pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS], ids=named)
-def test_observed_order(stepper, problem: GlobalError) -> None:
+def check_order(stepper, problem: GlobalError) -> None:
     steps = STEPS[named(problem)][stepper.order]
     assert observed_order(stepper, problem, steps) == pytest.approx(stepper.order, abs=0.15)
+
+
+@SPLITTINGS
+@pytest.mark.parametrize("problem", HOLONOMIC, ids=named)
+def test_observed_order(stepper, problem: GlobalError) -> None:
+    check_order(stepper, problem)
+
+
+@pytest.mark.parametrize("stepper", [BlanesMoan4(), BlanesMoan6()], ids=repr)
+@pytest.mark.parametrize("problem", VELOCITY_ROWS, ids=named)
+def test_observed_order_with_velocity_rows(stepper, problem: GlobalError) -> None:
+    check_order(stepper, problem)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("problem", VELOCITY_ROWS, ids=named)
+def test_observed_order_with_velocity_rows_of_the_longest(problem: GlobalError) -> None:
+    check_order(BlanesMoan6a(), problem)
 
 
 @SPLITTINGS
