@@ -17,7 +17,7 @@ def test_listing_on_the_page_is_that_of_the_integrator():
 
 
 def test_table_of_schemes():
-    rows = re.findall(r"^\| (`.*?) \| (\d) \| ([\d, ]+) \|", PAGE, re.MULTILINE)
+    rows = re.findall(r"^\| (`.*?) \| (\d) \| ([\d, ]+) \| (?!\d)", PAGE, re.MULTILINE)
     table = {}
     for names, order, evaluations in rows:
         keys = re.findall(r"`(.*?)`", names)
