@@ -2,6 +2,7 @@
 
     python examples/08_openmm_constraints.py                  small systems, a minute
     python examples/08_openmm_constraints.py --full --out F   everything, twenty minutes; F receives JSON
+    python examples/08_openmm_constraints.py --full --steps F --out F   measures the speed of steps again, keeps the rest
     python examples/08_openmm_constraints.py --show F         the tables of an earlier result
 
 One process, one thread, CPU platform. Times are processor times of the process, taken in turn, and ratios are medians
@@ -431,9 +432,11 @@ def run_builtin(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, step
 # -- all of it ------------------------------------------------------------------------------------
 
 
-def run(full: bool, console: Console) -> dict:
-    result: dict[str, Any] = {"machine": compare.environment(), "full": full}
+def run(full: bool, console: Console, kept: dict | None = None) -> dict:
+    """All measurements; or, with an earlier result, only the speed of steps."""
+    result: dict[str, Any] = kept or {"machine": compare.environment(), "full": full}
     result["machine"]["versions"]["openmm"] = openmm.__version__
+    result["steps_machine"] = compare.environment()
 
     def each(key: str, jobs: list[Callable[[], dict]]) -> None:
         result[key] = []
@@ -454,8 +457,9 @@ def run(full: bool, console: Console) -> dict:
             lambda: setup("DHFR HAngles", lambda: dhfr(app.HAngles)),
             lambda: setup("chain, 100000 bonds", lambda: chain(100_000)),
         ]
-    each("solver", solvers)
-    each("setup", setups)
+    if kept is None:
+        each("solver", solvers)
+        each("setup", setups)
     if full:
         steps = [lambda: steps_in_water(900, (1, 20), 50, 11)]
         vacuum = {"nonbondedMethod": app.NoCutoff}
@@ -470,6 +474,8 @@ def run(full: bool, console: Console) -> dict:
     else:
         steps = [lambda: steps_in_water(64, (1, 5), 5, 3)]
     each("steps", steps)
+    if kept is not None:
+        return result
     cases = hard_cases()
     names = list(cases) if full else ["methane, 10 distances", "collinear, 3"]
     result["hard"] = []
@@ -529,17 +535,20 @@ def show(result: dict, console: Console) -> None:
         held = "refused: singular at this geometry" if "refused" in ours else f"{ours['error']:.0e}"
         table.add_row(r["name"], held, theirs["raised"] or bad)
     console.print(table)
-    machine = result["machine"]
+    machine, other = result["machine"], result["steps_machine"]
     versions = ", ".join(f"{name} {machine['versions'][name]}" for name in ("numpy", "numba", "openmm"))
     console.print(
         f"{machine['cpu']}, one thread, CPU platform, processor time; {versions}; "
         f"commit {machine['commit']}, {machine['date']}"
     )
+    if other["commit"] != machine["commit"]:
+        console.print(f"Speed of whole steps: commit {other['commit']}, {other['date']}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="all systems")
+    parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
     options = parser.parse_args()
@@ -547,7 +556,8 @@ def main() -> None:
     if options.show:
         show(json.loads(options.show.read_text()), console)
         return
-    result = run(options.full, console)
+    kept = json.loads(options.steps.read_text()) if options.steps else None
+    result = run(options.full, console, kept)
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n")
     show(result, console)
