@@ -2,7 +2,7 @@
 
     python examples/08_openmm_constraints.py                  small systems, a minute
     python examples/08_openmm_constraints.py --full --out F   everything, twenty minutes; F receives JSON
-    python examples/08_openmm_constraints.py --full --steps F --out F   measures the speed of steps again, keeps the rest
+    python examples/08_openmm_constraints.py --full --steps F --out F   the speed of steps again, the rest kept
     python examples/08_openmm_constraints.py --show F         the tables of an earlier result
 
 One process, one thread, CPU platform. Times are processor times of the process, taken in turn, and ratios are medians
