@@ -16,6 +16,7 @@ from kcons import compare, methods, scenes, steppers
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "steppers.md").read_text(encoding="utf-8")
 RESULTS = json.loads((ROOT / "docs" / "results" / "high_order.json").read_text())
+LONG_RUNS = json.loads((ROOT / "docs" / "results" / "long_runs.json").read_text())
 
 
 def load_example():
@@ -115,3 +116,17 @@ def test_figure_is_drawn(tmp_path):
     example.plot(RESULTS, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert (ROOT / "docs" / "figures" / "high_order.png").exists()
+
+
+def long_run_row(which: str, found: dict[str, float]) -> str:
+    figures = [found[item] for item in ("energy", "momentum", "spin", "positions", "velocities") if item in found]
+    cells = [which, f"{found['steps']:,}", *(f"{x:.1e}" for x in figures), f"{found['cpu_s']:.0f} s"]
+    return "| " + " | ".join(cells) + " |"
+
+
+@pytest.mark.parametrize(("kind", "largest"), [("free_flight", 1e-10), ("reversal", 1e-11)])
+def test_page_shows_the_long_runs(kind, largest):
+    assert LONG_RUNS[kind]
+    for which, found in LONG_RUNS[kind].items():
+        assert long_run_row(which, found) in PAGE
+        assert max(x for item, x in found.items() if item not in ("dt", "steps", "wall_s", "cpu_s")) <= largest
