@@ -68,6 +68,8 @@ class CarriedConstraints:
     meets_system = False
     solves_alone = False
     lean = False
+    #: Whether the System had no constraints of its own when the forces were added.
+    alone = False
 
     def __init__(
         self,
@@ -116,6 +118,7 @@ class CarriedConstraints:
             )
         part = object.__new__(cls)
         part._bind(LIVE[keys[0]], [found[force_name(phase, keys[0])].getForceGroup() for phase in PHASES])
+        part.alone = system.getNumConstraints() == 0
         return part
 
     def forces(self) -> list[openmm.PythonForce]:
@@ -136,6 +139,7 @@ class CarriedConstraints:
         """Put the forces into the System; before the Context is made."""
         for force in self.forces():
             system.addForce(force)
+        self.alone = system.getNumConstraints() == 0
 
     # -- what is held ---------------------------------------------------------------------------
 
@@ -197,6 +201,15 @@ class CarriedConstraints:
             self._guard(program, "land", "carried rows: try to solve for positions")
         change = f"f{self._groups['land']}"
         program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: solve for positions")
+
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
+        group = self._groups["land"]
+        program.each("x", f"x+{h}*{u}", "move freely (drift)")
+        self._guard(program, "land", "carried rows: solve for positions")
+        # Force and energy come from one evaluation, for this moves no x.
+        program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
 
     def project(self, program: Program) -> None:
         change = f"f{self._groups['project']}"
@@ -296,6 +309,11 @@ class CarriedConstraints:
             raise InputError("masses have changed since the rows were built; build them again", item="masses")
         refuse_virtual_sites(system, engine.atoms, now)
         touched = set(engine.atoms.tolist())
+        if self.alone and system.getNumConstraints():
+            raise InputError(
+                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+                item="system",
+            )
         for k in range(system.getNumConstraints()):
             i, j, _ = system.getConstraintParameters(k)
             if touched & {i, j}:

@@ -44,6 +44,8 @@ class LeanStepWriter(StepWriter):
         self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
         self.lazy = self.lean or (self.scheme is None and not self.parts)
         self.observed = 2 if self.lean else 1
+        #: One part whose rows are all there is.
+        self.single = len(self.parts) == 1 and getattr(self.parts[0], "alone", False)
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:
             self.program.number("between", "1 if nobody looks at the velocities after this step")
@@ -150,7 +152,7 @@ class LeanStepWriter(StepWriter):
                 p.let("stage", "stage+1", "what follows")
             with p.when("select(failed, 0, 1-between) != 0", "somebody looks at the velocities"):
                 p.each("force", "f", "applied forces")
-                p.each("raw", "u+per_h*(x-xu)", "the constraint forces act")
+                p.each("raw", "v" if self.single else "u+per_h*(x-xu)", "the constraint forces act")
                 p.each("v", "raw+dt*kick_share(stage)*force/m", "the applied forces act (kick)")
                 self._project()
                 p.let("behind", "0", "unless all is well")
@@ -170,7 +172,8 @@ class LeanStepWriter(StepWriter):
         p.let("behind", "lean", "v, or raw, lacks half a kick")
         p.let("looked", "1-between", "does somebody look?")
         with p.when("looked = 0", "nobody does"):
-            p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
+            if not self.single:
+                p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
             self._each("passed")
         with p.when("looked != 0", "somebody does"):
             p.each("x_last", "x", "where forces were computed")
@@ -186,6 +189,9 @@ class LeanStepWriter(StepWriter):
         p = self.program
         for part in self.parts:
             part.remember(p)
+        if self.single:
+            self.parts[0].land_alone(p, u, h)  # type: ignore[attr-defined]
+            return
         p.each("x", f"x+{h}*{u}", "move freely (drift)")
         p.each("xu", "x", "where that leads")
         for part in self.parts:

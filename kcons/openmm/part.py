@@ -36,7 +36,9 @@ class Part(Protocol):
     Steps at whose end nobody looks may end without `project` (see `kcons.openmm.lean_steps`): the next drift absorbs
     what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
     The optional `renew(program)` is called before each drift that follows one, where v is free to be used, and
-    `passed(program)` at their ends.
+    `passed(program)` at their ends. A part with `alone = True` knows that the System has no constraints; where there is
+    no other part, `land_alone(program, u, h)` is the whole drift with the velocity u, changes v by its impulse too, and
+    needs `remember` before.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.system_checks`.

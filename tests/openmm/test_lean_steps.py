@@ -10,7 +10,7 @@ import pytest
 from openmm_systems import PLATFORMS, alanine, holding, loose_alanine, masses_of, residuals, started, state_of
 from test_collective import bond
 
-from kcons.constraints import Distance
+from kcons.constraints import Plane
 from kcons.errors import ConvergenceError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.transfer import hold
@@ -26,7 +26,9 @@ def held(kind, **arguments):
         system = copy.deepcopy(system)
         part = hold(system, [], x, take="all")
     elif kind == "carried beside bonds":
-        part = hold(system, Distance([[0, 21]]), x)
+        system = copy.deepcopy(system)
+        part = hold(system, Plane([0], [0, 0, 1]), x)
+        assert system.getNumConstraints()
     elif kind.endswith("row"):
         rate = 0.05 if kind == "moving row" else 0.0
         system = copy.deepcopy(system)

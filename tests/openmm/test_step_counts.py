@@ -8,10 +8,10 @@ import numpy as np
 import openmm
 import pytest
 from openmm_parts import HeldCoordinates
-from openmm_systems import alanine, context_of, dumbbell, started
+from openmm_systems import alanine, context_of, dumbbell, loose_alanine, started
 from test_collective import bond
 
-from kcons.constraints import Distance, Sphere
+from kcons.constraints import Distance, Plane, Sphere
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, SurfaceIntegrator
 from kcons.openmm.callbacks import Engine
 from kcons.openmm.program import Program
@@ -78,7 +78,7 @@ def test_force_evaluations(scheme, part):
 
 
 def test_calls_of_a_carrier(monkeypatch):
-    """Within a call of step there is one call for each step, and one more that gets what was found before."""
+    """Within a call of step there is one call for each step."""
     system, x, v = dumbbell()
     part = hold(system, Distance([[0, 1]]), x, take="all")
     calls = []
@@ -89,13 +89,30 @@ def test_calls_of_a_carrier(monkeypatch):
     integrator.step(3)
     calls.clear()
     integrator.step(1)
-    assert len(calls) == integrator.counts().row_evaluations == 4
+    assert len(calls) == integrator.counts().row_evaluations == 3
+    calls.clear()
+    integrator.step(30)
+    assert calls.count("land") == 30
+    assert integrator.counts(seen=False).row_evaluations == 1
+    # At the beginning of the call and of the last step positions are read as well; velocities in the last two steps.
+    assert len(calls) == 30 + 2 + 2
+    del context
+
+
+def test_calls_of_a_carrier_beside_bonds(monkeypatch):
+    """There x is moved by the force whose energy tells of failures: a second call gets what the first has found."""
+    system, x, v = loose_alanine()
+    part = hold(system, Plane([0], [0, 0, 1]), x)
+    calls = []
+    answer = Engine.answer
+    monkeypatch.setattr(Engine, "answer", lambda *a: calls.append(a[1]) or answer(*a))
+    integrator = ProjectedIntegrator(1e-3, parts=[part])
+    context = started(system, integrator, x, v)
+    integrator.step(3)
     calls.clear()
     integrator.step(30)
     assert calls.count("land") == 60
     assert integrator.counts(seen=False).row_evaluations == 2
-    # At the beginning of the call and of the last step positions are read as well; velocities in the last two steps.
-    assert len(calls) == 60 + 2 + 2
     del context
 
 
