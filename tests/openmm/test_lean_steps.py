@@ -10,12 +10,20 @@ import pytest
 from openmm_systems import PLATFORMS, alanine, holding, loose_alanine, masses_of, residuals, started, state_of
 from test_collective import bond
 
-from kcons.constraints import Plane
+from kcons.constraints import KnifeEdge, Plane
 from kcons.errors import ConvergenceError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.transfer import hold
 
-KINDS = ["part", "part that evaluates", "row", "moving row", "carried", "carried beside bonds"]
+KINDS = [
+    "part",
+    "part that evaluates",
+    "row",
+    "moving row",
+    "carried",
+    "carried beside bonds",
+    "carried, with a velocity",
+]
 
 
 def held(kind, **arguments):
@@ -29,6 +37,8 @@ def held(kind, **arguments):
         system = copy.deepcopy(system)
         part = hold(system, Plane([0], [0, 0, 1]), x)
         assert system.getNumConstraints()
+    elif kind == "carried, with a velocity":
+        part = hold(system, KnifeEdge(8, 20, [0, 0, 1]), x)
     elif kind.endswith("row"):
         rate = 0.05 if kind == "moving row" else 0.0
         system = copy.deepcopy(system)
