@@ -53,7 +53,9 @@ def chain_system():
 
 
 def context_of(system, integrator, positions, velocities=None, platform="Reference"):
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(platform))
+    # With several threads, forces are summed in any order, and no run is like another.
+    properties = {"Threads": "1", "DeterministicForces": "true"} if platform == "CPU" else {}
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(platform), properties)
     context.setPositions(positions)
     if velocities is not None:
         context.setVelocities(velocities)

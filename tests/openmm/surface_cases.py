@@ -68,7 +68,8 @@ def system_of(masses=MASSES, potential=POTENTIAL, springs=0.3):
 
 
 def started(system, integrator, x, v, platform="Reference"):
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform))
+    properties = {"Threads": "1", "DeterministicForces": "true"} if platform == "CPU" else {}
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
     context.setPositions(x)
     context.setVelocities(v)
     integrator.apply_velocities(context)
