@@ -1,0 +1,63 @@
+"""The HTML page: self-contained, escaped, well formed."""
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from kcons import page
+
+VOID = {"meta", "link", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Checks that every tag is closed in order, and remembers addresses and text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.addresses: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attributes):
+        self.addresses += [value for name, value in attributes if name in ("href", "src")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Reader:
+    figure = Figure()
+    figure.subplots().plot([1, 2], [3, 4])
+    table = page.PageTable(["method", "error"], [["a < b & c", "1e-6"], ["plain", "2"]], marks=["good", ""])
+    sections = [page.Section("First", ["<script>text</script>"], [figure], [table]), page.Section("Last", literal="x")]
+    reader = Reader()
+    reader.feed(page.write(tmp_path / "p.html", "A title", sections, introduction=["Hello."]).read_text())
+    return reader
+
+
+def test_every_tag_is_closed(read):
+    assert read.open == []
+
+
+def test_nothing_is_fetched_from_elsewhere(read):
+    assert len(read.addresses) == 4
+    assert all(address.startswith(("#", "data:")) for address in read.addresses)
+
+
+def test_text_is_shown_as_it_is(read):
+    for text in ("a < b & c", "<script>text</script>", "A title", "Hello."):
+        assert text in read.text
+
+
+def test_a_row_of_the_wrong_length_of_marks_is_an_error(tmp_path):
+    table = page.PageTable(["a"], [["1"], ["2"]], marks=["good"])
+    with pytest.raises(ValueError):
+        page.write(tmp_path / "p.html", "t", [page.Section("s", tables=[table])])
