@@ -25,10 +25,13 @@ class Ensemble(Protocol):
         of its own then.
     halves : bool
         Whether `middle` does something, between two halves of the only drift.
+    adds_up : bool
+        Whether two kicks at the same place, which are one of the sum of their times, are better made as one.
     """
 
     stays_tangent: bool
     halves: bool
+    adds_up: bool
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
@@ -93,6 +96,7 @@ class ConstantEnergy:
 
     stays_tangent = False
     halves = False
+    adds_up = False
 
     def check(self, scheme: Splitting | None) -> None:
         pass

@@ -78,6 +78,7 @@ class Isokinetic:
 
     stays_tangent = True
     halves = False
+    adds_up = True
 
     def __init__(
         self,

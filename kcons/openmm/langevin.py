@@ -48,6 +48,7 @@ class Langevin(ConstantEnergy):
     """
 
     halves = True
+    adds_up = False
 
     def __init__(self, temperature: unit.Quantity | float, friction: unit.Quantity | float) -> None:
         self.temperature = kelvins(temperature)

@@ -195,7 +195,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if self._plan.lean:
             self.setGlobalVariableByName("lean", float(guard.undisturbed))
             self.setGlobalVariableByName("moving", float(guard.moving))
-        if unseen > 0 and guard.undisturbed:
+        if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
             self.setGlobalVariableByName("between", 1.0)
             try:
                 self._run(guard, unseen)
@@ -247,7 +247,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         """
         if self.parts:
             self.setGlobalVariableByName("stale", 1.0)
-        if self._plan.lean:
+        if "behind" in self.program.numbers:
             self.setGlobalVariableByName("behind", 0.0)
 
     def check(self, context: openmm.Context | None = None) -> None:

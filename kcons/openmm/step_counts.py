@@ -89,6 +89,9 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "abs": _known(abs),
     "floor": _known(math.floor),
     "sqrt": _known(math.sqrt),
+    "exp": _known(math.exp),
+    "log": _known(math.log),
+    "sinh": _known(math.sinh),
     "min": _known(min),
     "max": _known(max),
 }

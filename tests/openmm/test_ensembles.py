@@ -23,7 +23,7 @@ from openmm_systems import (
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
 from kcons.constraints import Angle, Distance, Sphere
-from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
@@ -123,6 +123,72 @@ def test_kinetic_energy_stays(scheme, platform):
     assert ensemble.count == 6 * 27 - 3
     kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
     assert kelvin == pytest.approx(300, rel=1e-12)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
+def test_kinetic_energy_stays_for_a_million_steps(scheme):
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12, ensemble=Isokinetic())
+    context = started(system, integrator, x, v)
+    integrator.step(1)
+    first = twice_kinetic(system, state_of(context)[1])
+    for _ in range(1000):
+        integrator.step(1000)
+        assert abs(twice_kinetic(system, state_of(context)[1]) / first - 1) <= 1e-13
+
+
+def test_calls_of_any_length_make_the_same_motion():
+    """Two half kicks at one place are a whole one: in between, K and the pseudo-energy need not be looked at."""
+    system, x, v = alanine()
+    ends = []
+    for blocks in ([60], [1] * 60, [7, 30, 23]):
+        ensemble = Isokinetic(300.0)
+        integrator = ProjectedIntegrator(1e-3, tolerance=1e-13, ensemble=ensemble)
+        context = started(system, integrator, x, v)
+        for steps in blocks:
+            integrator.step(steps)
+        ends.append((*state_of(context), ensemble.conserved_energy(integrator)))
+    for other in ends[1:]:
+        assert np.abs(other[0] - ends[0][0]).max() <= 1e-12
+        assert np.abs(other[1] - ends[0][1]).max() <= 1e-10
+        assert other[2] == pytest.approx(ends[0][2], rel=1e-10)
+    unseen, seen = integrator.counts(seen=False), integrator.counts()
+    assert (unseen.constraint_solves, seen.constraint_solves) == (3, 4)
+    assert (unseen.passes, seen.passes) == (9, 15)
+
+
+def test_half_a_kick_is_not_owed_after_a_failure():
+    """A NaN within a call: the state of the last check, and the next step begins there with half a kick."""
+    system, x, v = alanine()
+    mine = copy.deepcopy(system)
+    bomb = openmm.CustomExternalForce("select(step(x-edge), sqrt(edge-x), 0)")
+    bomb.addGlobalParameter("edge", 1e6)
+    bomb.addParticle(0, [])
+    mine.addForce(bomb)
+
+    def begun(x, v, sign=1.0):
+        integrator = ProjectedIntegrator(1e-3, check_every=10, tolerance=1e-8, ensemble=Isokinetic())
+        return integrator, started(mine, integrator, x, sign * v, "CPU")
+
+    integrator, context = begun(x, v, 1.0)
+    forth = context.getState(positions=True).getPositions(asNumpy=True)._value[0, 0]
+    integrator.step(5)
+    moved = state_of(context)[0][0, 0]
+    sign = 1.0 if moved > forth else -1.0
+    (integrator, context), (other, twin) = begun(x, v, sign), begun(x, v, sign)
+    other.step(5)
+    context.setParameter("edge", 0.5 * (forth + state_of(twin)[0][0, 0]))
+    before = state_of(context)
+    with pytest.raises(NonFiniteError):
+        integrator.step(10)
+    np.testing.assert_array_equal(state_of(context), before)
+    context.setParameter("edge", 1e6)
+    twin.setPositions(before[0])
+    twin.setVelocities(before[1])
+    for one in (integrator, other):
+        one.step(10)
+    np.testing.assert_allclose(state_of(context), state_of(twin), rtol=0, atol=1e-6)
 
 
 def test_pseudo_energy_converges_with_the_order():
