@@ -59,6 +59,26 @@ class OverdeterminedError(ConstraintError):
     """The rows leave no degree of freedom although something moves."""
 
 
+class BudgetError(ConstraintError):
+    """A prescribed production of entropy cannot be met from the start of a run.
+
+    Attributes
+    ----------
+    budget : float
+        What was asked for, T(s_eq - s_0).
+    consistent : float
+        What the start allows.
+    time : float
+        When the prescription would fail; infinite if it would never end at equilibrium.
+    """
+
+    def __init__(self, message: str, *, budget: float, consistent: float, time: float) -> None:
+        super().__init__(message)
+        self.budget = budget
+        self.consistent = consistent
+        self.time = time
+
+
 class ConvergenceError(KconsError, RuntimeError):
     """No solution was found within the tolerance; positions and velocities are unchanged.
 

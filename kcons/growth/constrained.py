@@ -1,0 +1,312 @@
+"""Growth under constraints (notes section 4.3.1).
+
+    dx/dt = Psi + G (phi + z),   A dx/dt = b,   z = A^T lambda,   (A G A^T) lambda = b - A(Psi + G phi)
+
+(eqs. 124-141). z acts as an additional relative rate, so that positivity is untouched: with Psi = 0,
+d ln x/dt = phi + z.
+
+References
+----------
+Horvath & Kneller, J. Chem. Phys. 131, 171101 (2009). Bott & Duffin, Trans. AMS 74, 99 (1953).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons import projection
+from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError, SingularGeometryError
+from kcons.growth import orthogonal_rows
+from kcons.growth.model import FloatArray, GrowthModel, Populations
+from kcons.growth.rows import EPSILON, Row
+
+#: Newton iterations of a projection at most.
+MOST_ITERATIONS = 25
+#: A projection has arrived where what is left is this many times the round-off of the row.
+ROUND_OFF = 2.0
+#: Where an iteration no longer makes it smaller, this many are accepted.
+ACCEPTED = 200.0
+#: Least ln x. Where the rows press on a species that is extinct, ln x falls like -e^(lambda t), beyond all numbers of
+#: the machine in finite time; x and x ln x are 0 long before. A fall ends here; a return starts from here.
+LEAST_LOGARITHM = -1e300
+
+
+class ConstrainedGrowth:
+    """A growth model with rows that it is held to.
+
+    Parameters
+    ----------
+    model : GrowthModel
+    rows : sequence of Row
+        Holonomic and velocity rows, in any order; none at all leaves the model free.
+
+    Raises
+    ------
+    ConstraintError
+        If there are more rows than species.
+
+    Examples
+    --------
+    >>> from kcons.growth import ConstrainedGrowth, GrowthModel, TotalPopulation
+    >>> model = GrowthModel(lambda t, x: [1.0, 2.0], n=2)
+    >>> system = ConstrainedGrowth(model, [TotalPopulation(2)])
+    >>> system.velocity(0.0, [0.5, 0.5]).tolist()
+    [-0.25, 0.25]
+    """
+
+    def __init__(self, model: GrowthModel, rows: Sequence[Row] | Row = ()) -> None:
+        self.model = model
+        self.rows: tuple[Row, ...] = (rows,) if isinstance(rows, Row) else tuple(rows)
+        if len(self.rows) > model.n:
+            raise ConstraintError(
+                f"{len(self.rows)} rows for {model.n} species: give at most as many rows as there are species",
+                rows=range(model.n, len(self.rows)),
+            )
+
+    @property
+    def n(self) -> int:
+        return self.model.n
+
+    # -- the start ----------------------------------------------------------------------------------
+
+    def bind(self, p: Populations) -> Self:
+        """The same system with all targets set by the start `p`.
+
+        Raises
+        ------
+        ConstraintError
+            If the start is off a row whose target was given.
+        ContradictionError
+            If the rows contradict each other at the start.
+        """
+        if len(p.x) != self.n:
+            raise InputError(f"the start has {len(p.x)} populations, the model {self.n}", item="x0")
+        bound = copy.copy(self)
+        bound.rows = tuple(row.bind(p) for row in self.rows)
+        for number, row in enumerate(bound.rows):
+            row.check(p, number)
+        for what, values in (("rate", bound.model.rates(p)), ("source", bound.model.sources(p))):
+            if values is not None and not np.all(np.isfinite(values)):
+                species = int(np.argwhere(~np.isfinite(values))[0][0])
+                raise InputError(f"the {what} of species {species} at the start is not finite", item="rates")
+        bound._refuse(bound._solve(p, bound.model.drift(p)), p)
+        return bound
+
+    def take(self, lanes: NDArray[np.intp]) -> Self:
+        """Some of N systems side by side."""
+        taken = copy.copy(self)
+        taken.model = self.model.take(lanes)
+        taken.rows = tuple(row.take(lanes) for row in self.rows)
+        return taken
+
+    # -- the constrained equation of motion ----------------------------------------------------------
+
+    def _solve(self, p: Populations, drift: FloatArray) -> orthogonal_rows.Solution:
+        return orthogonal_rows.solve(
+            p.x, [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows], drift
+        )
+
+    def _refuse(self, found: orthogonal_rows.Solution, p: Populations) -> None:
+        """Raise where the rank is lost and the rows ask for the impossible."""
+        off = found.contradiction > orthogonal_rows.SOLVABILITY_TOLERANCE
+        if not np.any(off):
+            return
+        index = np.argwhere(off)[0]
+        row = int(index[0])
+        time = float(np.broadcast_to(p.time, p.x.shape[1:])[tuple(index[1:])])
+        message = (
+            f"row {row} ({self.rows[row].name}) depends on the rows before it at t = {time:.8g} and contradicts them: "
+            f"its right side is off by {found.contradiction[tuple(index)]:.3g} of its terms"
+        )
+        # The same rows at a state some way off: dependent everywhere, or only here?
+        lane = index[1:2]
+        here = self.take(lane) if len(lane) else self
+        log_x = p.log_x[:, lane] if len(lane) else p.log_x
+        shift = 0.1 * np.cos(np.arange(1.0, self.n + 1)).reshape(-1, *(1,) * (log_x.ndim - 1))
+        away = Populations.from_logarithms(
+            np.full(len(lane), time) if len(lane) else time, np.maximum(log_x, -30.0) + shift
+        )
+        gradients = np.array([r.gradient(away).reshape(self.n) for r in here.rows])
+        if projection.rank(gradients) < len(self.rows):
+            raise ContradictionError(message + "; remove one of the rows or change its rate", rows=[row])
+        raise SingularGeometryError(
+            message
+            + "; the rows are independent elsewhere: stop before this time (an event), or prescribe a rate that "
+            "fades as the rank does",
+            rows=[row],
+        )
+
+    def logarithmic_velocity(self, p: Populations) -> FloatArray:
+        """d ln x/dt = phi + z + Psi/x, shape of p.x; what `solve` integrates.
+
+        Raises
+        ------
+        ContradictionError, SingularGeometryError
+            Where the rank is lost and the rows contradict each other, for a single system.
+        """
+        phi = self.model.rates(p)
+        psi = self.model.sources(p)
+        with np.errstate(all="ignore"):
+            drift = p.x * phi if psi is None else p.x * phi + psi
+            if not self.rows:
+                slope = np.array(phi)
+            else:
+                found = self._solve(p, drift)
+                if p.x.ndim == 1:
+                    self._refuse(found, p)
+                slope = phi + found.z
+            if psi is not None:
+                slope = slope + psi * np.exp(-p.log_x)
+            fallen = p.log_x < LEAST_LOGARITHM
+            if fallen.any():
+                slope[fallen & (slope < 0)] = 0.0
+        return slope
+
+    def velocity(self, t: float, x: ArrayLike) -> FloatArray:
+        """dx/dt (notes eq. 133), shape of x."""
+        p = Populations.from_values(t, x)
+        drift = self.model.drift(p)
+        found = self._solve(p, drift)
+        self._refuse(found, p)
+        return drift + p.x * found.z
+
+    def constraint_rates(self, t: float, x: ArrayLike) -> FloatArray:
+        """z, shape of x (notes eqs. 137, 139)."""
+        p = Populations.from_values(t, x)
+        found = self._solve(p, self.model.drift(p))
+        self._refuse(found, p)
+        return found.z
+
+    def multipliers(self, t: float, x: ArrayLike) -> FloatArray:
+        """lambda with z = A^T lambda, shape (m,) or (m, N) (notes eq. 138); of least norm where rows depend."""
+        p = Populations.from_values(t, x)
+        found = self._solve(p, self.model.drift(p))
+        self._refuse(found, p)
+        if p.x.ndim == 1 and np.any(found.dependent):
+            A = np.array([row.gradient(p) for row in self.rows])
+            return np.asarray(projection.pseudo_inverse(A.T).matrix @ found.z)
+        return found.multipliers
+
+    # -- the formulas of the notes, literally and densely, for one system ----------------------------
+
+    def rows_and_rates(self, t: float, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """A, shape (m, n), and b, shape (m,) (notes eqs. 128-130)."""
+        p = self._one(t, x)
+        A = np.array([row.gradient(p) for row in self.rows]).reshape(-1, self.n)
+        return A, np.array([float(row.rate(p)) for row in self.rows])
+
+    def constrained_inverse(self, t: float, x: ArrayLike) -> FloatArray:
+        """G_perp+ = A^T (A G A^T)^-1 A = (P_perp G P_perp)+, shape (n, n) (notes eqs. 140, 141)."""
+        p = self._one(t, x)
+        A, _ = self.rows_and_rates(t, x)
+        root = np.sqrt(p.x)
+        # (A G A^T)+ = (C+)^T C+ with C = A G^1/2.
+        C_plus = projection.pseudo_inverse(A * root).matrix
+        return np.asarray(A.T @ (C_plus.T @ (C_plus @ A)))
+
+    def least_rate(self, t: float, x: ArrayLike) -> FloatArray:
+        """h = A+ b - Psi - G phi, shape (n,), so that z = G_perp+ h (notes eqs. 134, 139)."""
+        p = self._one(t, x)
+        A, b = self.rows_and_rates(t, x)
+        return np.asarray(projection.pseudo_inverse(A).matrix @ b - self.model.drift(p))
+
+    def perpendicular_velocity(self, t: float, x: ArrayLike) -> FloatArray:
+        """A+ b, the part of dx/dt that the rows fix by themselves, shape (n,) (notes eqs. 131, 132)."""
+        A, b = self.rows_and_rates(t, x)
+        return np.asarray(projection.pseudo_inverse(A).matrix @ b)
+
+    def _one(self, t: float, x: ArrayLike) -> Populations:
+        p = Populations.from_values(t, x)
+        if p.x.shape != (self.n,):
+            raise InputError(f"this formula is for one system, shape ({self.n},), not {p.x.shape}", item="x")
+        return p
+
+    # -- the holonomic rows as conditions on the state ------------------------------------------------
+
+    def residuals(self, p: Populations) -> FloatArray:
+        """sigma - sigma0 of the holonomic rows, shape (m_h,) or (m_h, N)."""
+        values = [np.broadcast_to(row.value(p), p.x.shape[1:]) for row in self.rows if row.holonomic]
+        return np.array(values).reshape(len(values), *p.x.shape[1:])
+
+    def project(self, time: float | FloatArray, log_x: FloatArray) -> FloatArray:
+        """The state on the holonomic rows, ln x + A^T mu with the least mu; shape of log_x.
+
+        Newton's iteration in the metric of the theory: x changes by G A^T mu, hence stays positive.
+
+        Raises
+        ------
+        ConvergenceError
+            If the rows cannot be met to round-off from here, for a single system.
+        """
+        projected, left = self.try_project(time, log_x)
+        if np.ndim(left) == 0 and not left <= ACCEPTED:
+            names = ", ".join(row.name for row in self.rows if row.holonomic)
+            raise ConvergenceError(
+                f"the state at t = {float(np.max(time)):.8g} cannot be projected on its rows ({names}): "
+                f"what is left is {left:.3g} times their round-off. "
+                "Ask for a smaller rtol, or check that the rows have a solution",
+                residual=float(left) * EPSILON,
+                tolerance=ACCEPTED * EPSILON,
+                iterations=MOST_ITERATIONS,
+            )
+        return projected
+
+    def try_project(self, time: float | FloatArray, log_x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`project` without raising: the state, and what is left in units of the round-off of the rows."""
+        rows = [row for row in self.rows if row.holonomic]
+        lanes = log_x.shape[1:]
+        if not rows:
+            return log_x, np.zeros(lanes)
+        y = np.array(log_x)
+        p = Populations.from_logarithms(time, y)
+        values, left = _misses(rows, p, lanes)
+        best, best_left = y, left
+        for _ in range(MOST_ITERATIONS):
+            open_ = ~(left <= ROUND_OFF)
+            if not np.any(open_):
+                break
+            found = orthogonal_rows.solve(p.x, [r.gradient(p) for r in rows], [-v for v in values], np.zeros_like(p.x))
+            change = np.where(open_, found.z, 0.0)
+            # Populations change by no more than a factor e at once: Newton's steps are for small corrections.
+            with np.errstate(all="ignore"):
+                largest = np.max(np.abs(change) * (p.x > 0), axis=0)
+                change = change / np.maximum(largest, 1.0)
+            y = y + np.where(np.isfinite(change), change, 0.0)
+            p = Populations.from_logarithms(time, y)
+            values, left = _misses(rows, p, lanes)
+            better = left < best_left
+            stuck = ~(left < 0.5 * best_left) & (best_left <= ACCEPTED)
+            best = np.where(better, y, best)
+            best_left = np.where(better, left, best_left)
+            if np.all(stuck | (best_left <= ROUND_OFF)):
+                break
+        return best, best_left
+
+    def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[FloatArray], FloatArray] | None:
+        """How the motion goes on without integration, once nothing but the rows decides about it; None before.
+
+        Returns a function of times, shape (k,), to ln x, shape (n, k).
+        """
+        return None
+
+    def settled_lanes(self, time: FloatArray, log_x: FloatArray, tolerance: float) -> NDArray[np.bool_]:
+        """Which of N systems have settled, see `settled`; those then go on as `slow_state` says."""
+        return np.zeros(log_x.shape[1:], dtype=bool)
+
+    def slow_state(self, time: ArrayLike, accuracy: float = 0.0) -> FloatArray:
+        """ln x of a settled system, shape (n, k), at times of shape (k,)."""
+        raise NotImplementedError("a system without a slow motion of its own")
+
+
+def _misses(rows: Sequence[Row], p: Populations, lanes: tuple[int, ...]) -> tuple[list[FloatArray], FloatArray]:
+    """Values of the rows, and the largest of them in units of their round-off."""
+    values = [np.broadcast_to(row.value(p), lanes) for row in rows]
+    with np.errstate(all="ignore"):
+        sizes = [np.maximum(row.size(p), np.finfo(np.float64).tiny) for row in rows]
+        left = np.max([np.abs(v) / (EPSILON * s) for v, s in zip(values, sizes, strict=True)], axis=0)
+    return values, np.where(np.isfinite(left), left, np.inf)

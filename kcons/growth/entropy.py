@@ -1,0 +1,328 @@
+"""Entropy production as a row (notes eqs. 145-150).
+
+Closed system: T ds/dt = -sum mu dx/dt >= 0 (corrected: the notes drop the sign in the middle of (149)). A law says
+what has been produced until t, T(s(t) - s_0); with a fixed sum of x it is the same as a law for the excess
+E(t) = g(x) - g_eq, which falls from E_0 = T(s_eq - s_0). The row is sum mu dx/dt = dE/dt.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import quad
+
+from kcons.errors import BudgetError, InputError
+from kcons.growth.mixture import Mixture
+from kcons.growth.model import FloatArray, Populations
+from kcons.growth.rows import Row
+
+if TYPE_CHECKING:
+    from kcons.growth.integration import GrowthSolution
+
+#: A budget is consistent with the start where it differs by no more than this part.
+BUDGET_TOLERANCE = 1e-9
+
+
+class EntropyLaw(ABC):
+    """What entropy, times T, has been produced since the start."""
+
+    @abstractmethod
+    def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        """T(s(t) - s_0)."""
+
+    def excess(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        """E(t) = E_0 - T(s(t) - s_0); laws that end at E = 0 write it without the difference."""
+        return np.asarray(excess0 - self.produced(elapsed, excess0))
+
+    @abstractmethod
+    def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
+        """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
+
+    def check(self, excess0: FloatArray, most: FloatArray) -> None:  # noqa: B027 (optional hook)
+        """Refuse a law that the start cannot follow; `most` is the largest excess there is.
+
+        Raises
+        ------
+        BudgetError
+        """
+
+    def relaxation_rate(self) -> float | FloatArray | None:
+        """Rate at which a deviation from equilibrium decays, 0 if it stays; None if there is no such rate."""
+        return None
+
+    def take(self, lanes: NDArray[np.intp]) -> EntropyLaw:
+        return self
+
+
+class Relaxation(EntropyLaw):
+    """s(t) = s_0 + (s_eq - s_0)(1 - exp(-t/tau)) (notes eqs. 148, 149).
+
+    Parameters
+    ----------
+    tau : float or ndarray, shape (N,)
+    budget : float, optional
+        T(s_eq - s_0); left out, it is computed from the start, g(x_0) - g_eq.
+    partial : bool
+        Whether a smaller budget is meant: the system then stops short of equilibrium, in a state that keeps moving.
+
+    Raises
+    ------
+    InputError
+        If tau is not positive, or the budget negative or not finite.
+    """
+
+    def __init__(self, tau: float | FloatArray, budget: float | None = None, *, partial: bool = False) -> None:
+        self.tau: FloatArray = np.array(tau, dtype=np.float64)
+        if not np.all(np.isfinite(self.tau) & (self.tau > 0)):
+            raise InputError(f"tau is a positive time, not {tau}", item="tau")
+        if budget is not None and not (np.isfinite(budget) and budget >= 0):
+            raise InputError(f"the budget T(s_eq - s_0) is not negative, so it cannot be {budget}", item="budget")
+        self.budget = None if budget is None else float(budget)
+        self.partial = partial
+
+    def _budget(self, excess0: FloatArray) -> FloatArray:
+        # A budget that agrees with the start is the start's.
+        return np.asarray(self.budget) if self.partial and self.budget is not None else excess0
+
+    def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        return -self._budget(excess0) * np.expm1(-np.asarray(elapsed) / self.tau)
+
+    def excess(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        budget = self._budget(excess0)
+        return np.asarray(budget * np.exp(-np.asarray(elapsed) / self.tau) + (excess0 - budget))
+
+    def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
+        # Told by the state instead of the time: the same on the constraint, but errors fade instead of piling up.
+        return -(excess - (excess0 - self._budget(excess0))) / self.tau
+
+    def check(self, excess0: FloatArray, most: FloatArray) -> None:
+        if self.budget is None:
+            return
+        allowed = float(np.max(excess0))
+        share = self.budget / allowed if allowed > 0 else np.inf if self.budget else 1.0
+        if share > 1.0 + BUDGET_TOLERANCE:
+            time = float(-np.max(self.tau) * np.log1p(-1.0 / share)) if np.isfinite(share) else 0.0
+            raise BudgetError(
+                f"T(s_eq - s_0) = {self.budget:.10g} is more than the start can produce, g(x_0) - g_eq = {allowed:.10g}"
+                f": equilibrium would be reached at t = {time:.6g} with entropy still to be produced. "
+                "Leave the budget out, it is then computed",
+                budget=self.budget,
+                consistent=allowed,
+                time=time,
+            )
+        if share < 1.0 - BUDGET_TOLERANCE and not self.partial:
+            raise BudgetError(
+                f"T(s_eq - s_0) = {self.budget:.10g} is less than what lies between the start and equilibrium, "
+                f"g(x_0) - g_eq = {allowed:.10g}: the system would stop producing at an excess of "
+                f"{allowed - self.budget:.6g}, and s_eq would not be the entropy at equilibrium. Leave the budget out, "
+                "it is then computed, or say partial=True if this is meant",
+                budget=self.budget,
+                consistent=allowed,
+                time=np.inf,
+            )
+
+    def relaxation_rate(self) -> float | FloatArray | None:
+        return 1.0 / (2.0 * self.tau) if not self.partial else None
+
+    def take(self, lanes: NDArray[np.intp]) -> Self:
+        taken = copy.copy(self)
+        if self.tau.ndim:
+            taken.tau = self.tau[lanes]
+        return taken
+
+
+class NoProduction(EntropyLaw):
+    """ds = 0 (notes eq. 150)."""
+
+    def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        return np.zeros(np.broadcast_shapes(np.shape(elapsed), np.shape(excess0)))
+
+    def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
+        return np.zeros(np.shape(excess))
+
+    def relaxation_rate(self) -> float | FloatArray | None:
+        return 0.0
+
+
+class PrescribedProduction(EntropyLaw):
+    """A production of your own.
+
+    Parameters
+    ----------
+    produced : callable, t -> float
+        T(s(t) - s_0), t counted from the start; 0 at t = 0. May fall (entropy taken from outside).
+    rate : callable, t -> float
+        Its time derivative.
+    until : float
+        The time up to which it will be asked for: so far it is checked.
+
+    Raises
+    ------
+    InputError
+        If `rate` is not the derivative of `produced`, or `until` is not positive.
+    """
+
+    #: Times at which a prescription is looked at before a run.
+    LOOKS = 2001
+
+    def __init__(self, produced: Callable[[float], float], rate: Callable[[float], float], *, until: float) -> None:
+        if not (np.isfinite(until) and until > 0):
+            raise InputError("`until` is a positive time", item="until")
+        self._produced, self._rate, self.until = produced, rate, float(until)
+        if abs(produced(0.0)) > 1e-12:
+            raise InputError(f"nothing has been produced at t = 0, not {produced(0.0):.6g}", item="produced")
+        times = np.linspace(0.0, until, 101)
+        pieces = [quad(rate, a, b, epsabs=1e-12, epsrel=1e-11)[0] for a, b in pairwise(times)]
+        off = np.abs(np.cumsum(pieces) - [produced(t) for t in times[1:]])
+        if not np.max(off) <= 1e-8 * max(1.0, float(np.max(np.abs(np.cumsum(pieces))))):
+            k = int(np.argmax(~(off <= 1e-8)))
+            raise InputError(
+                f"the integral of the rate is not what is produced: at t = {times[k + 1]:.6g} they differ by "
+                f"{off[k]:.3g}",
+                item="rate",
+            )
+
+    def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
+        return np.vectorize(self._produced, otypes=[np.float64])(elapsed)
+
+    def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
+        return -np.vectorize(self._rate, otypes=[np.float64])(elapsed)
+
+    def check(self, excess0: FloatArray, most: FloatArray) -> None:
+        times = np.linspace(0.0, self.until, self.LOOKS)
+        left = float(np.min(excess0)) - self.produced(times, excess0)
+        for bad, reason in (
+            (left < -1e-12 * np.max(excess0), "more than lies between the start and equilibrium"),
+            (left > float(np.min(most)), "more entropy taken away than the populations can give up"),
+        ):
+            if np.any(bad):
+                time = float(times[np.argmax(bad)])
+                raise BudgetError(
+                    f"the prescribed production asks for {reason} from t = {time:.6g} on; the start allows "
+                    f"T(s - s_0) between {float(np.max(excess0) - np.min(most)):.6g} and {float(np.min(excess0)):.6g}",
+                    budget=float(self.produced(time, excess0)),
+                    consistent=float(np.min(excess0)),
+                    time=time,
+                )
+
+
+class EntropyRow(Row):
+    """The Gibbs energy of a mixture follows an entropy law; to be used together with `TotalPopulation`.
+
+    Its row of A is mu - g_eq/c, that is mu with mu0 shifted by a common constant, which drops out where sum x is kept
+    and lets the row fade cleanly at equilibrium.
+    """
+
+    holonomic = True
+    name = "entropy production"
+
+    def __init__(self, mixture: Mixture, law: EntropyLaw) -> None:
+        self.mixture = mixture
+        self.law = law
+        self.start: float | FloatArray = 0.0
+        self.total: FloatArray | None = None
+        self.excess0: FloatArray | None = None
+
+    def _total(self, p: Populations) -> FloatArray:
+        return np.asarray(np.sum(p.x, axis=0)) if self.total is None else self.total
+
+    def law_excess(self, time: float | FloatArray) -> FloatArray:
+        """E(t) = g - g_eq as the law has it, for a row that is bound to a start."""
+        assert self.excess0 is not None
+        return self.law.excess(np.asarray(time) - self.start, self.excess0)
+
+    def gradient(self, p: Populations) -> FloatArray:
+        return self.mixture.excess_gradient(p, self._total(p))
+
+    def rate(self, p: Populations) -> FloatArray:
+        excess = self.mixture.excess(p, self._total(p))
+        excess0 = excess if self.excess0 is None else self.excess0
+        return self.law.excess_rate(np.asarray(p.time) - self.start, excess, excess0)
+
+    def value(self, p: Populations) -> FloatArray:
+        return self.mixture.excess(p, self._total(p)) - self.law_excess(p.time)
+
+    def size(self, p: Populations) -> FloatArray:
+        # ln x carries an error of some 1e-16 of itself, which enters through the gradient.
+        slope = np.sum(p.x * np.abs(self.gradient(p)) * np.maximum(1.0, np.abs(p.log_x)), axis=0)
+        return np.abs(self.law_excess(p.time)) + slope
+
+    def bind(self, p: Populations) -> EntropyRow:
+        bound = copy.copy(self)
+        bound.start = p.time
+        bound.total = np.asarray(np.sum(p.x, axis=0))
+        bound.excess0 = self.mixture.excess(p, bound.total)
+        most = self.mixture.largest_gibbs_energy(bound.total) - self.mixture.least_gibbs_energy(bound.total)
+        self.law.check(bound.excess0, np.asarray(most))
+        return bound
+
+    def take(self, lanes: NDArray[np.intp]) -> EntropyRow:
+        taken = copy.copy(self)
+        taken.mixture, taken.law = self.mixture.take(lanes), self.law.take(lanes)
+        if np.ndim(self.start):
+            taken.start = np.asarray(self.start)[lanes]
+        if self.total is not None and self.total.ndim:
+            taken.total = self.total[lanes]
+        if self.excess0 is not None and self.excess0.ndim:
+            taken.excess0 = self.excess0[lanes]
+        return taken
+
+
+class EntropyBalance(NamedTuple):
+    """Three ways to the entropy, times T, that a solution has produced.
+
+    Attributes
+    ----------
+    lost : float
+        g(x_0) - g(x(t)), from the two ends alone.
+    integrated : float
+        The integral of -sum mu dx/dt along the solution.
+    prescribed : float
+        What the law says.
+    """
+
+    lost: float
+    integrated: float
+    prescribed: float
+
+
+def entropy_balance(solution: GrowthSolution, nodes: int = 8) -> EntropyBalance:
+    """Whether the entropy produced is the integral of its prescribed rate.
+
+    Parameters
+    ----------
+    solution : GrowthSolution
+        Of a system with an `EntropyRow`, with dense_output=True.
+    nodes : int
+        Gauss points between two times of the solution.
+
+    Raises
+    ------
+    InputError
+        If the solution has no interpolant, or its system no entropy row.
+    """
+    row = next((r for r in solution.system.rows if isinstance(r, EntropyRow)), None)
+    if row is None or row.total is None or row.excess0 is None:
+        raise InputError("the system of this solution has no row of entropy production", item="solution")
+    if solution.sol is None:
+        raise InputError(
+            "the integral needs the solution between its times: solve(..., dense_output=True)", item="solution"
+        )
+    points, weights = np.polynomial.legendre.leggauss(nodes)
+    integrated = 0.0
+    for a, b in pairwise(solution.t):
+        times = 0.5 * (a + b) + 0.5 * (b - a) * points
+        for t, weight, log_x in zip(times, weights, solution.sol.logarithms(times).T, strict=True):
+            p = Populations.from_logarithms(float(t), log_x)
+            dx = p.x * solution.system.logarithmic_velocity(p)
+            integrated -= 0.5 * (b - a) * weight * float(np.sum(row.mixture.potentials(p) * dx))
+    ends = [Populations.from_logarithms(float(solution.t[k]), solution.log_y[:, k]) for k in (0, -1)]
+    lost = float(row.mixture.excess(ends[0], row.total) - row.mixture.excess(ends[1], row.total))
+    prescribed = float(row.excess0 - row.law_excess(float(solution.t[-1])))
+    return EntropyBalance(lost, integrated, prescribed)

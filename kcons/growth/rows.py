@@ -1,0 +1,284 @@
+"""Rows: what a growth model is held to.
+
+A row asks  sum_j A_j(x, t) dx_j/dt = b(x, t)  (notes eqs. 127, 128). Holonomic rows come from a function of the
+state that keeps its value, sigma(x, t) = sigma0 (eq. 126), so that A = d sigma/dx and b = -d sigma/dt (eqs. 129, 130);
+because they have a value, the state can be projected back on them to round-off.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.errors import ConstraintError, InputError
+from kcons.growth.model import FloatArray, OfState, Populations, evaluate
+
+#: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
+START_TOLERANCE = 1e-10
+EPSILON = float(np.finfo(np.float64).eps)
+
+
+class Row(ABC):
+    """One row of A dx/dt = b."""
+
+    #: Whether the row has a value that the state is projected on.
+    holonomic: bool = False
+    name: str = "row"
+
+    @abstractmethod
+    def gradient(self, p: Populations) -> FloatArray:
+        """The row of A, shape of p.x."""
+
+    @abstractmethod
+    def rate(self, p: Populations) -> FloatArray | float:
+        """b, a number a system."""
+
+    def value(self, p: Populations) -> FloatArray | float:
+        """sigma - sigma0, a number a system; 0 on the constraint."""
+        raise NotImplementedError(f"{self.name} has no value")
+
+    def size(self, p: Populations) -> FloatArray | float:
+        """The size of the terms that `value` is the difference of: its round-off is some 1e-16 of this."""
+        raise NotImplementedError(f"{self.name} has no value")
+
+    def bind(self, p: Populations) -> Row:
+        """The row that holds what it found at the start `p`."""
+        return self
+
+    def take(self, lanes: NDArray[np.intp]) -> Row:
+        """The row of some of N systems side by side."""
+        return self
+
+    def check(self, p: Populations, number: int) -> None:
+        """Refuse a start that is off the row.
+
+        Raises
+        ------
+        ConstraintError
+            If the start does not lie on it.
+        """
+        if not self.holonomic:
+            return
+        off = np.max(np.abs(self.value(p)) / np.maximum(self.size(p), np.finfo(np.float64).tiny))
+        if not off <= START_TOLERANCE:
+            raise ConstraintError(
+                f"the start is off row {number} ({self.name}): relative deviation {off:.3g}. Start on it, or leave the "
+                "target out to keep the value found at the start",
+                rows=[number],
+            )
+
+
+class HolonomicRow(Row):
+    """sigma(t, x) = target (notes eq. 126).
+
+    Parameters
+    ----------
+    function : callable (t, x) -> float
+        sigma.
+    gradient : callable (t, x) -> (n,), optional
+        d sigma/dx; by central differences where it is not given.
+    time_derivative : callable (t, x) -> float, optional
+        d sigma/dt at fixed x; left out, sigma does not depend on t.
+    target : float, optional
+        The value to be kept; left out, the one found at the start.
+    vectorized : bool
+        Whether the functions take x of shape (n, N) with times of shape (N,).
+    """
+
+    holonomic = True
+
+    def __init__(
+        self,
+        function: OfState,
+        gradient: OfState | None = None,
+        time_derivative: OfState | None = None,
+        *,
+        target: float | None = None,
+        vectorized: bool = False,
+        name: str = "holonomic row",
+    ) -> None:
+        self._function = function
+        self._gradient = gradient
+        self._time_derivative = time_derivative
+        self.target: float | FloatArray | None = None if target is None else _number(target, "target")
+        self.vectorized = vectorized
+        self.name = name
+
+    def measure(self, p: Populations) -> FloatArray:
+        """sigma itself."""
+        return evaluate(self._function, p, 0, self.vectorized, self.name)
+
+    def value(self, p: Populations) -> FloatArray:
+        if self.target is None:
+            raise ConstraintError(f"{self.name} has no target yet: it is set by the start, see bind()")
+        return self.measure(p) - self.target
+
+    def size(self, p: Populations) -> FloatArray:
+        return np.sum(np.abs(self.gradient(p)) * p.x, axis=0) + np.abs(self.target if self.target is not None else 0.0)
+
+    def gradient(self, p: Populations) -> FloatArray:
+        if self._gradient is not None:
+            return evaluate(self._gradient, p, len(p.x), self.vectorized, f"gradient of {self.name}")
+        return relative_differences(self.measure, p)
+
+    def rate(self, p: Populations) -> FloatArray | float:
+        if self._time_derivative is None:
+            return 0.0
+        return -evaluate(self._time_derivative, p, 0, self.vectorized, f"time derivative of {self.name}")
+
+    def bind(self, p: Populations) -> Self:
+        if self.target is not None:
+            return self
+        bound = copy.copy(self)
+        bound.target = self.measure(p)
+        return bound
+
+    def take(self, lanes: NDArray[np.intp]) -> Self:
+        taken = copy.copy(self)
+        if isinstance(self.target, np.ndarray) and self.target.ndim:
+            taken.target = self.target[lanes]
+        return taken
+
+
+class LinearRow(HolonomicRow):
+    """sum_i c_i x_i = target; left out, the target is what the start gives.
+
+    Parameters
+    ----------
+    coefficients : array_like, shape (n,)
+    target : float or callable t -> (value, rate), optional
+        A moving target returns its value and its time derivative.
+
+    Raises
+    ------
+    InputError
+        Coefficients that are not finite, or all zero.
+    """
+
+    def __init__(
+        self,
+        coefficients: ArrayLike,
+        target: float | Callable[[float], tuple[float, float]] | None = None,
+        *,
+        name: str = "linear row",
+    ) -> None:
+        c = np.array(coefficients, dtype=np.float64)
+        if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
+            raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
+        self.coefficients: FloatArray = c
+        self.vectorized = True
+        self.name = name
+        self.moving = target if callable(target) else None
+        self.target = None if target is None or callable(target) else _number(target, "target")
+
+    def _columns(self, p: Populations) -> FloatArray:
+        if len(p.x) != len(self.coefficients):
+            raise InputError(
+                f"{self.name} has {len(self.coefficients)} coefficients, there are {len(p.x)} species",
+                item="coefficients",
+            )
+        return self.coefficients.reshape(-1, *(1,) * (p.x.ndim - 1))
+
+    def measure(self, p: Populations) -> FloatArray:
+        return np.asarray(np.sum(self._columns(p) * p.x, axis=0))
+
+    def gradient(self, p: Populations) -> FloatArray:
+        return np.broadcast_to(self._columns(p), p.x.shape)
+
+    def _moved(self, p: Populations, item: int) -> FloatArray:
+        moving = self.moving
+        assert moving is not None
+        return np.asarray(np.vectorize(lambda t: moving(t)[item], otypes=[np.float64])(p.time))
+
+    def value(self, p: Populations) -> FloatArray:
+        return self.measure(p) - self._moved(p, 0) if self.moving else super().value(p)
+
+    def rate(self, p: Populations) -> FloatArray | float:
+        return self._moved(p, 1) if self.moving else 0.0
+
+    def bind(self, p: Populations) -> Self:
+        return self if self.moving else super().bind(p)
+
+
+class TotalPopulation(LinearRow):
+    """sum_i x_i = target (notes eqs. 143, 144), for n species; left out, the target is the sum at the start."""
+
+    def __init__(self, n: int, target: float | Callable[[float], tuple[float, float]] | None = None) -> None:
+        if n < 1:
+            raise InputError(f"there is at least one species, not {n}", item="n")
+        super().__init__(np.ones(n), target, name="total population")
+
+
+class VelocityRow(Row):
+    """sum_j A_j(t, x) dx_j/dt = b(t, x) (notes eq. 127), that need not come from any function of the state.
+
+    Parameters
+    ----------
+    coefficients : callable (t, x) -> (n,), or array_like, shape (n,)
+        A.
+    rate : callable (t, x) -> float, or float
+        b.
+    vectorized : bool
+        Whether the functions take x of shape (n, N) with times of shape (N,).
+    """
+
+    def __init__(
+        self,
+        coefficients: OfState | ArrayLike,
+        rate: OfState | float = 0.0,
+        *,
+        vectorized: bool = False,
+        name: str = "velocity row",
+    ) -> None:
+        self._coefficients = coefficients
+        self._rate = rate if callable(rate) else _number(rate, "rate")
+        self.vectorized = vectorized
+        self.name = name
+
+    def gradient(self, p: Populations) -> FloatArray:
+        if callable(self._coefficients):
+            return evaluate(self._coefficients, p, len(p.x), self.vectorized, f"coefficients of {self.name}")
+        c = np.asarray(self._coefficients, dtype=np.float64)
+        if c.shape != (len(p.x),):
+            raise InputError(f"{self.name}: {c.shape} coefficients for {len(p.x)} species", item="coefficients")
+        return np.broadcast_to(c.reshape(-1, *(1,) * (p.x.ndim - 1)), p.x.shape)
+
+    def rate(self, p: Populations) -> FloatArray | float:
+        if callable(self._rate):
+            return evaluate(self._rate, p, 0, self.vectorized, f"rate of {self.name}")
+        return self._rate
+
+
+def relative_differences(
+    measure: Callable[[Populations], FloatArray], p: Populations, step: float = 0.02
+) -> FloatArray:
+    """d measure/dx by central differences in ln x, extrapolated to order six (steps h, h/2, h/4)."""
+    gradient = np.empty_like(p.x)
+    for i in range(len(p.x)):
+        slopes = []
+        for h in (step, step / 2, step / 4):
+            ends = []
+            for sign in (1.0, -1.0):
+                log_x = p.log_x.copy()
+                log_x[i] += sign * h
+                ends.append(measure(Populations.from_logarithms(p.time, log_x)))
+            # d/dx of a function that is linear in x comes out exactly.
+            slopes.append((ends[0] - ends[1]) / (2.0 * np.sinh(h) * p.x[i]))
+        first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
+        gradient[i] = (16 * second - first) / 15
+    return gradient
+
+
+def _number(value: float, item: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{item} is a number, not {value!r}", item=item) from None
+    if not np.isfinite(number):
+        raise InputError(f"{item} is not finite", item=item)
+    return number

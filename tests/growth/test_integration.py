@@ -1,0 +1,136 @@
+"""`solve` has the interface of SciPy's solve_ivp, and keeps what it is told to keep."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from kcons.errors import InputError, SingularGeometryError, UnsupportedError
+from kcons.growth import (
+    ConstrainedGrowth,
+    GrowthModel,
+    Hypercycle,
+    Logistic,
+    Populations,
+    TotalPopulation,
+    VelocityRow,
+    solve,
+)
+
+X0 = np.array([0.6, 0.1, 0.1, 0.1, 0.1])
+
+
+def test_agrees_with_solve_ivp_and_multipliers_by_hand():
+    k = 3.0
+
+    def by_hand(t, x):
+        rates = k * np.roll(x, -1)
+        return x * (rates - x @ rates / x.sum())
+
+    wanted = solve_ivp(by_hand, (0.0, 10.0), X0, method="DOP853", rtol=1e-12, atol=1e-14, t_eval=[0.0, 3.0, 10.0])
+    found = solve(Hypercycle().with_fixed_total(), (0.0, 10.0), X0, t_eval=[0.0, 3.0, 10.0], rtol=1e-11, atol=1e-12)
+    assert found.y == pytest.approx(wanted.y, abs=1e-10)
+    for name in ("t", "y", "sol", "t_events", "y_events", "nfev", "njev", "nlu", "status", "message", "success"):
+        assert hasattr(found, name)
+        assert type(getattr(found, name)) is type(getattr(wanted, name))
+
+
+@pytest.mark.parametrize("method", ["RK23", "RK45", "DOP853", "Radau", "BDF"])
+def test_rows_hold_to_round_off_with_every_method(method):
+    system = Hypercycle().with_entropy_production(5.0)
+    found = solve(system, (0.0, 2.0), X0, method, rtol=1e-5, atol=1e-6, dense_output=True)
+    assert found.success
+    assert abs(found.residuals()).max() < 1e-15
+    # Between the steps as well.
+    times = np.linspace(0.0, 2.0, 57)
+    between = found.sol.logarithms(times)
+    assert abs(found.system.residuals(Populations.from_logarithms(times, between))).max() < 1e-15
+    fine = solve(system, (0.0, 2.0), X0, t_eval=times, rtol=1e-10, atol=1e-11)
+    assert np.exp(between) == pytest.approx(fine.y, abs=2e-4)
+
+
+def test_without_projection_the_rows_drift():
+    system = Hypercycle().with_entropy_production(5.0)
+    free = solve(system, (0.0, 10.0), X0, "RK45", rtol=1e-4, atol=1e-5, project=False)
+    assert abs(free.residuals()).max() > 1e-7
+
+
+def test_dense_output_at_one_time_and_at_many():
+    found = solve(Hypercycle().with_fixed_total(), (0.0, 3.0), X0, dense_output=True)
+    assert found.sol(1.5).shape == (5,)
+    assert found.sol([1.5, 2.0]).shape == (5, 2)
+    assert found.sol(found.t) == pytest.approx(found.y, rel=1e-12)
+    assert solve(Hypercycle().with_fixed_total(), (0.0, 1.0), X0).sol is None
+
+
+def test_events():
+    def half(t, x):
+        return x[0] - 5.0
+
+    half.terminal = True
+    model = Logistic(1.0, 0.1)
+    found = solve(ConstrainedGrowth(model), (0.0, 50.0), [1.0], events=half)
+    assert found.status == 1
+    assert found.t_events[0] == pytest.approx([np.log(9.0)], abs=1e-8)
+    assert found.y_events[0] == pytest.approx(np.array([[5.0]]), rel=1e-8)
+    assert found.t[-1] == found.t_events[0][-1]
+
+
+def test_events_of_a_motion_that_has_settled():
+    model = Hypercycle()
+    system = model.with_entropy_production(30.0)
+
+    def nearly(t, x):
+        # Taken from the law: excess of 1e-12.
+        return float(model.mixture.excess(Populations.from_values(t, x), 1.0)) * 1e12 - 1.0
+
+    nearly.terminal = True
+    found = solve(system, (0.0, 5000.0), X0, events=nearly, rtol=1e-7, atol=1e-8)
+    assert found.status == 1
+    assert found.settled_time < found.t_events[0][0] == found.t[-1]
+    assert found.t[-1] == pytest.approx(30.0 * np.log(0.3344071481541323e12), abs=1e-3)
+
+
+def test_backwards_in_time():
+    system = Hypercycle().with_fixed_total()
+    there = solve(system, (0.0, 3.0), X0, rtol=1e-11, atol=1e-12)
+    back = solve(system, (3.0, 0.0), there.y[:, -1], t_eval=[2.0, 0.0], rtol=1e-11, atol=1e-12)
+    assert back.y[:, -1] == pytest.approx(X0, rel=1e-9)
+
+
+def test_start_as_logarithms():
+    log_x0 = np.array([0.0, -5000.0])
+    model = GrowthModel(lambda t, x: [0.0, 1000.0], n=2)
+    found = solve(ConstrainedGrowth(model), (0.0, 5.0), log_x0=log_x0)
+    assert found.log_y[:, -1] == pytest.approx([0.0, 0.0], abs=1e-8)
+
+
+def test_rank_that_is_lost_on_the_way_is_named():
+    # The row (1, x2) becomes a multiple of (1, 1) at x2 = 1 and asks for the impossible there.
+    model = GrowthModel(lambda t, x: [0.0, 0.0], n=2)
+    rows = [TotalPopulation(2), VelocityRow(lambda t, x: [1.0, x[1]], 0.5)]
+    with pytest.raises(SingularGeometryError, match=r"row 1 .* at t = 0") as caught:
+        solve(ConstrainedGrowth(model, rows), (0.0, 1.0), [1.0, 1.0 + 1e-14])
+    assert caught.value.rows == (1,)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "error"),
+    [
+        ({"method": "LSODA"}, UnsupportedError),
+        ({"method": "Euler"}, InputError),
+        ({"t_span": (0.0, np.inf)}, InputError),
+        ({"t_span": 3.0}, InputError),
+        ({"t_eval": [0.5, 2.0]}, InputError),
+        ({"t_eval": [0.5, 0.2]}, InputError),
+        ({"x0": None}, InputError),
+        ({"x0": [0.5, 0.5]}, InputError),
+        ({"x0": [1.0, -1.0, 1.0, 1.0, 1.0]}, InputError),
+        ({"x0": [1.0, 0.0, 1.0, 1.0, 1.0]}, InputError),
+        ({"log_x0": np.zeros(5)}, InputError),
+        ({"x0": None, "log_x0": [0.0, 0.0, 0.0, 0.0, np.nan]}, InputError),
+    ],
+)
+def test_bad_input_is_refused(keywords, error):
+    arguments = {"t_span": (0.0, 1.0), "x0": X0, **keywords}
+    with pytest.raises(error):
+        solve(Hypercycle().with_fixed_total(), **arguments)

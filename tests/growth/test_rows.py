@@ -1,0 +1,104 @@
+"""Rows: their gradients, rates, targets, and what they refuse."""
+
+import numpy as np
+import pytest
+
+from kcons.errors import ConstraintError, InputError
+from kcons.growth import (
+    ConstrainedGrowth,
+    GrowthModel,
+    HolonomicRow,
+    LinearRow,
+    Populations,
+    TotalPopulation,
+    VelocityRow,
+    solve,
+)
+from kcons.growth.rows import relative_differences
+
+P = Populations.from_values(0.3, [0.5, 1.5, 2.5])
+MANY = Populations.from_values(np.array([0.3, 0.7]), [[0.5, 1.0], [1.5, 2.0], [2.5, 0.2]])
+
+
+def product(t, x):
+    return x[0] * x[1] ** 2 * np.exp(-t) + np.sin(x[2])
+
+
+def product_gradient(t, x):
+    return np.array([x[1] ** 2 * np.exp(-t), 2 * x[0] * x[1] * np.exp(-t), np.cos(x[2])])
+
+
+def test_differences_agree_with_the_gradient():
+    row = HolonomicRow(product)
+    assert row.gradient(P) == pytest.approx(product_gradient(0.3, P.x), rel=1e-12)
+    assert relative_differences(row.measure, MANY)[:, 1] == pytest.approx(
+        product_gradient(0.7, MANY.x[:, 1]), rel=1e-12
+    )
+
+
+def test_gradient_by_its_taylor_remainder():
+    row = HolonomicRow(product, product_gradient)
+    direction = np.array([0.3, -0.2, 0.5])
+    slope = row.gradient(P) @ direction
+    left = [
+        row.measure(Populations.from_values(0.3, P.x + h * direction)) - row.measure(P) - h * slope
+        for h in (1e-3, 5e-4)
+    ]
+    assert left[0] / left[1] == pytest.approx(4.0, rel=1e-2)
+
+
+def test_rate_is_minus_the_time_derivative():
+    row = HolonomicRow(product, product_gradient, lambda t, x: -x[0] * x[1] ** 2 * np.exp(-t))
+    assert row.rate(P) == pytest.approx(0.5 * 1.5**2 * np.exp(-0.3))
+    assert HolonomicRow(product).rate(P) == 0.0
+
+
+def test_target_is_what_the_start_gives():
+    row = HolonomicRow(product).bind(P)
+    assert row.value(P) == 0.0
+    with pytest.raises(ConstraintError, match="no target"):
+        HolonomicRow(product).value(P)
+    many = TotalPopulation(3).bind(MANY)
+    assert many.target.tolist() == pytest.approx([4.5, 3.2])
+    assert many.take(np.array([1])).target.tolist() == pytest.approx([3.2])
+
+
+def test_moving_target():
+    row = LinearRow([1.0, 2.0, 0.0], lambda t: (3.0 + t, 1.0))
+    assert row.value(P) == pytest.approx(3.5 - 3.3)
+    assert row.rate(P) == 1.0
+    assert row.rate(MANY).tolist() == [1.0, 1.0]
+
+
+def test_velocity_row():
+    row = VelocityRow(lambda t, x: [t, x[0], 1.0], lambda t, x: x[1])
+    assert row.gradient(MANY).T.tolist() == [[0.3, 0.5, 1.0], [0.7, 1.0, 1.0]]
+    assert row.rate(MANY).tolist() == [1.5, 2.0]
+    assert VelocityRow([1.0, 0.0, 2.0], 0.5).gradient(MANY)[:, 1].tolist() == [1.0, 0.0, 2.0]
+
+
+def test_start_off_a_row_is_refused():
+    model = GrowthModel(lambda t, x: x, n=3)
+    system = ConstrainedGrowth(model, [TotalPopulation(3), LinearRow([1.0, 0.0, 0.0], 0.7)])
+    with pytest.raises(ConstraintError, match=r"off row 1 \(linear row\)") as caught:
+        solve(system, (0.0, 1.0), [0.5, 0.3, 0.2])
+    assert caught.value.rows == (1,)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: LinearRow([0.0, 0.0]),
+        lambda: LinearRow([1.0, np.nan]),
+        lambda: LinearRow([[1.0]]),
+        lambda: LinearRow([1.0], np.inf),
+        lambda: TotalPopulation(0),
+        lambda: VelocityRow([1.0], np.nan),
+        lambda: HolonomicRow(product, target="x"),
+        lambda: TotalPopulation(2).gradient(P),
+        lambda: VelocityRow([1.0]).gradient(P),
+    ],
+)
+def test_bad_rows_are_refused(make):
+    with pytest.raises(InputError):
+        make()
