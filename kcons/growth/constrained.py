@@ -28,9 +28,9 @@ from kcons.growth.rows import EPSILON, Row
 #: Newton iterations of a projection at most.
 MOST_ITERATIONS = 25
 #: A projection has arrived where what is left is this many times the round-off of the row.
-ROUND_OFF = 2.0
-#: Where an iteration no longer makes it smaller, this many are accepted.
-ACCEPTED = 200.0
+ROUND_OFF = 3.0
+#: After this many iterations, so many times the round-off are accepted.
+STALLED, ACCEPTED = 4, 50.0
 #: Least ln x. Where the rows press on a species that is extinct, ln x falls like -e^(lambda t), beyond all numbers of
 #: the machine in finite time; x and x ln x are 0 long before. A fall ends here; a return starts from here.
 LEAST_LOGARITHM = -1e300
@@ -262,30 +262,49 @@ class ConstrainedGrowth:
         lanes = log_x.shape[1:]
         if not rows:
             return log_x, np.zeros(lanes)
-        y = np.array(log_x)
-        p = Populations.from_logarithms(time, y)
-        values, left = _misses(rows, p, lanes)
-        best, best_left = y, left
-        for _ in range(MOST_ITERATIONS):
-            open_ = ~(left <= ROUND_OFF)
-            if not np.any(open_):
-                break
-            found = orthogonal_rows.solve(p.x, [r.gradient(p) for r in rows], [-v for v in values], np.zeros_like(p.x))
-            change = np.where(open_, found.z, 0.0)
+        best = np.array(log_x)
+        p = Populations.from_logarithms(time, best)
+        values, best_left = _misses(rows, p, lanes)
+        if not lanes:
+            return self._iterate(p, values, best, best_left)
+        # Most are there at once, or after one step: the others go on by themselves.
+        open_ = np.flatnonzero(~(best_left <= ROUND_OFF))
+        if len(open_):
+            part = self.take(open_)
+            times = np.broadcast_to(np.asarray(time, dtype=np.float64), lanes)[open_]
+            p = Populations.from_logarithms(times, best[:, open_])
+            found, left = part._iterate(p, [np.asarray(v)[open_] for v in values], best[:, open_], best_left[open_])
+            best[:, open_], best_left[open_] = found, left
+        return best, best_left
+
+    def _iterate(
+        self, p: Populations, values: list[FloatArray], best: FloatArray, best_left: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Newton's iteration from `p` with the row values `values`; the best state on the way and what is left."""
+        rows = [row for row in self.rows if row.holonomic]
+        lanes = best.shape[1:]
+        y = best
+        for iteration in range(MOST_ITERATIONS):
+            change = orthogonal_rows.solve(
+                p.x, [r.gradient(p) for r in rows], [-v for v in values], np.zeros_like(p.x)
+            ).z
             # Populations change by no more than a factor e at once: Newton's steps are for small corrections.
             with np.errstate(all="ignore"):
                 largest = np.max(np.abs(change) * (p.x > 0), axis=0)
-                change = change / np.maximum(largest, 1.0)
-            y = y + np.where(np.isfinite(change), change, 0.0)
-            p = Populations.from_logarithms(time, y)
+                change = np.where(np.isfinite(change), change / np.maximum(largest, 1.0), 0.0)
+            y = y + change
+            p = Populations.from_logarithms(p.time, y)
             values, left = _misses(rows, p, lanes)
             better = left < best_left
-            stuck = ~(left < 0.5 * best_left) & (best_left <= ACCEPTED)
             best = np.where(better, y, best)
             best_left = np.where(better, left, best_left)
-            if np.all(stuck | (best_left <= ROUND_OFF)):
+            if np.all(best_left <= (ROUND_OFF if iteration < STALLED else ACCEPTED)):
                 break
         return best, best_left
+
+    def past_instants(self, time: float | FloatArray, log_x: FloatArray) -> FloatArray:
+        """The state beyond what happens in less time than numbers can tell; the same state where nothing does."""
+        return log_x
 
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[FloatArray], FloatArray] | None:
         """How the motion goes on without integration, once nothing but the rows decides about it; None before.

@@ -23,6 +23,7 @@ BATCH = 2048
 #: Steps of a trajectory at most.
 MOST_STEPS = 200_000
 EXPONENT = -1.0 / 8.0
+LEAST_STEP = 1e-305
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class EnsembleSolution:
 
     Attributes
     ----------
-    t : ndarray, shape (k,)
+    t : ndarray, shape (k,) or (k, N)
     log_x : ndarray, shape (k, n, N)
         ln x; NaN after a trajectory failed.
     steps : ndarray of int, shape (N,)
@@ -74,8 +75,8 @@ def solve_ensemble(
     system : ConstrainedGrowth
         Functions of a model of your own must be vectorized. A `Hypercycle` may have parameters of its own for each
         trajectory.
-    t_eval : array_like, shape (k,)
-        Times wanted, increasing, none before t0.
+    t_eval : array_like, shape (k,) or (k, N)
+        Times wanted, increasing, none before t0; perhaps others for each trajectory.
     x0, log_x0 : array_like, shape (n, N)
         Starts, on the constraints, as populations or as their logarithms.
     t0 : float
@@ -93,7 +94,7 @@ def solve_ensemble(
         As `solve`, if any start cannot be held.
     """
     times = np.atleast_1d(np.asarray(t_eval, dtype=np.float64))
-    if times.ndim != 1 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0) or times[0] < t0:
+    if not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
         raise InputError("t_eval holds finite times that increase, none before t0", item="t_eval")
     if (x0 is None) == (log_x0 is None):
         raise InputError("give the starts either as x0 or as log_x0", item="x0")
@@ -105,6 +106,9 @@ def solve_ensemble(
             "an ensemble needs functions that are vectorized: GrowthModel(..., vectorized=True)", item="model"
         )
     n, N = start.shape
+    if times.ndim > 2 or (times.ndim == 2 and times.shape[1] != N):
+        raise InputError(f"t_eval has shape (k,) or (k, {N}), not {times.shape}", item="t_eval")
+    every = np.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), N))
     log_x = np.full((len(times), n, N), np.nan)
     steps = np.zeros(N, dtype=np.int64)
     failed = np.zeros(N, dtype=bool)
@@ -113,7 +117,7 @@ def solve_ensemble(
 
     def work(lanes: NDArray[np.intp]) -> None:
         part = system.take(lanes).bind(Populations.from_logarithms(np.full(len(lanes), t0), start[:, lanes]))
-        run = _Batch(part, start[:, lanes], t0, times, rtol, atol)
+        run = _Batch(part, start[:, lanes], t0, every[:, lanes], rtol, atol)
         run.go()
         log_x[:, :, lanes], steps[lanes], failed[lanes] = run.log_x, run.steps, run.failed
         settled[lanes] = run.settled_time
@@ -142,15 +146,18 @@ class _Batch:
         # Of those still on their way:
         self.system = system
         self.lanes: NDArray[np.intp] = np.arange(N)
+        # The time is the sum of two numbers: a species that returns from ln x = -1e8 does so within less than what the
+        # last digit of t can show.
         self.t = np.full(N, t0)
+        self.t_rest = np.zeros(N)
         self.y, _ = system.try_project(self.t, start)
         self.f = self._slope(self.t, self.y)
         self.next = np.zeros(N, dtype=np.intp)
         self._show(np.ones(N, dtype=bool))
         with np.errstate(divide="ignore"):
-            speed = np.sqrt(np.mean((self.f / (atol + rtol * np.abs(self.y))) ** 2, axis=0))
-            place = np.sqrt(np.mean((self.y / (atol + rtol * np.abs(self.y))) ** 2, axis=0))
-            self.h = np.minimum(0.01 * place / np.maximum(speed, 1e-300), max(times[-1] - t0, 1e-300))
+            speed = np.max(np.abs(self.f) / (atol + rtol * np.abs(self.y)), axis=0)
+            place = np.max(np.abs(self.y) / (atol + rtol * np.abs(self.y)), axis=0)
+            self.h = np.minimum(0.01 * place / np.maximum(speed, 1e-300), np.maximum(times[-1] - t0, 1e-300))
         self.was_rejected = np.zeros(N, dtype=bool)
 
     def _slope(self, t: FloatArray, y: FloatArray) -> FloatArray:
@@ -160,7 +167,8 @@ class _Batch:
         """Write down those that have just come to a time wanted."""
         for _ in range(2):  # t0 may be the first of them
             open_ = np.flatnonzero(moved & (self.next < len(self.times)))
-            here = open_[self.t[open_] == self.times[self.next[open_]]]
+            here = open_[self.t[open_] == self.times[self.next[open_], self.lanes[open_]]]
+            here = here[self.t_rest[here] == 0.0]
             self.log_x[self.next[here], :, self.lanes[here]] = self.y[:, here].T
             self.next[here] += 1
 
@@ -177,13 +185,15 @@ class _Batch:
         index = np.flatnonzero(stay)
         self.system = self.system.take(index)
         self.lanes, self.t, self.h, self.next = self.lanes[index], self.t[index], self.h[index], self.next[index]
+        self.t_rest = self.t_rest[index]
         self.y, self.f, self.was_rejected = self.y[:, index], self.f[:, index], self.was_rejected[index]
 
     def _step(self) -> None:
-        goal = self.times[self.next]
-        h = np.minimum(self.h, goal - self.t)
+        goal = self.times[self.next, self.lanes]
+        ahead = (goal - self.t) - self.t_rest
+        h = np.minimum(self.h, ahead)
         # Not so short a last step that it could hardly be taken.
-        clipped = h >= (goal - self.t) * (1 - 1e-12)
+        clipped = h >= ahead * (1 - 1e-12)
         with np.errstate(all="ignore"):
             K = np.empty((DOP853.n_stages, *self.y.shape))
             K[0] = self.f
@@ -193,11 +203,12 @@ class _Batch:
             y_new = self.y + h * np.tensordot(DOP853.B, K, axes=1)
             scale = self.atol + self.rtol * np.maximum(np.abs(self.y), np.abs(y_new))
             # The last entries of E5 and E3, of the slope at the end, are zero.
-            fifth = np.sum((np.tensordot(DOP853.E5[:-1], K, axes=1) / scale) ** 2, axis=0)
-            third = np.sum((np.tensordot(DOP853.E3[:-1], K, axes=1) / scale) ** 2, axis=0)
-            error = np.where(fifth == 0, 0.0, h * fifth / np.sqrt((fifth + 0.01 * third) * len(self.y)))
+            fifth = np.sum((h * np.tensordot(DOP853.E5[:-1], K, axes=1) / scale) ** 2, axis=0)
+            third = np.sum((h * np.tensordot(DOP853.E3[:-1], K, axes=1) / scale) ** 2, axis=0)
+            error = np.where(fifth == 0, 0.0, fifth / np.sqrt((fifth + 0.01 * third) * len(self.y)))
             good = error < 1.0
-            t_new = np.where(clipped, goal, self.t + h)
+            t_new, rest_new = _sum(self.t, self.t_rest + h)
+            t_new, rest_new = np.where(clipped, goal, t_new), np.where(clipped, 0.0, rest_new)
             y_new = np.where(good, y_new, self.y)
             y_new, left = self.system.try_project(np.where(good, t_new, self.t), y_new)
             good &= (left <= ACCEPTED) & np.all(np.isfinite(y_new), axis=0)
@@ -208,12 +219,13 @@ class _Batch:
         self.h = np.where(good, np.where(clipped & (grown * h < self.h), self.h, grown * h), shrunk * h)
         self.was_rejected = ~good
         self.steps[self.lanes] += 1
-        self.t = np.where(good, t_new, self.t)
+        self.t, self.t_rest = np.where(good, t_new, self.t), np.where(good, rest_new, self.t_rest)
         self.y = np.where(good, y_new, self.y)
+        self.y = self.system.past_instants(self.t, self.y)
         self.f = np.where(good, self._slope(self.t, self.y), self.f)
         self._show(good)
         self._settle(good)
-        stuck = (self.h < 1e-15 * np.maximum(np.abs(self.t), 1e-290)) | (self.steps[self.lanes] >= MOST_STEPS)
+        stuck = (self.h < LEAST_STEP) | (self.steps[self.lanes] >= MOST_STEPS)
         stuck &= self.next < len(self.times)
         if np.any(stuck):
             self.failed[self.lanes[stuck]] = True
@@ -227,9 +239,17 @@ class _Batch:
             return
         index = np.flatnonzero(settled)
         part = self.system.take(index)
-        for k, time in enumerate(self.times):
+        for k, times in enumerate(self.times):
             late = np.flatnonzero(self.next[index] <= k)
             if len(late):
-                self.log_x[k, :, self.lanes[index[late]]] = part.take(late).slow_state(np.full(len(late), time)).T
+                lanes = self.lanes[index[late]]
+                self.log_x[k, :, lanes] = part.take(late).slow_state(times[lanes]).T
         self.settled_time[self.lanes[index]] = self.t[index]
         self.next[index] = len(self.times)
+
+
+def _sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """a + b and its rounding error (Knuth's two-sum)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)

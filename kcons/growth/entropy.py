@@ -215,8 +215,8 @@ class PrescribedProduction(EntropyLaw):
 class EntropyRow(Row):
     """The Gibbs energy of a mixture follows an entropy law; to be used together with `TotalPopulation`.
 
-    Its row of A is mu - g_eq/c, that is mu with mu0 shifted by a common constant, which drops out where sum x is kept
-    and lets the row fade cleanly at equilibrium.
+    Its row of A is mu less the mu of the largest population: a constant common to all species drops out where sum x is
+    kept. So the row fades cleanly where the rank is lost: at equilibrium, and where one species is nearly alone.
     """
 
     holonomic = True
@@ -238,7 +238,7 @@ class EntropyRow(Row):
         return self.law.excess(np.asarray(time) - self.start, self.excess0)
 
     def gradient(self, p: Populations) -> FloatArray:
-        return self.mixture.excess_gradient(p, self._total(p))
+        return self.mixture.relative_potentials(p)
 
     def rate(self, p: Populations) -> FloatArray:
         excess = self.mixture.excess(p, self._total(p))

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.errors import InputError
-from kcons.growth.constrained import ConstrainedGrowth
+from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
 from kcons.growth.mixture import Mixture
 from kcons.growth.model import FloatArray, GrowthModel, Populations
@@ -39,6 +39,12 @@ STRAYING = 20.0
 NEARNESS = 0.1
 #: Where the excess is this part of kT sum x, its direction no longer matters.
 NEGLIGIBLE_EXCESS = 1e-22
+#: Extinct is what lies below this part of the sum.
+EXTINCT = 1e-24
+#: Variance of mu over the populations, in kT^2, below which extinct species are about to return at once,
+FADED = 1e-14
+#: and ln x of the first of them when they are back: x (ln x)^2 = 1e-13.
+RETURNED = -37.2
 
 
 class Hypercycle(GrowthModel):
@@ -150,18 +156,58 @@ class ConstrainedHypercycle(ConstrainedGrowth):
         """lambda of the rows 1 and mu, as in the notes, shape (m,) or (m, N)."""
         found = np.array(super().multipliers(t, x))
         if self.entropy_row is not None:
-            # The entropy row is kept as mu - g_eq/c.
-            found[0] = found[0] - found[1] * self.model.mixture.least_gibbs_energy(1.0)
+            # The entropy row is kept as mu less the mu of the largest population.
+            p = Populations.from_values(t, x)
+            found[0] = found[0] - found[1] * np.max(
+                np.where(p.x == np.max(p.x, axis=0), self.model.mixture.potentials(p), -np.inf), axis=0
+            )
         return found
+
+    # -- the return of extinct species -----------------------------------------------------------------
+
+    def past_instants(self, time: float | FloatArray, log_x: FloatArray) -> FloatArray:
+        """Bring extinct species back where entropy can be produced in no other way.
+
+        With some species extinct, the others have an equilibrium of their own, at which the entropy row fades as it
+        does at the true one. The law asks for more: lambda_2 grows like -1/(t* - t), and every ln x of an extinct
+        species returns as (t* - t)^(1/2), from -1e8 or less, in less time than the last digit of t. In that time
+        nothing else moves, and all of them keep their proportions mu_i - <mu>: they are taken to where the first of
+        them counts again.
+        """
+        row = self.entropy_row
+        if row is None:
+            return log_x
+        p = Populations.from_logarithms(time, log_x)
+        total = np.sum(p.x, axis=0)
+        extinct = p.x < EXTINCT * total
+        if not extinct.any():
+            return log_x
+        kT = self.model.mixture.kT
+        mu = row.gradient(p) / kT
+        mean = np.sum(p.x * mu, axis=0) / total
+        away = np.where(extinct, 0.0, mu - mean)
+        faded = np.sum(p.x * away * away, axis=0) < FADED * total
+        # lambda_2 < 0: towards the return, not into extinction.
+        pull = row.rate(p) - kT * np.sum(p.x * away * self.model.rates(p), axis=0)
+        level = np.max(np.where(extinct, log_x - np.log(total), -np.inf), axis=0)
+        here = faded & (pull < 0) & extinct.any(axis=0) & (level < RETURNED)
+        if not np.any(here):
+            return log_x
+        with np.errstate(all="ignore"):
+            first = np.max(np.where(extinct, mu - mean, -np.inf), axis=0)
+            share = (first + RETURNED - level) / first
+            moved = np.where(extinct & here, log_x + (share - 1.0) * (mu - mean), log_x)
+        projected, left = self.try_project(time, moved)
+        return np.where(here & (left <= ACCEPTED), projected, log_x)
 
     # -- arrival at equilibrium ------------------------------------------------------------------------
 
     def slow_state(self, time: ArrayLike, accuracy: float = 0.0) -> FloatArray:
         """Where all is settled but the approach to equilibrium: ln x, shape (n, k), at times of shape (k,).
 
-        d(ln x)/dt = phi + lambda_1 + lambda_2 (mu - g_eq/c). Close to x_eq, u = ln(x/x_eq) shrinks at the rate of the
-        law, du/dt = -rho u, and mu - g_eq/c = kT u, so that u = s (phi(x) + lambda_1): its two unknowns come from the
-        two rows, and x by iteration. The terms left out are of the order of rho r^3/|phi|, r the size of u.
+        d(ln x)/dt = phi + lambda_1 + lambda_2 mu. Close to x_eq, u = ln(x/x_eq) shrinks at the rate of the law,
+        du/dt = -rho u, and mu is kT u but for a constant, so that u = s (phi(x) + lambda_1): its two unknowns come from
+        the two rows, and x by iteration. The terms left out are of the order of rho r^3/|phi|, r the size of u.
         """
         row = self.entropy_row
         assert row is not None and row.total is not None

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.growth.constrained import ConstrainedGrowth
+from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.model import FloatArray, Populations, positive_populations
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
@@ -217,7 +217,7 @@ def _projecting(
             message: str | None = super().step()
             if self.status == "failed":
                 return message
-            y = system.project(self.t, self.y)
+            y = system.past_instants(self.t, system.project(self.t, self.y))
             if isinstance(self, BDF):
                 self.D[0] += y - self.y
             else:
@@ -350,7 +350,7 @@ def _each(system: ConstrainedGrowth, times: FloatArray, log_y: FloatArray) -> Fl
     if not any(row.holonomic for row in system.rows):
         return log_y
     projected, left = system.try_project(times, log_y)
-    for k in np.flatnonzero(~(left <= 200.0)):
+    for k in np.flatnonzero(~(left <= ACCEPTED)):
         projected[:, k] = system.project(float(times[k]), log_y[:, k])
     return projected
 

@@ -100,11 +100,15 @@ class Mixture:
         v = np.log1p((np.sum(p.x, axis=0) - c) / c)
         return np.asarray(self.kT * (np.sum(x_eq * entropy_function(u), axis=0) - c * entropy_function(v)))
 
-    def excess_gradient(self, p: Populations, total: ArrayLike) -> FloatArray:
-        """d(g - g_eq)/dx = mu - g_eq/c, all of them 0 at equilibrium, shape of p.x."""
-        c = np.asarray(total, dtype=np.float64)
-        u, _ = self._displacement(p, c)
-        return np.asarray(self.kT * (u - np.log1p((np.sum(p.x, axis=0) - c) / c)))
+    def relative_potentials(self, p: Populations) -> FloatArray:
+        """mu less that of the largest population, shape of p.x.
+
+        Exact where differences are all that is left: next to equilibrium, where all mu are equal, and where one species
+        is nearly alone.
+        """
+        u = p.log_x - self._fractions(p)
+        largest = np.argmax(p.x, axis=0)
+        return np.asarray(self.kT * (u - np.take_along_axis(u, np.expand_dims(largest, 0), axis=0)))
 
     def _displacement(self, p: Populations, c: FloatArray) -> tuple[FloatArray, FloatArray]:
         """ln(x/x_eq) and x_eq."""
