@@ -21,9 +21,11 @@ from kcons.growth.model import FloatArray, Populations, positive_populations
 #: Trajectories that take their steps together.
 BATCH = 2048
 #: Steps of a trajectory at most.
-MOST_STEPS = 200_000
+MOST_STEPS = 50_000
 EXPONENT = -1.0 / 8.0
 LEAST_STEP = 1e-305
+#: Whether a motion has settled is looked at each time so many steps were taken.
+SETTLING = 4
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ class _Batch:
             place = np.max(np.abs(self.y) / (atol + rtol * np.abs(self.y)), axis=0)
             self.h = np.minimum(0.01 * place / np.maximum(speed, 1e-300), np.maximum(times[-1] - t0, 1e-300))
         self.was_rejected = np.zeros(N, dtype=bool)
+        self.rounds = 0
 
     def _slope(self, t: FloatArray, y: FloatArray) -> FloatArray:
         return self.system.logarithmic_velocity(Populations.from_logarithms(t, y))
@@ -224,7 +227,9 @@ class _Batch:
         self.y = self.system.past_instants(self.t, self.y)
         self.f = np.where(good, self._slope(self.t, self.y), self.f)
         self._show(good)
-        self._settle(good)
+        self.rounds += 1
+        if self.rounds % SETTLING == 0:
+            self._settle(good)
         stuck = (self.h < LEAST_STEP) | (self.steps[self.lanes] >= MOST_STEPS)
         stuck &= self.next < len(self.times)
         if np.any(stuck):

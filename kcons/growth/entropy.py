@@ -20,7 +20,7 @@ from scipy.integrate import quad
 from kcons.errors import BudgetError, InputError
 from kcons.growth.mixture import Mixture
 from kcons.growth.model import FloatArray, Populations
-from kcons.growth.rows import Row
+from kcons.growth.rows import EPSILON, Row
 
 if TYPE_CHECKING:
     from kcons.growth.integration import GrowthSolution
@@ -249,8 +249,9 @@ class EntropyRow(Row):
         return self.mixture.excess(p, self._total(p)) - self.law_excess(p.time)
 
     def size(self, p: Populations) -> FloatArray:
-        # ln x carries an error of some 1e-16 of itself, which enters through the gradient.
-        slope = np.sum(p.x * np.abs(self.gradient(p)) * np.maximum(1.0, np.abs(p.log_x)), axis=0)
+        # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
+        error = np.maximum(1.0, np.abs(p.log_x))
+        slope = np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * EPSILON * error) * error, axis=0)
         return np.abs(self.law_excess(p.time)) + slope
 
     def bind(self, p: Populations) -> EntropyRow:

@@ -214,13 +214,18 @@ class ConstrainedHypercycle(ConstrainedGrowth):
         times = np.atleast_1d(np.asarray(time, dtype=np.float64))
         log_eq, x_eq, size = self._near_equilibrium(times)
         y = np.array(log_eq)
-        for _ in range(60):
-            push, length = self._push(Populations.from_logarithms(times, y), x_eq)
-            trial, _ = self.try_project(times, log_eq + np.where(length > 0, size / length, 0.0) * push)
-            moved = np.max(np.abs(trial - y) - 4e-16 * np.abs(y), initial=0.0)
-            y = trial
-            if moved <= accuracy:
+        away = np.flatnonzero(size > 1e-15)
+        part, when = self.take(away), times[away]
+        for _ in range(60 if len(away) else 0):
+            push, length = part._push(Populations.from_logarithms(when, y[:, away]), x_eq[:, away])
+            trial, _ = part.try_project(when, log_eq[:, away] + size[away] / length * push)
+            moved = np.max(np.abs(trial - y[:, away]) - 4e-16 * np.abs(trial), axis=0)
+            y[:, away] = trial
+            going = moved > accuracy
+            if not going.any():
                 break
+            if not going.all():
+                away, when, part = away[going], when[going], part.take(np.flatnonzero(going))
         return y
 
     def _near_equilibrium(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

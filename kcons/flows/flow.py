@@ -1,0 +1,182 @@
+"""Flows: dX/dt = V(X, t) (notes eqs. 1-3), their Jacobians, divergence, trajectories and phase-space volume.
+
+Functions take their arguments in SciPy's order, (t, X).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import solve_ivp
+
+from kcons.errors import ConvergenceError, InputError
+
+FloatArray = NDArray[np.float64]
+Field = Callable[[float, FloatArray], ArrayLike]
+
+
+class Flow:
+    """A velocity field in phase space.
+
+    Parameters
+    ----------
+    velocity : callable (t, X) -> (n,)
+        V.
+    n : int
+        Number of variables.
+    jacobian : callable (t, X) -> (n, n), optional
+        A_kl = dV_k/dX_l (notes eq. 27); by differences where it is not given.
+
+    Raises
+    ------
+    InputError
+        If n < 1.
+    """
+
+    def __init__(self, velocity: Field, n: int, jacobian: Field | None = None) -> None:
+        if n < 1:
+            raise InputError(f"a flow has at least one variable, not {n}", item="n")
+        self.n = int(n)
+        self._velocity = velocity
+        self._jacobian = jacobian
+
+    def velocity(self, t: float, X: ArrayLike) -> FloatArray:
+        """V(X, t), shape (n,) (notes eqs. 2, 3)."""
+        X = self._state(X)
+        V = np.asarray(self._velocity(t, X), dtype=np.float64)
+        if V.shape != (self.n,):
+            raise InputError(f"V has shape {V.shape}, not ({self.n},)", item="velocity")
+        return V
+
+    def jacobian(self, t: float, X: ArrayLike) -> FloatArray:
+        """A = dV/dX, shape (n, n) (notes eq. 27)."""
+        X = self._state(X)
+        if self._jacobian is None:
+            return jacobian_by_differences(self._velocity, t, X)
+        A = np.asarray(self._jacobian(t, X), dtype=np.float64)
+        if A.shape != (self.n, self.n):
+            raise InputError(f"the Jacobian has shape {A.shape}, not ({self.n}, {self.n})", item="jacobian")
+        return A
+
+    def divergence(self, t: float, X: ArrayLike) -> float:
+        """div V = tr A (notes eqs. 36, 37)."""
+        return float(np.trace(self.jacobian(t, X)))
+
+    def solve(
+        self,
+        t_span: Sequence[float],
+        X0: ArrayLike,
+        method: str = "DOP853",
+        *,
+        rtol: float = 1e-10,
+        atol: float = 1e-12,
+        **options: Any,
+    ) -> Any:
+        """A trajectory X(t) = f(X_0; t) (notes eq. 30): SciPy's ``solve_ivp``, with tighter tolerances."""
+        if method in ("Radau", "BDF", "LSODA"):
+            options.setdefault("jac", self.jacobian)
+        return solve_ivp(self.velocity, tuple(t_span), self._state(X0), method, rtol=rtol, atol=atol, **options)
+
+    def _state(self, X: ArrayLike) -> FloatArray:
+        array = np.asarray(X, dtype=np.float64)
+        if array.shape != (self.n,):
+            raise InputError(f"a state of this flow has shape ({self.n},), not {array.shape}", item="X")
+        if not np.all(np.isfinite(array)):
+            raise InputError("the state is not finite", item="X")
+        return array
+
+
+def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float = 0.02) -> FloatArray:
+    """dV/dX by central differences with steps h, h/2, h/4, extrapolated to order six; shape (n, n)."""
+    X = np.asarray(X, dtype=np.float64)
+    columns = []
+    for k in range(len(X)):
+        h = step * max(1.0, abs(X[k]))
+        slopes = []
+        for part in (h, h / 2, h / 4):
+            e = np.zeros(len(X))
+            e[k] = part
+            up, down = X + e, X - e
+            ends = [np.asarray(velocity(t, at), dtype=np.float64) for at in (up, down)]
+            slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
+        first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
+        columns.append((16 * second - first) / 15)
+    return np.stack(columns, axis=1)
+
+
+class PhaseVolume(NamedTuple):
+    """How a small volume is carried along.
+
+    Attributes
+    ----------
+    t : ndarray, shape (k,)
+    states : ndarray, shape (k, n)
+    propagators : ndarray, shape (k, n, n)
+        dX_t/dX_0 (notes eq. 34).
+    log_volume : ndarray, shape (k,)
+        ln |det dX_t/dX_0|, from the propagators (notes eq. 33).
+    integrated_divergence : ndarray, shape (k,)
+        The integral of div V along the trajectory; the same number.
+    """
+
+    t: FloatArray
+    states: FloatArray
+    propagators: FloatArray
+    log_volume: FloatArray
+    integrated_divergence: FloatArray
+
+
+def phase_volume(
+    flow: Flow, X0: ArrayLike, times: ArrayLike, *, rtol: float = 1e-11, atol: float = 1e-12, pieces: int = 1
+) -> PhaseVolume:
+    """The change of phase-space volume along a trajectory (notes eqs. 30-39).
+
+    Integrates the variational equation dJ/dt = A(X, t) J, J = 1, together with the trajectory, starting J anew at every
+    time wanted, so that a volume that shrinks by many orders of magnitude keeps its digits.
+
+    Parameters
+    ----------
+    flow : Flow
+    X0 : array_like, shape (n,)
+    times : array_like, shape (k,)
+        Increasing; the first is that of X0.
+    pieces : int
+        Fresh starts between two times.
+
+    Raises
+    ------
+    InputError
+        Times that do not increase.
+    ConvergenceError
+        If the integration fails.
+    """
+    wanted = np.asarray(times, dtype=np.float64)
+    if wanted.ndim != 1 or len(wanted) < 1 or np.any(np.diff(wanted) <= 0):
+        raise InputError("times are one-dimensional and increase", item="times")
+    n = flow.n
+    state, total = flow._state(X0), np.eye(n)
+    log_volume = divergence = 0.0
+    rows = [(state, total, 0.0, 0.0)]
+
+    def together(t: float, Y: FloatArray) -> FloatArray:
+        A = flow.jacobian(t, Y[:n])
+        return np.concatenate([flow.velocity(t, Y[:n]), (A @ Y[n:-1].reshape(n, n)).ravel(), [np.trace(A)]])
+
+    for a, b in pairwise(wanted):
+        edges = np.linspace(a, b, pieces + 1)
+        for c, d in pairwise(edges):
+            start = np.concatenate([state, np.eye(n).ravel(), [0.0]])
+            found = solve_ivp(together, (c, d), start, "DOP853", rtol=rtol, atol=atol)
+            if not found.success:
+                raise ConvergenceError(f"the variational equation could not be integrated beyond t = {found.t[-1]:.6g}")
+            state, J = found.y[:n, -1], found.y[n:-1, -1].reshape(n, n)
+            log_volume += float(np.linalg.slogdet(J)[1])
+            divergence += float(found.y[-1, -1])
+            total = J @ total
+        rows.append((state, total, log_volume, divergence))
+    states, propagators, volumes, divergences = zip(*rows, strict=True)
+    return PhaseVolume(wanted, np.array(states), np.array(propagators), np.array(volumes), np.array(divergences))

@@ -1,0 +1,177 @@
+"""Flows with known solutions: oscillators, the pendulum, a particle on a sphere (notes examples 1 to 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ellipj, ellipkinc
+
+from kcons.errors import InputError
+from kcons.flows.flow import FloatArray, Flow
+from kcons.flows.hamiltonian import HamiltonianFlow
+from kcons.flows.linear import LinearFlow
+
+
+class DampedOscillator(LinearFlow):
+    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 - eta x_2, with x_1 = Omega x and x_2 = dx/dt (notes eqs. 20-22).
+
+    Raises
+    ------
+    InputError
+        If Omega is not positive or eta negative.
+    """
+
+    def __init__(self, omega: float = 1.0, eta: float = 0.2) -> None:
+        if not (np.isfinite(omega) and omega > 0):
+            raise InputError(f"Omega is positive and finite, not {omega}", item="omega")
+        if not (np.isfinite(eta) and eta >= 0):
+            raise InputError(f"eta is not negative, so it cannot be {eta}", item="eta")
+        self.omega, self.eta = float(omega), float(eta)
+        super().__init__([[0.0, self.omega], [-self.omega, -self.eta]])
+
+    @property
+    def regime(self) -> str:
+        """'undamped', 'oscillating', 'critical' or 'overdamped', by the sign of a^2 = eta^2 - 4 Omega^2."""
+        if self.eta == 0:
+            return "undamped"
+        if self.eta == 2 * self.omega:
+            return "critical"
+        return "oscillating" if self.eta < 2 * self.omega else "overdamped"
+
+    def eigenvalues(self) -> tuple[complex, complex]:
+        """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2 (notes eq. 23)."""
+        a = np.sqrt(complex((self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)))
+        return complex(0.5 * (-self.eta - a)), complex(0.5 * (-self.eta + a))
+
+    def closed_form(self, t: float) -> FloatArray:
+        """exp(At), shape (2, 2), in one formula for all regimes (notes eq. 25, derived anew).
+
+        e^(-eta t/2) [C 1 + S (A + eta/2)] with C = cosh(at/2), S = sinh(at/2)/(a/2): both depend on a^2 alone, and are
+        smooth through a = 0.
+        """
+        square = 0.25 * (self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)
+        root = np.sqrt(abs(square))
+        shifted = self.matrix + 0.5 * self.eta * np.eye(2)
+        if square > 0 and root * t > 1.0:
+            # e^(-eta t/2) cosh overflows in its second factor: both exponentials together.
+            slow = np.exp(-(self.omega**2) / (0.5 * self.eta + root) * t)
+            fast = np.exp(-(root + 0.5 * self.eta) * t)
+            return np.asarray(0.5 * (slow + fast) * np.eye(2) + 0.5 * (slow - fast) / root * shifted)
+        C = np.cosh(root * t) if square > 0 else np.cos(root * t)
+        z = square * t * t
+        if abs(z) < 1e-4:
+            S = t * (1 + z / 6 * (1 + z / 20 * (1 + z / 42)))
+        else:
+            S = (np.sinh(root * t) if square > 0 else np.sin(root * t)) / root
+        return np.asarray(np.exp(-0.5 * self.eta * t) * (C * np.eye(2) + S * shifted))
+
+
+class HarmonicOscillator(DampedOscillator):
+    """dx_1/dt = Omega x_2, dx_2/dt = -Omega x_1 (notes eqs. 4-6, 15)."""
+
+    def __init__(self, omega: float = 1.0) -> None:
+        super().__init__(omega, 0.0)
+
+    def circle(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
+        """X(t) on its circle, shape (2,) or (k, 2) (notes eqs. 18, 19)."""
+        x1, x2 = self._state(X0)
+        c, s = np.cos(self.omega * np.asarray(t)), np.sin(self.omega * np.asarray(t))
+        return np.stack([c * x1 + s * x2, c * x2 - s * x1], axis=-1)
+
+
+class Pendulum(HamiltonianFlow):
+    """x_1 = theta, x_2 = (dtheta/dt)/Omega; H = Omega (x_2^2/2 + 1 - cos x_1) (notes example 3, eqs. 56, 57).
+
+    Raises
+    ------
+    InputError
+        If Omega is not positive.
+    """
+
+    def __init__(self, omega: float = 1.0) -> None:
+        if not (np.isfinite(omega) and omega > 0):
+            raise InputError(f"Omega is positive and finite, not {omega}", item="omega")
+        self.omega = float(omega)
+        super().__init__(
+            lambda q, p: float(self.omega * (0.5 * p[0] ** 2 + 2.0 * np.sin(0.5 * q[0]) ** 2)),
+            1,
+            lambda q, p: self.omega * np.sin(q),
+            lambda q, p: self.omega * p,
+            separable=True,
+        )
+        self._jacobian = lambda t, X: np.array([[0.0, self.omega], [-self.omega * np.cos(X[0]), 0.0]])
+
+    def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
+        """X(t) by Jacobi's elliptic functions, shape (2,) or (k, 2).
+
+        With k^2 = H/(2 Omega): sin(theta/2) = k sn(Omega t + u_0 | k^2) for k < 1, and theta/2 = am(k Omega t + u_0 |
+        1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
+        """
+        theta0, rate0 = self._state(X0)
+        times = np.asarray(t, dtype=np.float64)
+        m = self.energy(X0) / (2.0 * self.omega)
+        # Measured from the nearest lowest position.
+        turns = np.round(theta0 / (2 * np.pi))
+        sine, half_rate = np.sin(0.5 * (theta0 - 2 * np.pi * turns)), 0.5 * rate0
+        if m == 0.0:
+            return np.stack(np.broadcast_arrays(theta0 + 0 * times, 0.0 * times), axis=-1)
+        k = np.sqrt(m)
+        if m <= 1.0:
+            start = ellipkinc(np.arctan2(sine, half_rate), m)
+            sn, cn, dn, _ = ellipj(self.omega * times + start, m)
+            half = np.arctan2(k * sn, dn)
+            return np.stack([2.0 * half + 2 * np.pi * turns, 2.0 * k * cn], axis=-1)
+        direction = np.sign(rate0)
+        start = ellipkinc(0.5 * direction * (theta0 - 2 * np.pi * turns), 1.0 / m)
+        _, _, dn, am = ellipj(k * self.omega * times + start, 1.0 / m)
+        return np.stack([direction * 2.0 * am + 2 * np.pi * turns, direction * 2.0 * k * dn], axis=-1)
+
+    def stationary_point(self, k: int) -> FloatArray:
+        """(k pi, 0), stable for even k (notes eqs. 58-61)."""
+        return np.array([k * np.pi, 0.0])
+
+
+class ParticleOnSphere(Flow):
+    """A particle of mass m on a sphere of radius R about the origin, X = (x, v) (notes example 4, eq. 110).
+
+        a = (1 - x x^T/R^2) f/m - (v.v/R^2) x
+
+    Parameters
+    ----------
+    radius, mass : float
+    force : callable (x) -> (3,), optional
+        None for free motion.
+
+    Raises
+    ------
+    InputError
+        If radius or mass is not positive.
+    """
+
+    def __init__(
+        self, radius: float = 1.0, mass: float = 1.0, force: Callable[[FloatArray], ArrayLike] | None = None
+    ) -> None:
+        for name, value in (("radius", radius), ("mass", mass)):
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} is positive and finite, not {value}", item=name)
+        self.radius, self.mass = float(radius), float(mass)
+        self.force = force
+        super().__init__(lambda t, X: np.concatenate([X[3:], self.acceleration(X[:3], X[3:])]), 6)
+
+    def acceleration(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
+        """The acceleration on the sphere, shape (3,) (notes eq. 110)."""
+        x, v = np.asarray(x, dtype=np.float64), np.asarray(v, dtype=np.float64)
+        a = -(v @ v) / self.radius**2 * x
+        if self.force is not None:
+            f = np.asarray(self.force(x), dtype=np.float64) / self.mass
+            a = a + f - x * (x @ f) / self.radius**2
+        return np.asarray(a)
+
+    def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
+        """The free motion x(t), shape (3,) or (k, 3); v0 is tangent to the sphere."""
+        x0, v0 = np.asarray(x0, dtype=np.float64), np.asarray(v0, dtype=np.float64)
+        speed = float(np.linalg.norm(v0))
+        angle = np.asarray(t, dtype=np.float64)[..., None] * speed / self.radius
+        return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))

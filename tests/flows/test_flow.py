@@ -1,0 +1,89 @@
+"""Flows in general: Jacobians by differences, trajectories, phase volume."""
+
+import numpy as np
+import pytest
+
+from kcons.errors import InputError
+from kcons.flows import DampedOscillator, Flow, Pendulum, jacobian_by_differences, phase_volume
+from kcons.growth import LotkaVolterra
+
+
+def lorenz(t, X):
+    x, y, z = X
+    return np.array([10.0 * (y - x), x * (28.0 - z) - y, x * y - 8.0 / 3.0 * z])
+
+
+def own(t, X):
+    return np.array([np.sin(X[1]) * X[0], np.exp(-(X[0] ** 2)) + 0.1 * t * X[1]])
+
+
+def own_jacobian(t, X):
+    return np.array([[np.sin(X[1]), X[0] * np.cos(X[1])], [-2 * X[0] * np.exp(-(X[0] ** 2)), 0.1 * t]])
+
+
+def test_jacobian_by_differences():
+    X = np.array([0.4, -1.2])
+    assert jacobian_by_differences(own, 0.5, X) == pytest.approx(own_jacobian(0.5, X), abs=1e-11)
+    assert Flow(own, 2).jacobian(0.5, X) == pytest.approx(Flow(own, 2, own_jacobian).jacobian(0.5, X), abs=1e-11)
+    assert Flow(own, 2).divergence(0.5, X) == pytest.approx(np.sin(-1.2) + 0.05, abs=1e-11)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_volume_by_the_variational_equation_is_the_integral_of_the_divergence(given):
+    flow = Flow(own, 2, own_jacobian if given else None)
+    found = phase_volume(flow, [0.7, 0.3], [0.0, 1.0, 3.0])
+    assert abs(found.log_volume[1:]).min() > 0.05
+    assert found.log_volume == pytest.approx(found.integrated_divergence, abs=1e-9)
+    # The propagator is what neighbouring trajectories do.
+    h = 1e-5
+    ends = [flow.solve((0.0, 3.0), np.array([0.7, 0.3]) + h * e).y[:, -1] for e in (*np.eye(2), *-np.eye(2))]
+    differences = np.stack([(ends[0] - ends[2]) / (2 * h), (ends[1] - ends[3]) / (2 * h)], axis=1)
+    assert found.propagators[-1] == pytest.approx(differences, rel=1e-5, abs=1e-6)
+
+
+def test_strong_contraction_keeps_its_digits():
+    # div V = -(10 + 1 + 8/3): the volume shrinks to e^-68.
+    found = phase_volume(Flow(lorenz, 3), [1.0, 1.0, 20.0], [0.0, 5.0], pieces=10)
+    assert found.log_volume[-1] == pytest.approx(-5 * (11 + 8 / 3), rel=1e-9)
+    assert found.integrated_divergence[-1] == pytest.approx(-5 * (11 + 8 / 3), rel=1e-11)
+
+
+def test_infinitesimal_volume():
+    flow, X = Flow(own, 2, own_jacobian), np.array([0.7, 0.3])
+    dt = 1e-4
+    J = phase_volume(flow, X, [0.0, dt]).propagators[-1]
+    assert pytest.approx(np.eye(2) + dt * own_jacobian(0.0, X), abs=2e-8) == J
+    assert np.linalg.det(J) == pytest.approx(1 + dt * flow.divergence(0.0, X), abs=2e-8)
+
+
+def test_examples_of_the_notes():
+    # No divergence: the volume is kept; friction: e^(-eta t); Lotka-Volterra comes back to it after a period.
+    assert phase_volume(Pendulum(), [2.0, 0.3], [0.0, 10.0]).log_volume[-1] == pytest.approx(0.0, abs=1e-9)
+    damped = phase_volume(DampedOscillator(1.0, 0.2), [1.0, 0.0], [0.0, 10.0])
+    assert damped.log_volume[-1] == pytest.approx(-2.0, rel=1e-10)
+    model = LotkaVolterra()
+    found = phase_volume(Flow(model.velocity, 2, model.jacobian), [1.0, 0.5], [0.0, 3.0])
+    assert abs(found.log_volume[-1]) > 0.1
+    assert found.log_volume[-1] == pytest.approx(found.integrated_divergence[-1], abs=1e-9)
+
+
+def test_time_dependent_trajectory():
+    flow = Flow(lambda t, X: [2 * t], 1)
+    assert flow.solve((0.0, 3.0), [1.0]).y[0, -1] == pytest.approx(10.0, rel=1e-10)
+    assert flow.solve((0.0, 3.0), [1.0], "Radau", rtol=1e-8).y[0, -1] == pytest.approx(10.0, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda: Flow(own, 0),
+        lambda: Flow(own, 2).velocity(0.0, [1.0]),
+        lambda: Flow(own, 2).velocity(0.0, [1.0, np.nan]),
+        lambda: Flow(lambda t, X: [1.0], 2).velocity(0.0, [1.0, 1.0]),
+        lambda: Flow(own, 2, lambda t, X: [1.0]).jacobian(0.0, [1.0, 1.0]),
+        lambda: phase_volume(Flow(own, 2), [1.0, 1.0], [0.0, 1.0, 0.5]),
+    ],
+)
+def test_bad_input_is_refused(act):
+    with pytest.raises(InputError):
+        act()
