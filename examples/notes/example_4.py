@@ -1,0 +1,39 @@
+"""Example 4: a particle on a sphere (eqs. 108-110).
+
+The acceleration of the projection formalism (eq. 105) is the formula of the example (eq. 110). Free, the particle
+follows a great circle; under gravity it is a spherical pendulum.
+
+python examples/notes/example_4.py        writes example_4.png
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kcons import projection
+from kcons.flows import ParticleOnSphere
+
+R, m = 1.0, 2.0
+gravity = np.array([0.0, 0.0, -m * 9.81])
+x0, v0 = np.array([0.8, 0.0, -0.6]), np.array([0.0, 1.5, 0.0])
+
+# sigma = x.x - R^2: A = 2 x^T, b = -2 v.v. (The notes print A = v^T.)
+by_projection = projection.acceleration(2 * x0[None, :], [m], gravity, [-2 * v0 @ v0])
+by_formula = ParticleOnSphere(R, m, lambda x: gravity).acceleration(x0, v0)
+print(f"accelerations by (105) and (110) differ by {abs(by_projection - by_formula).max():.1e}")
+
+free, falling = ParticleOnSphere(R, m), ParticleOnSphere(R, m, lambda x: gravity)
+t = np.linspace(0, 4, 500)
+circle = free.great_circle(t, x0, v0)
+swing = falling.solve((0, 4), np.concatenate([x0, v0]), t_eval=t).y[:3].T
+print(
+    f"radius along the free path: {R} to {abs(np.linalg.norm(circle, axis=1) - R).max():.0e}; "
+    f"of the integrated swing to {abs(np.linalg.norm(swing, axis=1) - R).max():.0e}: it drifts"
+)
+
+fig = plt.figure(figsize=(5, 5))
+axes = fig.add_subplot(projection="3d")
+axes.plot(*circle.T, label="free")
+axes.plot(*swing.T, label="under gravity")
+axes.set(xlabel="$x$", ylabel="$y$", zlabel="$z$", box_aspect=(1, 1, 1))
+axes.legend()
+fig.savefig("example_4.png", dpi=120)

@@ -1,0 +1,37 @@
+"""Example 5: a thermostat that keeps the kinetic energy (eqs. 111-113), and what it does to phase space.
+
+python examples/notes/example_5.py        writes example_5.png
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kcons.flows import Thermostat
+
+masses = np.array([1.0, 1.0, 2.5, 2.5])  # two particles in a plane
+stiffness = np.array([1.0, 2.0, 1.5, 0.7])
+flow = Thermostat(masses, lambda x: -stiffness * x - x**3)
+
+X0 = flow.state([1.0, -0.3, 0.5, 0.8], [0.4, 0.9, -0.3, 0.2])
+t = np.linspace(0, 6, 121)
+path = flow.solve((0, 6), X0, t_eval=t).y.T
+K = 0.5 * np.sum(path[:, 4:] ** 2, axis=1)
+alpha = np.array([flow.friction(X) for X in path])
+print(f"kinetic energy {K[0]:.6f}, kept to {np.ptp(K):.1e}; alpha between {alpha.min():.2f} and {alpha.max():.2f}")
+
+# alpha is no friction: where it is negative, phase space expands. div V = -(g - 1) alpha, measured and predicted.
+found = flow.compression(X0, t[::10])
+print(
+    f"g = {found.g}: ln of the phase volume {found.log_volume[-1]:.8f}, "
+    f"-(g - 1) times the integral of alpha {found.predicted[-1]:.8f}"
+)
+
+fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+left.plot(t, alpha)
+left.axhline(0, color="0.6", linewidth=0.8)
+left.set(xlabel="$t$", ylabel=r"$\alpha(t)$")
+right.plot(found.t, found.predicted, label=r"$-(g-1)\int\alpha\,dt$")
+right.plot(found.t, found.log_volume, "o", label="ln volume, measured")
+right.set(xlabel="$t$")
+right.legend()
+fig.savefig("example_5.png", dpi=120)

@@ -1,0 +1,28 @@
+"""Figure 2: velocity field and a trajectory of the oscillator with friction (eqs. 22, 25).
+
+python examples/notes/figure_02.py        writes figure_02.png
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kcons.flows import DampedOscillator
+
+oscillator = DampedOscillator(omega=1.0, eta=0.2)
+
+fig, (left, right) = plt.subplots(1, 2, figsize=(8, 4), layout="constrained")
+
+x1, x2 = np.meshgrid(np.linspace(-2, 2, 17), np.linspace(-2, 2, 17))
+V = np.einsum("kl,lij->kij", oscillator.matrix, np.array([x1, x2]))
+left.quiver(x1, x2, *V)
+
+# The closed form (25), one formula for all regimes.
+t = np.linspace(0, 40, 800)
+X = np.array([oscillator.closed_form(s) @ [1.0, 0.0] for s in t])
+right.plot(*X.T)
+right.plot(1, 0, "ko")
+
+for axes in (left, right):
+    axes.set(xlabel="$x_1$", ylabel="$x_2$", aspect="equal")
+fig.savefig("figure_02.png", dpi=120)
+print(f"{oscillator.regime}: eigenvalues {oscillator.eigenvalues()}; {oscillator.classification()}")
