@@ -100,20 +100,25 @@ def random_starts(
 # -- a large ensemble -------------------------------------------------------------------------------
 
 
-def ensemble(count: int, end: float = 100.0, rtol: float = 2e-9, threads: int = 2, seed: int = 2) -> dict[str, Any]:
+#: Tolerances that bring the error of each system to t = 100 below 1e-6.
+TOLERANCE = {"a": 2e-9, "b": 2e-8, "c": 2e-9}
+
+
+def ensemble(count: int, end: float = 100.0, threads: int = 2, seed: int = 2) -> dict[str, Any]:
     """`count` hypercycles of figure 11 from random starts to t = `end`, against runs with a tolerance of 1e-12."""
     x0 = np.random.default_rng(seed).dirichlet(np.ones(5), count).T
-    result: dict[str, Any] = {"count": count, "end": end, "rtol": rtol, "threads": threads, "kinds": {}}
+    result: dict[str, Any] = {"count": count, "end": end, "threads": threads, "kinds": {}}
     for kind in KINDS:
-        system = constrained(Hypercycle(), kind)
+        system, rtol = constrained(Hypercycle(), kind), TOLERANCE[kind]
         wall, cpu = perf_counter(), process_time()
-        found = solve_ensemble(system, [end], x0, rtol=rtol, atol=rtol, threads=threads)
+        found = solve_ensemble(system, [end], x0, rtol=rtol, atol=rtol, batch=5000, threads=threads)
         wall, cpu = perf_counter() - wall, process_time() - cpu
-        fine = solve_ensemble(system, [end], x0, rtol=1e-12, atol=1e-12, threads=threads)
+        fine = solve_ensemble(system, [end], x0, rtol=1e-12, atol=1e-12, batch=5000, threads=threads)
         # Relative error of x where |ln x| is of order one, of ln x where species die out beyond all numbers.
         error = np.max(np.abs(found.log_x[0] - fine.log_x[0]) / np.maximum(1.0, np.abs(fine.log_x[0])), axis=0)
         of_x = np.max(np.abs(found.x[0] - fine.x[0]), axis=0)
         result["kinds"][kind] = {
+            "rtol": rtol,
             "wall_s": wall,
             "cpu_s": cpu,
             "failed": int(found.failed.sum()),
@@ -238,11 +243,11 @@ def show(result: dict[str, Any]) -> None:
         f"rows within {r['worst_row']:.1e} of max(1, |g_0|), {r['cpu_s']:.0f} s CPU"
     )
     e = result["ensemble"]
-    print(f"\n{e['count']:,} hypercycles to t = {e['end']:g}, rtol {e['rtol']:g}, {e['threads']} threads")
+    print(f"\n{e['count']:,} hypercycles to t = {e['end']:g}, {e['threads']} threads")
     for kind, row in e["kinds"].items():
         print(
-            f"  ({kind}) {MEANING[kind]:17s} {row['wall_s']:6.1f} s wall {row['cpu_s']:6.1f} s CPU   "
-            f"error {row['error_max']:.1e} (median {row['error_median']:.1e})"
+            f"  ({kind}) {MEANING[kind]:17s} rtol {row['rtol']:.0e} {row['wall_s']:6.1f} s wall "
+            f"{row['cpu_s']:6.1f} s CPU   error {row['error_max']:.1e} (median {row['error_median']:.1e})"
         )
     w = result["work_precision"]
     print(f"\nWork and precision to t = {w['end']:g}, {w['system']}")

@@ -32,7 +32,7 @@ ROUND_OFF = 3.0
 #: After this many iterations, so many times the round-off are accepted.
 STALLED, ACCEPTED = 4, 50.0
 #: Least ln x. Where the rows press on a species that is extinct, ln x falls like -e^(lambda t), beyond all numbers of
-#: the machine in finite time; x and x ln x are 0 long before. A fall ends here; a return starts from here.
+#: the machine in finite time; x and x ln x are 0 long before. A fall fades out here; a return starts from here.
 LEAST_LOGARITHM = -1e300
 
 
@@ -162,9 +162,9 @@ class ConstrainedGrowth:
                 slope = phi + found.z
             if psi is not None:
                 slope = slope + psi * np.exp(-p.log_x)
-            fallen = p.log_x < LEAST_LOGARITHM
+            fallen = (p.log_x < 1e-17 * LEAST_LOGARITHM) & (slope < 0)
             if fallen.any():
-                slope[fallen & (slope < 0)] = 0.0
+                slope[fallen] *= np.maximum(1.0 - p.log_x[fallen] / LEAST_LOGARITHM, 0.0)
         return slope
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:

@@ -32,6 +32,9 @@ BUDGET_TOLERANCE = 1e-9
 class EntropyLaw(ABC):
     """What entropy, times T, has been produced since the start."""
 
+    #: Whether `excess_rate` looks at the excess of the state.
+    feedback: bool = False
+
     @abstractmethod
     def produced(self, elapsed: float | FloatArray, excess0: FloatArray) -> FloatArray:
         """T(s(t) - s_0)."""
@@ -76,6 +79,8 @@ class Relaxation(EntropyLaw):
     InputError
         If tau is not positive, or the budget negative or not finite.
     """
+
+    feedback = True
 
     def __init__(self, tau: float | FloatArray, budget: float | None = None, *, partial: bool = False) -> None:
         self.tau: FloatArray = np.array(tau, dtype=np.float64)
@@ -241,7 +246,10 @@ class EntropyRow(Row):
         return self.mixture.relative_potentials(p)
 
     def rate(self, p: Populations) -> FloatArray:
-        excess = self.mixture.excess(p, self._total(p))
+        if self.law.feedback or self.excess0 is None:
+            excess = self.mixture.excess(p, self._total(p))
+        else:
+            excess = np.zeros(p.x.shape[1:])
         excess0 = excess if self.excess0 is None else self.excess0
         return self.law.excess_rate(np.asarray(p.time) - self.start, excess, excess0)
 
