@@ -2,6 +2,7 @@
 
 python examples/notes/growth_results.py                   small samples, some seconds
 python examples/notes/growth_results.py --full --out F    10^6 random systems, 10^4 hypercycles; F receives JSON
+python examples/notes/growth_results.py --full --part ensemble --out F    one part of F again
 python examples/notes/growth_results.py --show F          the tables of an earlier result
 """
 
@@ -9,6 +10,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -112,6 +115,8 @@ def ensemble(count: int, end: float = 100.0, threads: int = 2, seed: int = 2) ->
     result: dict[str, Any] = {"count": count, "end": end, "threads": threads, "kinds": {}}
     for kind in KINDS:
         system, rtol = constrained(Hypercycle(), kind), TOLERANCE[kind]
+        # Other work on the machine: processes that wanted a core in the last minute.
+        load = os.getloadavg()[0]
         wall, cpu = perf_counter(), process_time()
         found = solve_ensemble(system, [end], x0, rtol=rtol, atol=rtol, batch=5000, threads=threads)
         wall, cpu = perf_counter() - wall, process_time() - cpu
@@ -125,6 +130,7 @@ def ensemble(count: int, end: float = 100.0, threads: int = 2, seed: int = 2) ->
             "rtol": rtol,
             "wall_s": wall,
             "cpu_s": cpu,
+            "load": load,
             "failed": int(found.failed.sum()),
             "error_max": float(error.max()),
             "error_median": float(np.median(error)),
@@ -262,7 +268,7 @@ def show(result: dict[str, Any]) -> None:
             f"{row['error']:9.1e} {row['total']:11.1e} {row['excess_error']:14.1e}" if "error" in row else row["note"]
         )
         print(f"  {row['method']:16s} {row['rtol']:8.0e} {row['nfev']:12,} {row['cpu_s']:8.2f} {tail}")
-    if "far_out" in result:
+    if result["far_out"]:
         print()
         for row in result["far_out"]:
             end = f"error {row['error']:.1e}" if "error" in row else f"ends at t = {row['reached']:.4g} or is wrong"
@@ -276,21 +282,26 @@ def show(result: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="the sample sizes of docs/growth.md")
+    parser.add_argument("--part", choices=("ensemble", "work_precision", "random", "far_out"), help="this part alone")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--show", type=Path, help="tables of an earlier result instead of a run")
     options = parser.parse_args()
+    if options.part and not options.out:
+        parser.error("--part writes into the file that --out names")
+    full = options.full
+    parts: dict[str, Callable[[], Any]] = {
+        "ensemble": lambda: ensemble(10_000 if full else 50, 100.0 if full else 5.0),
+        "work_precision": lambda: work_precision() if full else work_precision(5.0, (1e-4, 1e-6)),
+        "random": lambda: random_starts(1_000_000) if full else random_starts(180, sizes=(3,)),
+        "far_out": far_out if full else lambda: [],
+    }
     if options.show:
         result = json.loads(options.show.read_text(encoding="utf-8"))
+    elif options.part:
+        result = json.loads(options.out.read_text(encoding="utf-8"))
+        result[options.part] = parts[options.part]()
     else:
-        result = {
-            "machine": compare.environment(),
-            "full": options.full,
-            "ensemble": ensemble(10_000 if options.full else 50, 100.0 if options.full else 5.0),
-            "work_precision": work_precision() if options.full else work_precision(5.0, (1e-4, 1e-6)),
-            "random": random_starts(1_000_000) if options.full else random_starts(180, sizes=(3,)),
-        }
-        if options.full:
-            result["far_out"] = far_out()
+        result = {"machine": compare.environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     show(result)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.model import FloatArray, Populations, positive_populations
 
@@ -161,6 +161,8 @@ def solve(
         A start off the constraints, or a prescription that cannot be met from it.
     ContradictionError, SingularGeometryError
         Rows that contradict each other, at the start or where their rank is lost on the way.
+    NonFiniteError
+        Rates or sources that are not finite where the run has come to.
     """
     solver = _solver(method)
     t0, t1 = _span(t_span)
@@ -174,7 +176,11 @@ def solve(
     def slope(t: float, y: FloatArray) -> FloatArray:
         if y.ndim == 2:
             return np.stack([bound.logarithmic_velocity(Populations.from_logarithms(t, c)) for c in y.T], axis=-1)
-        return bound.logarithmic_velocity(Populations.from_logarithms(t, y))
+        found = bound.logarithmic_velocity(Populations.from_logarithms(t, y))
+        if not np.all(np.isfinite(found)) and np.all(np.isfinite(y)):
+            # A trial step may go too far, and is then rejected; what is left is told if the run ends here.
+            holder["not finite"] = t, y
+        return found
 
     stepper = _projecting(solver, bound, holder, tolerance) if project else solver
     slow = bound.settled(t0, log_start, tolerance) if project else None
@@ -197,7 +203,24 @@ def solve(
         )
         if ode.status == 1:
             holder.clear()
+        elif ode.status < 0 and "not finite" in holder:
+            _refuse_rates(bound, *holder["not finite"])
     return _assemble(bound, ode, holder, (t0, t1), wanted, dense_output, events, log_start, project)
+
+
+def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
+    """Raise if it is the model that is not finite at a finite state."""
+    p = Populations.from_logarithms(t, y)
+    if not np.all(np.isfinite(p.x)):
+        return
+    for what, values in (("rate", system.model.rates(p)), ("source", system.model.sources(p))):
+        if values is not None and not np.all(np.isfinite(values)):
+            species = int(np.argmin(np.isfinite(values)))
+            raise NonFiniteError(
+                f"the {what} of species {species} is not finite at t = {t:.8g}, "
+                f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
+                item=f"{what}s",
+            )
 
 
 # -- one step at a time ------------------------------------------------------------------------------

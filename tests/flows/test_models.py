@@ -21,7 +21,7 @@ def test_damped_oscillator_reference(number):
     for k, t in enumerate(given["times"]):
         wanted = np.array([w * regime["x"][k], regime["v"][k]])
         for found in (flow.closed_form(t) @ X0, flow.exact(t, X0)):
-            assert abs(found - wanted).max() < 1e-10 * max(abs(wanted).max(), 1e-3)
+            assert abs(found - wanted).max() < 1e-12 * max(abs(wanted).max(), 1e-3)
     eigenvalues = [complex(*pair) for pair in regime["eigenvalues"]]
     own = sorted(flow.eigenvalues(), key=lambda z: (z.real, z.imag))
     assert own == pytest.approx(sorted(eigenvalues, key=lambda z: (z.real, z.imag)), abs=2e-7)

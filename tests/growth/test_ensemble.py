@@ -84,6 +84,14 @@ def test_own_model():
         assert found.x[0, :, k] == pytest.approx(one.y[:, -1], rel=1e-6)
 
 
+def test_rates_that_turn_nan_are_marked():
+    # One system of two fails; the other goes on.
+    model = GrowthModel(lambda t, x: np.where((t > 0.5) & (x[0] > 0.5), np.nan, 0 * x), n=2, vectorized=True)
+    found = solve_ensemble(ConstrainedGrowth(model, TotalPopulation(2)), [0.4, 1.0], [[0.6, 0.4], [0.4, 0.6]])
+    assert found.failed.tolist() == [True, False]
+    assert np.all(np.isnan(found.log_x[1, :, 0])) and np.all(np.isfinite(found.log_x[1, :, 1]))
+
+
 def test_bad_input_is_refused():
     model, x0 = Hypercycle(), starts(3)
     with pytest.raises(InputError, match="vectorized"):

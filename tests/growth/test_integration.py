@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kcons.errors import InputError, SingularGeometryError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.growth import (
     ConstrainedGrowth,
     GrowthModel,
@@ -111,6 +111,18 @@ def test_rank_that_is_lost_on_the_way_is_named():
     with pytest.raises(SingularGeometryError, match=r"row 1 .* at t = 0") as caught:
         solve(ConstrainedGrowth(model, rows), (0.0, 1.0), [1.0, 1.0 + 1e-14])
     assert caught.value.rows == (1,)
+
+
+def nan_from_half(t, x):
+    return [np.sqrt(0.5 - t), 1.0] if t < 0.5 else [np.nan, 1.0]
+
+
+@pytest.mark.parametrize("rows", [[], [TotalPopulation(2)]])
+@pytest.mark.parametrize("method", ["DOP853", "Radau"])
+def test_rates_that_turn_nan_on_the_way_are_named(rows, method):
+    system = ConstrainedGrowth(GrowthModel(nan_from_half, n=2), rows)
+    with pytest.raises(NonFiniteError, match=r"rate of species 0 is not finite at t = 0\.5"):
+        solve(system, (0.0, 1.0), [0.5, 0.5], method, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
