@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -53,50 +54,59 @@ def random_systems(n: int, count: int, seed: int) -> tuple[Hypercycle, np.ndarra
     return Hypercycle(n, k_h, mu0, kT), tau, log_x
 
 
+def random_group(n: int, kind: str, share: int, seed: int, batch: int = 16384) -> dict[str, Any]:
+    """`share` random systems of n species under one kind of constraints, to t = 10/k_h."""
+    sums = {"trajectories": 0, "finite": 0, "failed": 0, "settled": 0, "steps": 0}
+    worst = {"total": 0.0, "entropy": 0.0, "least_log_x": 0.0, "most_steps": 0.0}
+    begin = process_time()
+    for part, first in enumerate(range(0, share, batch)):
+        many = min(batch, share - first)
+        model, tau, log_x0 = random_systems(n, many, seed + 1000 * part + 100_000 * KINDS.index(kind))
+        system = constrained(model, kind, tau)
+        times = np.linspace(0.1, 1.0, 10)[:, None] * 10.0 / model.k_h
+        found = solve_ensemble(system, times, log_x0=log_x0, rtol=1e-6, atol=1e-8, batch=batch)
+        start = Populations.from_logarithms(np.zeros(many), log_x0)
+        bound = system.bind(start)
+        size = np.maximum(1.0, np.abs(model.mixture.gibbs_energy(start)))
+        finite = np.all(np.isfinite(found.log_x), axis=(0, 1))
+        for t, log_x in zip(found.t, found.log_x, strict=True):
+            left = np.abs(bound.residuals(Populations.from_logarithms(t, log_x))) / size
+            worst["total"] = max(worst["total"], float(np.max(left[0, finite], initial=0.0)))
+            if kind != "a":
+                worst["entropy"] = max(worst["entropy"], float(np.max(left[1, finite], initial=0.0)))
+        sums["trajectories"] += many
+        sums["finite"] += int(finite.sum())
+        sums["failed"] += int(found.failed.sum())
+        sums["settled"] += int(np.isfinite(found.settled_time).sum())
+        sums["steps"] += int(found.steps.sum())
+        worst["least_log_x"] = min(worst["least_log_x"], float(np.nanmin(found.log_x)))
+        worst["most_steps"] = max(worst["most_steps"], float(found.steps.max()))
+    group = {"n": n, "kind": kind, **sums, **worst, "cpu_s": process_time() - begin}
+    print(
+        f"n = {n} ({kind}): {sums['trajectories']:,} trajectories, {sums['finite']:,} finite, least ln x "
+        f"{worst['least_log_x']:.3g}, rows {worst['total']:.1e} {worst['entropy']:.1e}, {group['cpu_s']:.0f} s",
+        flush=True,
+    )
+    return group
+
+
 def random_starts(
-    count: int, seed: int = 1, sizes: tuple[int, ...] = (2, 3, 4, 5, 6, 8), batch: int = 16384
+    count: int, seed: int = 1, sizes: tuple[int, ...] = (2, 3, 4, 5, 6, 8), processes: int = 1
 ) -> dict[str, Any]:
     """`count` random systems to t = 10/k_h: is ln x finite, do the rows hold?"""
-    result: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8, "groups": []}
-    groups = [(n, kind) for n in sizes for kind in KINDS]
-    for number, (n, kind) in enumerate(groups):
-        share = count // len(groups) + (number < count % len(groups))
-        sums = {"trajectories": 0, "finite": 0, "failed": 0, "settled": 0, "steps": 0}
-        worst = {"total": 0.0, "entropy": 0.0, "least_log_x": 0.0, "most_steps": 0.0}
-        begin = process_time()
-        for part, first in enumerate(range(0, share, batch)):
-            many = min(batch, share - first)
-            model, tau, log_x0 = random_systems(n, many, seed + 1000 * part + 100_000 * KINDS.index(kind))
-            system = constrained(model, kind, tau)
-            times = np.linspace(0.1, 1.0, 10)[:, None] * 10.0 / model.k_h
-            found = solve_ensemble(system, times, log_x0=log_x0, rtol=1e-6, atol=1e-8, batch=batch)
-            start = Populations.from_logarithms(np.zeros(many), log_x0)
-            bound = system.bind(start)
-            size = np.maximum(1.0, np.abs(model.mixture.gibbs_energy(start)))
-            finite = np.all(np.isfinite(found.log_x), axis=(0, 1))
-            for t, log_x in zip(found.t, found.log_x, strict=True):
-                left = np.abs(bound.residuals(Populations.from_logarithms(t, log_x))) / size
-                worst["total"] = max(worst["total"], float(np.max(left[0, finite], initial=0.0)))
-                if kind != "a":
-                    worst["entropy"] = max(worst["entropy"], float(np.max(left[1, finite], initial=0.0)))
-            sums["trajectories"] += many
-            sums["finite"] += int(finite.sum())
-            sums["failed"] += int(found.failed.sum())
-            sums["settled"] += int(np.isfinite(found.settled_time).sum())
-            sums["steps"] += int(found.steps.sum())
-            worst["least_log_x"] = min(worst["least_log_x"], float(np.nanmin(found.log_x)))
-            worst["most_steps"] = max(worst["most_steps"], float(found.steps.max()))
-        group = {"n": n, "kind": kind, **sums, **worst, "cpu_s": process_time() - begin}
-        result["groups"].append(group)
-        print(
-            f"n = {n} ({kind}): {sums['trajectories']:,} trajectories, {sums['finite']:,} finite, least ln x "
-            f"{worst['least_log_x']:.3g}, rows {worst['total']:.1e} {worst['entropy']:.1e}, {group['cpu_s']:.0f} s",
-            flush=True,
-        )
+    kinds = [(n, kind) for n in sizes for kind in KINDS]
+    shares = [count // len(kinds) + (number < count % len(kinds)) for number in range(len(kinds))]
+    work = [(n, kind, share, seed) for (n, kind), share in zip(kinds, shares, strict=True)]
+    if processes == 1:
+        groups = [random_group(*arguments) for arguments in work]
+    else:
+        with ProcessPoolExecutor(processes) as pool:
+            groups = [task.result() for task in [pool.submit(random_group, *arguments) for arguments in work]]
+    result: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8, "groups": groups}
     for key in ("trajectories", "finite", "failed", "settled"):
-        result[key] = sum(g[key] for g in result["groups"])
-    result["worst_row"] = max(max(g["total"], g["entropy"]) for g in result["groups"])
-    result["cpu_s"] = sum(g["cpu_s"] for g in result["groups"])
+        result[key] = sum(g[key] for g in groups)
+    result["worst_row"] = max(max(g["total"], g["entropy"]) for g in groups)
+    result["cpu_s"] = sum(g["cpu_s"] for g in groups)
     return result
 
 
@@ -283,6 +293,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="the sample sizes of docs/growth.md")
     parser.add_argument("--part", choices=("ensemble", "work_precision", "random", "far_out"), help="this part alone")
+    parser.add_argument("--processes", type=int, default=2, help="for the random systems")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     parser.add_argument("--show", type=Path, help="tables of an earlier result instead of a run")
     options = parser.parse_args()
@@ -292,7 +303,9 @@ def main() -> None:
     parts: dict[str, Callable[[], Any]] = {
         "ensemble": lambda: ensemble(10_000 if full else 50, 100.0 if full else 5.0),
         "work_precision": lambda: work_precision() if full else work_precision(5.0, (1e-4, 1e-6)),
-        "random": lambda: random_starts(1_000_000) if full else random_starts(180, sizes=(3,)),
+        "random": lambda: (
+            random_starts(1_000_000, processes=options.processes) if full else random_starts(180, sizes=(3,))
+        ),
         "far_out": far_out if full else lambda: [],
     }
     if options.show:

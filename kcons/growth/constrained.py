@@ -317,6 +317,14 @@ class ConstrainedGrowth:
         """Which of N systems have settled, see `settled`; those then go on as `slow_state` says."""
         return np.zeros(log_x.shape[1:], dtype=bool)
 
+    def arrived_lanes(self, time: FloatArray, log_x: FloatArray) -> NDArray[np.bool_]:
+        """Which of N systems are at rest but for what is beyond round-off; those go on as `rest_state` says."""
+        return np.zeros(log_x.shape[1:], dtype=bool)
+
+    def rest_state(self, time: FloatArray, log_x: FloatArray, later: FloatArray) -> FloatArray:
+        """ln x, shape (n, N), at times `later`, shape (N,), of systems that have arrived in log_x at `time`."""
+        raise NotImplementedError("a system that does not come to rest")
+
     def slow_state(self, time: ArrayLike, accuracy: float = 0.0) -> FloatArray:
         """ln x of a settled system, shape (n, k), at times of shape (k,)."""
         raise NotImplementedError("a system without a slow motion of its own")

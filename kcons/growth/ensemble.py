@@ -238,17 +238,26 @@ class _Batch:
 
     def _settle(self, moved: NDArray[np.bool_]) -> None:
         """Finish those of which nothing is left to integrate."""
-        settled = self.system.settled_lanes(self.t, self.y, self.rtol + self.atol)
-        settled &= moved & (self.next < len(self.times))
-        if not np.any(settled):
-            return
-        index = np.flatnonzero(settled)
+        here = moved & (self.next < len(self.times))
+        arrived = here & self.system.arrived_lanes(self.t, self.y)
+        if np.any(arrived):
+            self._finish(np.flatnonzero(arrived), at_rest=True)
+        settled = here & ~arrived & self.system.settled_lanes(self.t, self.y, self.rtol + self.atol)
+        if np.any(settled):
+            self._finish(np.flatnonzero(settled), at_rest=False)
+
+    def _finish(self, index: NDArray[np.intp], *, at_rest: bool) -> None:
         part = self.system.take(index)
         for k, times in enumerate(self.times):
             late = np.flatnonzero(self.next[index] <= k)
             if len(late):
-                lanes = self.lanes[index[late]]
-                self.log_x[k, :, lanes] = part.take(late).slow_state(times[lanes]).T
+                which = index[late]
+                lanes, system = self.lanes[which], part.take(late)
+                wanted = times[lanes]
+                found = (
+                    system.rest_state(self.t[which], self.y[:, which], wanted) if at_rest else system.slow_state(wanted)
+                )
+                self.log_x[k, :, lanes] = found.T
         self.settled_time[self.lanes[index]] = self.t[index]
         self.next[index] = len(self.times)
 

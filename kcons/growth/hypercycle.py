@@ -264,6 +264,24 @@ class ConstrainedHypercycle(ConstrainedGrowth):
             settled[lanes] = np.max(np.abs(y - log_x[:, lanes]), axis=0) < STRAYING * tolerance
         return settled
 
+    def arrived_lanes(self, time: FloatArray, log_x: FloatArray) -> NDArray[np.bool_]:
+        """Which of the systems have no excess left that numbers could tell."""
+        row = self.entropy_row
+        if row is None or row.total is None or row.law.relaxation_rate() is None:
+            return np.zeros(log_x.shape[1:], dtype=bool)
+        few = NEGLIGIBLE_EXCESS * self.model.mixture.kT * row.total
+        return np.broadcast_to(row.law_excess(time) <= few, log_x.shape[1:])
+
+    def rest_state(self, time: FloatArray, log_x: FloatArray, later: FloatArray) -> FloatArray:
+        """ln x at times `later`: the direction from equilibrium stays, its length shrinks with the law."""
+        row = self.entropy_row
+        assert row is not None and row.total is not None
+        log_eq = self.model.mixture.equilibrium(row.total)
+        log_eq = log_eq[:, None] if log_eq.ndim == 1 else log_eq
+        excess = np.maximum(row.law_excess(time), np.finfo(np.float64).tiny)
+        shrink = np.sqrt(np.maximum(row.law_excess(later), 0.0) / excess)
+        return np.asarray(log_eq + (log_x - log_eq) * np.minimum(shrink, 1.0))
+
     def settled(self, time: float, log_x: FloatArray, tolerance: float) -> Callable[[FloatArray], FloatArray] | None:
         """The slow motion from here on, once the state is on it to `tolerance`; None before.
 
@@ -275,15 +293,7 @@ class ConstrainedHypercycle(ConstrainedGrowth):
             return None
         if self.settled_lanes(np.array([time]), log_x[:, None], tolerance)[0]:
             return self.slow_state
-        kT_c = float(self.model.mixture.kT * row.total)
-        excess = float(row.law_excess(time))
-        if excess > NEGLIGIBLE_EXCESS * kT_c:
+        when, start = np.array([time]), log_x[:, None]
+        if not self.arrived_lanes(when, start)[0]:
             return None
-        log_eq = self.model.mixture.equilibrium(row.total)
-        u = log_x - log_eq
-
-        def frozen(times: FloatArray) -> FloatArray:
-            shrink = np.sqrt(np.maximum(row.law_excess(times), 0.0) / max(excess, np.finfo(np.float64).tiny))
-            return np.asarray(log_eq[:, None] + u[:, None] * np.minimum(shrink, 1.0))
-
-        return frozen
+        return lambda times: self.rest_state(when, start, times)

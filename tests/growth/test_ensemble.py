@@ -66,6 +66,19 @@ def test_those_that_settle_are_finished_at_once():
     assert found.x[3] == pytest.approx(np.repeat(np.exp(system.model.mixture.equilibrium())[:, None], 6, 1), rel=1e-15)
 
 
+def test_two_species_come_to_rest():
+    # Nothing turns with two species: they are finished where no excess is left that numbers could tell.
+    rng = np.random.default_rng(5)
+    system = Hypercycle(2, 1.0, rng.normal(size=(2, 8))).with_entropy_production(0.1)
+    found = solve_ensemble(system, [1.0, 8.0, 1e4], rng.dirichlet([1.0, 1.0], 8).T, rtol=1e-6)
+    assert found.settled_time == pytest.approx(np.full(8, 5.0), abs=0.5)
+    # Thousands of steps, each no longer than round-off lets it, were it integrated on.
+    assert found.steps.max() < 400
+    assert found.log_x[2] == pytest.approx(system.model.mixture.equilibrium(), abs=1e-11)
+    excess = system.model.mixture.excess(Populations.from_logarithms(0.0, found.log_x[0]), 1.0)
+    assert np.all(excess < 2.0 * np.exp(-10.0)) and np.all(excess > 0)
+
+
 def test_extinction_beyond_all_numbers_ends_at_the_least_logarithm():
     # Species 3 to 5 die for good under (c): ln x falls like -e^(lambda t) and would overflow before t = 100.
     x0 = np.array([[0.18899264, 0.01101811, 0.01901061, 0.74291806, 0.03806058]]).T
