@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -57,19 +56,16 @@ def test_committed_result(script, committed, capsys):
     for row in committed["ensemble"]["kinds"].values():
         assert row["failed"] == 0
         assert row["error_max"] < 1e-6
-        assert row["wall_s"] < 60.0
+        # Of one core, and two were used; how long that takes depends on what else runs.
+        assert row["cpu_s"] < 60.0
     script.show(committed)
     assert "10,000 hypercycles" in capsys.readouterr().out
 
 
-def test_page_tells_the_committed_result(committed):
-    for kind, row in committed["ensemble"]["kinds"].items():
-        line = re.search(rf"^\| \({kind}\) .*$", PAGE, re.MULTILINE)
-        assert line is not None
-        assert f"{row['wall_s']:.0f} s" in line[0]
-        assert f"{row['error_max']:.0e}".replace("e-0", "e-") in line[0]
-    assert f"{committed['random']['worst_row']:.0e}" in PAGE
-    assert committed["machine"]["cpu"] in PAGE
+def test_page_shows_the_committed_result(script, committed, capsys):
+    script.show(committed)
+    shown = "\n".join(line.rstrip() for line in capsys.readouterr().out.strip("\n").split("\n"))
+    assert shown in PAGE
 
 
 @pytest.mark.validation
