@@ -56,8 +56,8 @@ def random_systems(n: int, count: int, seed: int) -> tuple[Hypercycle, np.ndarra
 
 def random_group(n: int, kind: str, share: int, seed: int, batch: int = 16384) -> dict[str, Any]:
     """`share` random systems of n species under one kind of constraints, to t = 10/k_h."""
-    sums = {"trajectories": 0, "finite": 0, "failed": 0, "settled": 0, "steps": 0}
-    worst = {"total": 0.0, "entropy": 0.0, "least_log_x": 0.0, "most_steps": 0.0}
+    sums = {"trajectories": 0, "finite": 0, "failed": 0, "settled": 0, "steps": 0, "above_1e-13": 0}
+    worst = {"total": 0.0, "entropy": 0.0, "of_terms": 0.0, "least_log_x": 0.0, "most_steps": 0.0}
     begin = process_time()
     for part, first in enumerate(range(0, share, batch)):
         many = min(batch, share - first)
@@ -68,12 +68,19 @@ def random_group(n: int, kind: str, share: int, seed: int, batch: int = 16384) -
         start = Populations.from_logarithms(np.zeros(many), log_x0)
         bound = system.bind(start)
         size = np.maximum(1.0, np.abs(model.mixture.gibbs_energy(start)))
+        # What g is the sum of: its own zero is that of the potentials, and arbitrary.
+        terms = np.maximum(size, np.sum(start.x * np.abs(model.mixture.potentials(start)), axis=0))
+        above = np.zeros(many, dtype=bool)
         finite = np.all(np.isfinite(found.log_x), axis=(0, 1))
         for t, log_x in zip(found.t, found.log_x, strict=True):
             left = np.abs(bound.residuals(Populations.from_logarithms(t, log_x))) / size
             worst["total"] = max(worst["total"], float(np.max(left[0, finite], initial=0.0)))
             if kind != "a":
                 worst["entropy"] = max(worst["entropy"], float(np.max(left[1, finite], initial=0.0)))
+                of_terms = (left[1] * size / terms)[finite]
+                worst["of_terms"] = max(worst["of_terms"], float(np.max(of_terms, initial=0.0)))
+            above |= finite & np.any(left > 1e-13, axis=0)
+        sums["above_1e-13"] += int(above.sum())
         sums["trajectories"] += many
         sums["finite"] += int(finite.sum())
         sums["failed"] += int(found.failed.sum())
@@ -103,9 +110,10 @@ def random_starts(
         with ProcessPoolExecutor(processes) as pool:
             groups = [task.result() for task in [pool.submit(random_group, *arguments) for arguments in work]]
     result: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8, "groups": groups}
-    for key in ("trajectories", "finite", "failed", "settled"):
+    for key in ("trajectories", "finite", "failed", "settled", "above_1e-13"):
         result[key] = sum(g[key] for g in groups)
     result["worst_row"] = max(max(g["total"], g["entropy"]) for g in groups)
+    result["worst_of_terms"] = max(g["of_terms"] for g in groups)
     result["cpu_s"] = sum(g["cpu_s"] for g in groups)
     return result
 
