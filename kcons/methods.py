@@ -13,7 +13,6 @@ from ase import Atoms
 from ase.constraints import FixAtoms, FixBondLengths, FixInternals
 from ase.md.verlet import VelocityVerlet
 from scipy.integrate import DOP853
-from scipy.linalg import qr
 
 from kcons import steppers
 from kcons.ase import Constraints
@@ -23,8 +22,10 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.motion import Motion
 from kcons.openmm_methods import OPENMM_METHODS
-from kcons.runs import ENGINE_CALLS, Method, Run, matched_steps
+from kcons.peers import PEERS
+from kcons.runs import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
 from kcons.scenes import Scene
+from kcons.scenes.friction import Damped
 from kcons.steppers import Rattle, State, Stepper, System
 
 #: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
@@ -73,6 +74,8 @@ class _CoreRun(Run):
         self._state = self._stepper.step(self._system, self._state, self._dt)
         self._done += 1
         self.time = self._done * self._dt
+        # Rigid water takes a step in one kernel, in which the engine is not called.
+        self.divided = self.constraints.seconds > 0.0
 
     def rewind(self) -> None:
         self._state = self._start
@@ -105,6 +108,7 @@ class CoreStepper(Method):
     """
 
     make: Callable[[float], Stepper] = lambda dt: Rattle()
+    damps: bool = True
 
     @property
     def stepper(self) -> Stepper:
@@ -121,8 +125,11 @@ class CoreStepper(Method):
 
     def start(self, scene: Scene, setting: float) -> Run:
         # What does not keep the positions on the surface cannot have rows that depend on each other there.
-        held = scene.constraint_set if self.stepper.symplectic else _independent_rows(scene)
-        return _CoreRun(scene, Motion(held, scene.positions), self.make(setting), setting)
+        held = scene.constraint_set if self.stepper.symplectic else independent_rows(scene)
+        stepper = self.make(setting)
+        if scene.friction:
+            stepper = Damped(stepper, scene.friction)
+        return _CoreRun(scene, Motion(held, scene.positions), stepper, setting)
 
 
 class CoreVerlet(Method):
@@ -260,13 +267,16 @@ class _OdeRun(Run):
     def __init__(self, scene: Scene, rtol: float) -> None:
         super().__init__()
         # Off the surface, where this equation drifts, rows that depend on each other contradict each other.
-        motion = Motion(_independent_rows(scene), scene.positions)
+        motion = Motion(independent_rows(scene), scene.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
         shape, half = scene.positions.shape, scene.positions.size
 
         def rate(t: float, y: FloatArray) -> FloatArray:
             x, v = y[:half].reshape(shape), y[half:].reshape(shape)
-            return np.concatenate([y[half:], motion.acceleration(x, v, scene.potential.forces(x, t), t).ravel()])
+            f = scene.potential.forces(x, t)
+            if scene.friction:
+                f -= scene.friction * scene.masses[:, None] * v
+            return np.concatenate([y[half:], motion.acceleration(x, v, f, t).ravel()])
 
         speed = float(np.sqrt(np.mean(scene.velocities**2)))
         # Errors are measured against one unit of length and the thermal speed, not against each entry.
@@ -294,21 +304,6 @@ class _OdeRun(Run):
         return np.asarray(self._solver.y[self._half :]).reshape(self._shape)
 
 
-def _independent_rows(scene: Scene) -> ConstraintSet:
-    """The set without the rows that others imply at the start (those last in a pivoted QR)."""
-    held = scene.constraint_set
-    if scene.motion.rank == held.n_rows:
-        return held
-    weighted = held.jacobian(scene.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
-    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][: scene.motion.rank])
-    pieces = []
-    for item, start in zip(held.constraints, held.starts, strict=False):
-        mine = kept[(kept >= start) & (kept < start + item.n_rows)] - start
-        if len(mine):
-            pieces.append(item.select(mine))
-    return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
-
-
 class ProjectedOde(Method):
     """SciPy's DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105): nothing stops a drift."""
 
@@ -323,10 +318,11 @@ METHODS: Mapping[str, Method] = {
         AseKcons("ase-kcons", "ASE Verlet + kcons", host="ase"),
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
-        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy"),
+        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
         CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
         AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
         *OPENMM_METHODS,
+        *PEERS,
     )
 }
 
@@ -363,13 +359,12 @@ def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> li
 
 
 def usual(scene: Scene | None = None) -> list[Method]:
-    """What runs where no method is named: the usual ones, of OpenMM only those that can run the scene.
+    """What runs where no method is named: the usual ones, of guests only those that can run the scene.
 
-    All of OpenMM's on scenes that are at home there, and nothing else; elsewhere those that are guests.
+    All of OpenMM's on scenes that are at home there, and nothing else.
     """
     found = [method for method in METHODS.values() if method.usual]
-    if scene is None or scene.openmm is None:
-        return [method for method in found if method.host != "openmm"]
-    if scene.openmm.home:
+    if scene is not None and scene.openmm is not None and scene.openmm.home:
         return [method for method in found if method.host == "openmm" and method.refuses(scene) is None]
-    return [m for m in found if m.host != "openmm" or (m.guest and m.refuses(scene) is None)]
+    hosts = [m for m in found if m.host != "openmm" or m.guest]
+    return [m for m in hosts if not m.guest or (scene is not None and m.refuses(scene) is None)]

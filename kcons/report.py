@@ -45,6 +45,14 @@ STYLES: dict[str, tuple[str, str | int]] = {
     "openmm-held-rattle": ("#74c476", "s"),
     "openmm-held-blanes-moan6": ("#006d2c", "D"),
     "openmm-free": ("#cccccc", 6),
+    # Peers: sweeps in browns, LAMMPS in violets, DAE solvers in greys.
+    "shake-1e-4": ("#dfc27d", 4),
+    "shake-1e-8": ("#a6611a", 5),
+    "lammps-shake-1e-8": ("#9e9ac8", 7),
+    "lammps-rattle-1e-8": ("#6a51a3", "x"),
+    "mici": ("#f768a1", "2"),
+    "dae-radau": ("#525252", "3"),
+    "dae-ida": ("#969696", "4"),
 }
 
 #: For methods that have no style of their own, in their order.

@@ -11,6 +11,10 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+from scipy.linalg import qr
+
+from kcons.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.scenes import Scene
 
@@ -129,13 +133,15 @@ class Method(ABC):
     usual : bool
         Whether it runs unless methods are named.
     host : str
-        Whose it is: 'kcons', 'ase', 'scipy' or 'openmm'.
+        Whose it is: 'kcons', 'ase', 'scipy', 'openmm' or 'peer'.
     guest : bool
-        Whether it runs, unless methods are named, on scenes that are at home in another host too.
+        Whether it runs, unless methods are named, wherever it is able to, and is not mentioned elsewhere.
     follows : bool
         Whether it is to follow the reference trajectory. A thermostat does not: no error can be stated.
     remark : str
         What a reader of its numbers should know.
+    damps : bool
+        Whether it can run scenes with friction.
     """
 
     name: str
@@ -147,9 +153,12 @@ class Method(ABC):
     guest: bool = False
     follows: bool = True
     remark: str = ""
+    damps: bool = False
 
     def refuses(self, scene: Scene) -> str | None:
         """Why this method cannot run the scene, or None."""
+        if scene.friction and self.holds and not self.damps:
+            return "it knows no friction"
         return scene.refusals.get(self.name)
 
     def settings(self, scene: Scene) -> tuple[float, ...]:
@@ -170,3 +179,19 @@ def matched_steps(scene: Scene, evaluations: int) -> tuple[float, ...]:
     first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
     counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
     return tuple(scene.horizon / count for count in counts)
+
+
+def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> ConstraintSet:
+    """The scene's set, or an equivalent one, without the rows that others imply at the start (last in a pivoted QR)."""
+    if held is None:
+        held = scene.constraint_set
+    if scene.motion.rank == held.n_rows:
+        return held
+    weighted = held.jacobian(scene.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
+    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][: scene.motion.rank])
+    pieces = []
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        mine = kept[(kept >= start) & (kept < start + item.n_rows)] - start
+        if len(mine):
+            pieces.append(item.select(mine))
+    return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)

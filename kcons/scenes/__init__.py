@@ -42,6 +42,10 @@ SCENES: Mapping[str, Entry] = {
     "chain-free": Entry("chain", "freely jointed chain", 100, 20, "bonds", {"shape": "free"}),
     "sphere": Entry("sphere", "free particles on spheres; closed form", 10, 2, "particles"),
     "sphere-pendulum": Entry("sphere", "spherical pendulums", 10, 2, "particles", {"gravity": 1.0}),
+    "sphere-pendulum-top": Entry(
+        "sphere", "spherical pendulums from near the top", 10, 2, "particles", {"gravity": 1.0, "near_top": True}
+    ),
+    "fekete": Entry("fekete", "20 repelling particles on a sphere, with friction; known optimum", 20, 20, "particles"),
     "ethanol": Entry("molecule", "ethanol, all bonds and angles, GFN2-xTB forces", 1, 1, "molecule"),
     "butane": Entry("butane", "four-atom chain, bonds and angles held, free torsion", 1, 1, "molecule"),
     "dumbbells": Entry("dumbbells", "collision of two rigid dumbbells; a periodic box from 8 on", 2, 2, "dumbbells"),

@@ -20,6 +20,8 @@ from kcons.scenes.scene import Scene, thermal_velocities
 BOND = 1.53
 MASS = 14.027
 TEMPERATURE = 300.0
+#: From so many bonds on, runs are half, and a quarter as long: a reference solution has to be paid for.
+LONG, VERY_LONG = 50_000, 500_000
 #: Stiffness of the site that pulls at each atom, eV/Å².
 STIFFNESS = 0.2
 
@@ -55,6 +57,11 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> Scene:
     held = ConstraintSet(Distance(pairs, BOND), x, masses)
     # Near 180° small sideways motion changes the directions of the bonds fast.
     pace = 0.5 if shape in ("straight", "175") else 1.0
+    horizon, steps = 80.0, [10.0, 5.0, 2.5, 1.25]
+    if size >= LONG:
+        horizon = 40.0
+    if size >= VERY_LONG:
+        horizon, steps = 20.0, steps[:3]
     v = thermal_velocities(Motion(held, x), x, TEMPERATURE, seed, at_rest=False)
     return Scene(
         name="chain" if shape == "zigzag" else f"chain-{shape}",
@@ -64,8 +71,8 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> Scene:
         velocities=v,
         potential=Potential(_springs(x), "harmonic sites"),
         symbols=["C"] * (size + 1),
-        horizon=pace * 80 * units.fs,
-        time_steps=tuple(pace * dt * units.fs for dt in (10.0, 5.0, 2.5, 1.25)),
+        horizon=pace * horizon * units.fs,
+        time_steps=tuple(pace * dt * units.fs for dt in steps),
         bonds=pairs,
         openmm=OpenMMHost(lambda: _system(x, pairs, masses)),
     )

