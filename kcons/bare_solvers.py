@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -140,12 +141,8 @@ class OpenMMSolver(BareSolver):
         super().__init__(system, tolerance)
         if find_spec("openmm") is None:
             raise UnsupportedError("OpenMM is not installed; python -m pip install openmm")
-        import openmm
-
         self.tolerance = tolerance
-        platform = openmm.Platform.getPlatformByName("CPU")
-        made = openmm_system(system)
-        self.context = openmm.Context(made, openmm.VerletIntegrator(0.001), platform, {"Threads": "1"})
+        self.context = _context(system)
 
     def timing(self, stage: str) -> Timing:
         system, context = self.system, self.context
@@ -164,6 +161,15 @@ class OpenMMSolver(BareSolver):
         state = self.context.getState(**{what: True})
         found = state.getPositions(asNumpy=True) if what == "positions" else state.getVelocities(asNumpy=True)
         return np.asarray(found._value)
+
+
+@lru_cache(maxsize=1)
+def _context(system: BareSystem) -> Any:
+    """The tolerance is an argument of each solve; CCMA may take most of a minute to set up."""
+    import openmm
+
+    platform = openmm.Platform.getPlatformByName("CPU")
+    return openmm.Context(openmm_system(system), openmm.VerletIntegrator(0.001), platform, {"Threads": "1"})
 
 
 def openmm_system(system: BareSystem) -> Any:

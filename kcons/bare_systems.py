@@ -22,7 +22,7 @@ STEP = 2.0
 NONE: IntArray = np.zeros((0, 3), dtype=np.int64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BareSystem:
     """Masses and distances.
 

@@ -99,6 +99,7 @@ def _points(name: str, system: BareSystem, candidate: Candidate, patience: float
         except UnsupportedError as error:
             return [*found, {**common, "stage": BOTH, "status": "not run", "note": str(error)}]
         setup = perf_counter() - begun
+        begun = perf_counter()
         for stage in STAGES:
             point = {**common, "stage": stage, "setup_seconds": setup}
             try:
