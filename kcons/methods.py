@@ -264,7 +264,7 @@ def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
 
 
 class _OdeRun(Run):
-    def __init__(self, scene: Scene, rtol: float) -> None:
+    def __init__(self, scene: Scene, rtol: float, *, project: bool) -> None:
         super().__init__()
         # Off the surface, where this equation drifts, rows that depend on each other contradict each other.
         motion = Motion(independent_rows(scene), scene.positions)
@@ -273,9 +273,9 @@ class _OdeRun(Run):
 
         def rate(t: float, y: FloatArray) -> FloatArray:
             x, v = y[:half].reshape(shape), y[half:].reshape(shape)
-            f = scene.potential.forces(x, t)
+            f = self._force = scene.potential.forces(x, t)
             if scene.friction:
-                f -= scene.friction * scene.masses[:, None] * v
+                f = f - scene.friction * scene.masses[:, None] * v
             return np.concatenate([y[half:], motion.acceleration(x, v, f, t).ravel()])
 
         speed = float(np.sqrt(np.mean(scene.velocities**2)))
@@ -283,6 +283,7 @@ class _OdeRun(Run):
         scale = np.concatenate([np.ones(half), np.full(half, speed if speed > 0 else 1.0)])
         start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])
         self._shape, self._half = shape, half
+        self._motion, self._project, self._damping = motion, project, scene.friction * scene.masses[:, None]
         self._solver = DOP853(rate, 0.0, start, scene.horizon, rtol=max(rtol, 1e-13), atol=rtol * scale)
 
     def advance(self) -> None:
@@ -290,6 +291,17 @@ class _OdeRun(Run):
         if self._solver.status == "failed":
             raise KconsError(f"DOP853 gave up at t = {self._solver.t:g}: {message}")
         self.time = float(self._solver.t)
+        if self._project:
+            self._land()
+
+    def _land(self) -> None:
+        """Back onto the constraints, by less than the tolerance: the force known there need not be computed again."""
+        motion, t = self._motion, self.time
+        x = motion.project_positions(self.positions, self.positions, time=t)
+        v = motion.project_velocities(x, self.velocities, time=t)
+        a = motion.acceleration(x, v, self._force - self._damping * v, t)
+        self._solver.y = np.concatenate([x.ravel(), v.ravel()])
+        self._solver.f = np.concatenate([v.ravel(), a.ravel()])
 
     @property
     def finished(self) -> bool:
@@ -304,11 +316,21 @@ class _OdeRun(Run):
         return np.asarray(self._solver.y[self._half :]).reshape(self._shape)
 
 
+@dataclass(frozen=True)
 class ProjectedOde(Method):
-    """SciPy's DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105): nothing stops a drift."""
+    """SciPy's DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105).
+
+    Attributes
+    ----------
+    project : bool
+        Whether the engine brings positions and velocities back onto the constraints after each step (Hairer, Lubich
+        and Wanner, Geometric Numerical Integration, IV.4); otherwise nothing stops a drift.
+    """
+
+    project: bool = False
 
     def start(self, scene: Scene, setting: float) -> Run:
-        return _OdeRun(scene, setting)
+        return _OdeRun(scene, setting, project=self.project)
 
 
 METHODS: Mapping[str, Method] = {
@@ -319,6 +341,7 @@ METHODS: Mapping[str, Method] = {
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
         ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
+        ProjectedOde("dop853-projected", "kcons + DOP853, projected", adaptive=True, damps=True, project=True),
         CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
         AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
         *OPENMM_METHODS,

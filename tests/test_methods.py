@@ -188,3 +188,17 @@ def test_hosts_fix_the_atoms_of_the_slab():
         assert not moved[scene.fixed].any()
         assert np.delete(moved, scene.fixed).all()
         assert run.constraints.seconds > 0
+
+
+@pytest.mark.parametrize("name", ["triple-pendulum", "rotor", "bead-rotating"])
+def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name):
+    # Along a constraint that moves, too.
+    scene = scenes.build(name)
+    found = compare.compare(scene, methods=["dop853", "dop853-projected"])
+    for free, held in zip(found.of("dop853"), found.of("dop853-projected"), strict=True):
+        assert held.evaluations_per_time == pytest.approx(free.evaluations_per_time, rel=0.05)
+        assert held.error < free.error
+        assert held.constraint_residual < 1e-14
+        assert held.velocity_residual < 1e-14
+    errors = [m.error for m in found.of("dop853-projected")]
+    assert errors[0] > 100 * errors[1] > 1e4 * errors[2]
