@@ -6,141 +6,36 @@ solution at the horizon. Times are medians over steps, after the kernels have be
 
 from __future__ import annotations
 
-import os
-import platform
 import signal
-import subprocess
 import textwrap
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
-from importlib import metadata
-from pathlib import Path
+from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
+from kcons.machine import environment, kernels_cached
 from kcons.methods import chosen
+from kcons.results import Comparison, Measurement, Status, duration
 from kcons.runs import Method, Run
 from kcons.scenes import Reference, Scene
+from kcons.scenes.potential import Potential
 from kcons.steppers import Rattle, State, System
-
-#: Packages whose versions go into the result.
-PACKAGES = ("kcons", "numpy", "scipy", "numba", "ase", "openmm", "tblite", "matplotlib")
 
 #: A first step below this may be slow only because it is the first.
 FIRST_STEP_DOUBT = 0.5
 
+#: A repeat takes at most this part of a method's budget.
+REPEAT_SHARE = 0.3
+#: Points at which the forces are timed, and for how many seconds at most.
+FORCE_POINTS, FORCE_SECONDS = 15, 0.5
+
 #: A host is interrupted within a step after so many budgets.
 PATIENCE = 3
-
-Status = Literal["ok", "floor", "thermostat", "partial", "failed", "not run"]
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One method at one time step (or tolerance). Times in seconds unless said; None where not known.
-
-    Attributes
-    ----------
-    setting : float
-        Time step in the scene's shown unit, or relative tolerance of an adaptive method.
-    status : {'ok', 'floor', 'thermostat', 'partial', 'failed', 'not run'}
-        'floor': nothing is held, only the cost is stated. 'thermostat': the trajectory is not to be that of the
-        reference, so that there is no error. 'partial': stopped for the budget; cost only.
-    error : float
-        Root-mean-square distance an atom from the reference at the horizon.
-    constraint_residual, velocity_residual : float
-        max |sigma| in natural units, and max |A v|/v_rms with rows of unit norm, after the last step.
-    energy_slope, energy_slope_error : float
-        Linear fit of the total energy against time and its standard error, a degree of freedom and `long_time`.
-    step_seconds, constraint_seconds : float
-        Median wall time of a step, and of the constraints' part of it where a host tells.
-    setup_seconds : float
-        Before the first step, and what the first step took beyond the others.
-    evaluations_per_time, seconds_per_time : float
-        Force evaluations and wall time a simulated `long_time` (1 ps for molecules).
-    """
-
-    method: str
-    title: str
-    setting: float
-    adaptive: bool
-    status: Status
-    note: str = ""
-    steps: int = 0
-    steps_planned: int | None = None
-    error: float | None = None
-    constraint_residual: float | None = None
-    velocity_residual: float | None = None
-    energy_slope: float | None = None
-    energy_slope_error: float | None = None
-    step_seconds: float | None = None
-    constraint_seconds: float | None = None
-    setup_seconds: float | None = None
-    evaluations_per_time: float | None = None
-    seconds_per_time: float | None = None
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """All that `kcons compare` found.
-
-    Attributes
-    ----------
-    scene : mapping
-        Name, title, sizes, horizon, units.
-    reference : mapping
-        How the reference was obtained and how good it is.
-    settings : mapping
-        What was asked for.
-    environment : mapping
-        Machine, versions, commit, date.
-    measurements : list of Measurement
-    remarks : list of str
-        What a reader should know of the methods that ran.
-    """
-
-    scene: Mapping[str, Any]
-    reference: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    environment: Mapping[str, Any]
-    measurements: Sequence[Measurement] = field(default_factory=list)
-    remarks: Sequence[str] = ()
-
-    def of(self, method: str, status: Status = "ok") -> list[Measurement]:
-        """Measurements of one method, coarsest first."""
-        return [m for m in self.measurements if m.method == method and m.status == status]
-
-    def observed_order(self, method: str) -> float | None:
-        """Slope of log(error) against log(time step) at the two finest steps whose error is above the reference's.
-
-        None with fewer than two such steps. Coarser steps are left out: high orders show at small steps only.
-        """
-        floor = 5 * float(self.reference["error"])
-        used = [m for m in self.of(method) if not m.adaptive and m.error is not None and m.error > max(floor, 1e-12)]
-        if len(used) < 2:
-            return None
-        steps, errors = np.log([(m.setting, float(m.error or 0)) for m in used[-2:]]).T
-        return float((errors[1] - errors[0]) / (steps[1] - steps[0]))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data, as it goes to JSON."""
-        orders = {name: self.observed_order(name) for name in dict.fromkeys(m.method for m in self.measurements)}
-        return {
-            "format": "kcons-compare-1",
-            "scene": dict(self.scene),
-            "reference": dict(self.reference),
-            "settings": dict(self.settings),
-            "environment": dict(self.environment),
-            "remarks": list(self.remarks),
-            "observed_order": {name: order for name, order in orders.items() if order is not None},
-            "measurements": [asdict(m) for m in self.measurements],
-        }
 
 
 class Watcher:
@@ -155,6 +50,9 @@ class Watcher:
     def end(self) -> None:
         """It is over."""
 
+    def overall(self, what: str, done: float, total: float) -> None:
+        """A part of something larger starts; of its `total` expected seconds `done` are over."""
+
 
 def compare(
     scene: Scene,
@@ -163,6 +61,8 @@ def compare(
     budget: float = 30.0,
     watcher: Watcher | None = None,
     settings: Mapping[str, Any] | None = None,
+    repeats: int = 0,
+    reference: Reference | None = None,
 ) -> Comparison:
     """Run `scene` through `methods`.
 
@@ -178,6 +78,10 @@ def compare(
     watcher : Watcher, optional
     settings : mapping, optional
         What else to record with the result.
+    repeats : int
+        Each method is run so often again at its longest step, to see how well times repeat.
+    reference : Reference, optional
+        If it is known.
 
     Raises
     ------
@@ -197,9 +101,8 @@ def compare(
     watching.advance(1)
     watching.end()
 
-    watching.begin("reference solution", 1)
-    reference = scene.reference(lambda done, total: watching.advance(done / total))
-    watching.end()
+    if reference is None:
+        reference = reference_of(scene, watching)
 
     measurements: list[Measurement] = []
     for method in picked:
@@ -208,6 +111,7 @@ def compare(
             measurements.append(Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason))
             continue
         measurements += _all_settings(scene, method, reference, budget, watching)
+    margin = _repeated(scene, picked, measurements, reference, budget, repeats, watching)
     unit = scene.units.time_unit
     return Comparison(
         scene={
@@ -231,7 +135,89 @@ def compare(
         remarks=list(dict.fromkeys(m.remark for m in picked if m.remark)),
         environment=environment(),
         measurements=measurements,
+        timing={"force_seconds": force_seconds(scene), "repeats": repeats, "margin": margin},
     )
+
+
+def reference_of(scene: Scene, watcher: Watcher) -> Reference:
+    """The reference solution, with its progress shown."""
+    watcher.begin("reference solution", 1)
+    try:
+        return scene.reference(lambda done, total: watcher.advance(done / total))
+    finally:
+        watcher.end()
+
+
+def force_seconds(scene: Scene) -> float:
+    """Median wall time of the scene's forces beyond that of a spring on one atom, which is that of a call of NumPy."""
+    least = Potential(lambda x: (0.5 * float(np.sum(x * x)), -x), "one spring")
+    return max(0.0, _force_time(scene.potential, scene.positions) - _force_time(least, np.ones((1, 3))))
+
+
+def _force_time(potential: Potential, x: np.ndarray) -> float:
+    potential.watched_energy(x)
+    potential.forget()
+    found: list[float] = []
+    while len(found) < FORCE_POINTS and sum(found) < FORCE_SECONDS:
+        begun = perf_counter()
+        potential.watched_energy(x)
+        found.append(perf_counter() - begun)
+    return float(np.median(found))
+
+
+def measure(
+    scene: Scene, method: Method, setting: float, reference: Reference, budget: float, watcher: Watcher | None = None
+) -> Measurement:
+    """One method at one setting, a time step in internal units or a tolerance; `warm_up` comes first.
+
+    Parameters
+    ----------
+    scene : Scene
+    method : Method
+    setting : float
+    reference : Reference
+    budget : float
+        Seconds.
+    watcher : Watcher, optional
+    """
+    watching = watcher or Watcher()
+    shown = setting if method.adaptive else setting / scene.units.time_unit
+    planned = None if method.adaptive else round(scene.horizon / setting)
+    common: dict[str, Any] = dict(
+        method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
+    )
+    watching.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
+    try:
+        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common)
+    finally:
+        watching.end()
+
+
+def _repeated(
+    scene: Scene,
+    picked: Iterable[Method],
+    measurements: Iterable[Measurement],
+    reference: Reference,
+    budget: float,
+    repeats: int,
+    watcher: Watcher,
+) -> float | None:
+    """By what fraction nine tenths of the times of a step changed at most; None where nothing was repeated."""
+    off: list[float] = []
+    for method in picked:
+        done = [m for m in measurements if m.method == method.name and m.status in ("ok", "floor") and m.step_seconds]
+        if not done or repeats < 1:
+            continue
+        first = done[0]
+        once = float(first.step_seconds or 0.0) * first.steps + float(first.setup_seconds or 0.0)
+        if once * repeats > REPEAT_SHARE * budget:
+            continue
+        setting = first.setting if method.adaptive else first.setting * scene.units.time_unit
+        for _ in range(repeats):
+            again = measure(scene, method, setting, reference, budget, watcher)
+            if again.step_seconds:
+                off.append(abs(np.log(again.step_seconds / float(first.step_seconds or 1.0))))
+    return float(np.expm1(np.quantile(off, 0.9))) if off else None
 
 
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
@@ -435,14 +421,6 @@ def _energy_slope(scene: Scene, log: _Log) -> tuple[float | None, float | None]:
     return slope, float(np.sqrt(left_over / (len(t) - 2) / (t @ t)))
 
 
-def duration(seconds: float) -> str:
-    """Three digits and a unit, for example '12.5 ms'."""
-    for size, limit, unit in ((1e-9, 1e-6, "ns"), (1e-6, 1e-3, "µs"), (1e-3, 1.0, "ms"), (1.0, 600.0, "s")):
-        if seconds < 0.9995 * limit:
-            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
-    return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"
-
-
 @contextmanager
 def _interrupted_after(seconds: float) -> Iterator[None]:
     """Raise _OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread)."""
@@ -460,56 +438,3 @@ def _interrupted_after(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, previous)
-
-
-# -- where and with what ----------------------------------------------------------------------------
-
-
-def environment() -> dict[str, Any]:
-    """Machine, versions, commit and date."""
-    versions: dict[str, str | None] = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = None
-    return {
-        "cpu": _processor(),
-        "cores": os.cpu_count(),
-        "threads": 1,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "versions": versions,
-        "commit": _commit(),
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-    }
-
-
-def kernels_cached() -> bool:
-    """Whether compiled kernels of an earlier run are on disk beside the package (or where NUMBA_CACHE_DIR says)."""
-    here = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)
-    return next(here.rglob("*.nbi"), None) is not None
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    """Commit of the checkout this file belongs to, with '+' if it was changed since; None outside of one."""
-
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
-    except (OSError, subprocess.SubprocessError):
-        return None

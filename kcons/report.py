@@ -13,11 +13,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from kcons.compare import Comparison, Measurement, duration
+from kcons.fronts import ARRAYS, EVERY_HOST, Cost, Standing, verdict
 from kcons.methods import METHODS
+from kcons.page import PageTable
+from kcons.results import Comparison, Measurement, duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Colour-blind safe (Okabe and Ito), and a marker each; 6 is matplotlib's upward caret.
 STYLES: dict[str, tuple[str, str | int]] = {
@@ -195,13 +198,19 @@ def explanation(comparison: Comparison) -> str:
 
 
 def plot(comparison: Comparison, path: Path) -> None:
-    """Error against force evaluations and against wall time, both axes logarithmic, as a PNG file."""
+    """`figure` as a PNG file."""
+    figure(comparison).savefig(path, dpi=150)
+
+
+def figure(comparison: Comparison) -> Figure:
+    """Error against force evaluations and against wall time, all axes logarithmic, the fronts of each host marked."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     units = comparison.scene["units"]
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    names = len({m.method for m in comparison.measurements})
+    figure = Figure(figsize=(11, 5.0 + 0.22 * math.ceil(max(names, 3) / 3)), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, cost in ((left, "evaluations_per_time"), (right, "seconds_per_time")):
@@ -222,12 +231,16 @@ def plot(comparison: Comparison, path: Path) -> None:
                 )
         if _reference_in_sight(comparison):
             axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
+    standings = verdict(comparison).standings
+    _mark_fronts(left, standings, "evaluations")
+    _mark_fronts(right, standings, "wall")
     _mark_costs_without_error(right, comparison)
     for axes in (left, right):
-        if not any(line.get_marker() != "None" for line in axes.lines):
+        if not standings:
             axes.text(0.5, 0.5, "no method reached the horizon", transform=axes.transAxes, ha="center")
-            if not axes.get_legend_handles_labels()[0]:
+            if not any(len(line.get_xdata()) for line in axes.lines):
                 axes.set_xlim(1.0, 1000.0)
+            axes.set_ylim(1e-6, 1.0)
         axes.set(xscale="log", yscale="log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -248,11 +261,37 @@ def plot(comparison: Comparison, path: Path) -> None:
         )
     handles, labels = right.get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     environment = comparison.environment
     figure.suptitle(comparison.scene["title"], fontsize=11)
     right.set_title(f"{environment['cpu']}, 1 thread; {environment['date']}", fontsize=8, loc="right")
-    figure.savefig(path, dpi=150)
+    return figure
+
+
+#: Bands behind the curves, one a host.
+FRONT_STYLES = {ARRAYS: "#999999", "ASE": "#D9B38C", "OpenMM": "#B3A2C7", "LAMMPS": "#A9CBA4"}
+
+
+def _mark_fronts(axes: Axes, standings: Sequence[Standing], cost: Cost) -> None:
+    """A broad pale band through the points that no other of the same host dominates."""
+    from kcons.fronts import cost_of
+
+    for standing in standings:
+        if standing.cost != cost or standing.host == EVERY_HOST or not standing.front:
+            continue
+        axes.plot(
+            [cost_of(m, cost) for m in standing.front],
+            [float(m.error or 0.0) for m in standing.front],
+            color=FRONT_STYLES.get(standing.host, "#999999"),
+            linewidth=9,
+            alpha=0.45,
+            zorder=0,
+            solid_capstyle="round",
+            marker="o",
+            markersize=8,
+            markeredgewidth=0,
+            label=f"front, {standing.host}",
+        )
 
 
 def _reference_in_sight(comparison: Comparison) -> bool:
@@ -262,7 +301,10 @@ def _reference_in_sight(comparison: Comparison) -> bool:
 
 
 def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
-    """Floors: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line."""
+    """Floors: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line.
+
+    Runs that failed: crosses along the upper edge, at the cost they had until then.
+    """
     for name in dict.fromkeys(m.method for m in comparison.measurements):
         colour, marker = style(name)
         floors = [m for m in comparison.of(name, "floor") if m.seconds_per_time]
@@ -281,13 +323,27 @@ def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
             if m.seconds_per_time:
                 label = f"{m.title} (stopped for the budget, cost only)"
                 axes.axvline(m.seconds_per_time, color=colour, linestyle="--", linewidth=1.2, label=label)
+        failed = comparison.of(name, "failed")
+        if failed:
+            known = [float(m.seconds_per_time) for m in failed if m.seconds_per_time]
+            axes.plot(
+                known,
+                [0.97] * len(known),
+                transform=axes.get_xaxis_transform(),
+                linestyle="none",
+                marker="x",
+                color=colour,
+                markersize=8,
+                markeredgewidth=2,
+                label=f"{failed[0].title} (failed at {len(failed)} of its settings)",
+            )
 
 
 def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:
     """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
-    data.write_text(json.dumps(_plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    data.write_text(json.dumps(plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     plot(comparison, picture)
     written = [data, picture]
     if tables:
@@ -296,12 +352,42 @@ def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -
     return written
 
 
-def _plain(value: Any) -> Any:
+def page_table(comparison: Comparison) -> PageTable:
+    """All measurements as a table of a page: those on a front are good rows, those that failed bad ones."""
+    units = comparison.scene["units"]
+    rank = max(int(comparison.scene["rank"]), 1)
+    headings = [
+        *("method", f"step / {units['time']}", f"error / {units['length']}", "on the front of"),
+        *("max |σ|", "max |Av|", f"slope / {units['energy']}/{units['long_time']}"),
+        *("time a step", "constraints a step", "a constraint", f"forces a {units['long_time']}"),
+        *(f"wall a {units['long_time']}", "what happened"),
+    ]
+    on_front: dict[int, list[str]] = {}
+    for standing in verdict(comparison).standings:
+        for m in standing.front if standing.host != EVERY_HOST else ():
+            on_front.setdefault(id(m), []).append("wall" if standing.cost == "wall" else "forces")
+    rows, marks = [], []
+    for m in comparison.measurements:
+        cells = {name: str(cell) for name, cell in _cells(m, None).items()}
+        each = m.constraint_seconds / rank if m.constraint_seconds is not None and m.status != "floor" else None
+        front = on_front.get(id(m), [])
+        rows.append(
+            [
+                *(m.title, cells["step"], cells["error"], ", ".join(dict.fromkeys(front))),
+                *(cells["max |σ|"], cells["max |Av|"], cells["slope"], cells["time"], cells["constraints"]),
+                *("" if each is None else duration(each), cells["forces"], cells["wall"], m.note),
+            ]
+        )
+        marks.append("good" if front else "bad" if m.status == "failed" else "")
+    return PageTable(headings, rows, text_columns=(0, 3, len(headings) - 1), marks=marks)
+
+
+def plain(value: Any) -> Any:
     """JSON has no NaN: it becomes null."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
