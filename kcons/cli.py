@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +86,23 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
     compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
     compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
+    compare.add_argument(
+        "--target-error",
+        type=float,
+        metavar="E",
+        help="also find the cheapest method and step that make at most this error, by measurement",
+    )
+    report = compare.add_argument_group("the whole comparison")
+    report.add_argument(
+        "--all",
+        action="store_true",
+        help="every scene, into one page (default ./compare-all; --quick: five minutes); goes on where it stopped",
+    )
+    report.add_argument(
+        "--only", type=_names, metavar="PARTS", help="of these, comma separated (--all --list shows them)"
+    )
+    report.add_argument("--fresh", action="store_true", help="measure again what is there already")
+    report.add_argument("--redraw", type=Path, metavar="DIR", help="pictures and page from the numbers in DIR, no run")
     compare.set_defaults(run=_compare)
 
     plan = commands.add_parser(
@@ -111,6 +130,8 @@ def _names(text: str) -> list[str]:
 
 
 def _compare(chosen: argparse.Namespace) -> int:
+    if chosen.all or chosen.redraw is not None or chosen.only or chosen.fresh:
+        return _compare_all(chosen)
     if chosen.list:
         return _list()
     from kcons import scenes
@@ -120,9 +141,14 @@ def _compare(chosen: argparse.Namespace) -> int:
     if chosen.dt is not None and not chosen.dt:
         raise InputError("--dt is empty; give time steps such as --dt 4,2,1", item="dt")
     asked = {"size": chosen.size, "seed": chosen.seed, "quick": chosen.quick, "dt": chosen.dt, **_molecules(chosen)}
+    target: float | None = chosen.target_error
+    if target is not None and not (target > 0 and isfinite(target)):
+        raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
     if chosen.scene in scenes.FLUIDS:
+        if target is not None:
+            raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
         return _compare_averages(chosen, budget, folder, asked)
-    from kcons import compare, methods, report
+    from kcons import compare, methods, recommendation, report
     from kcons.progress import Bars
 
     methods.chosen(chosen.methods)  # complain before any work
@@ -134,11 +160,64 @@ def _compare(chosen: argparse.Namespace) -> int:
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-        result = compare.compare(scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked)
+        reference = None if target is None else compare.reference_of(scene, watcher)
+        result = compare.compare(
+            scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked, reference=reference
+        )
+        if target is not None and reference is not None:
+            result = recommendation.recommend(
+                scene, result, target, reference=reference, made_by=_expression(chosen), budget=budget, watcher=watcher
+            )
     console = _console()
     explained = report.explanation(result)
+    if target is not None:
+        explained += "\n\n" + recommendation.sentences(result)
     _print(report.table(result, narrow=not report.fits(result, console.width)), explained, console)
     _say_written(report.write(result, folder, tables=[_rendered(report.table(result)), explained]))
+    return 0
+
+
+def _expression(chosen: argparse.Namespace) -> str:
+    """Python that makes the scene, after `from kcons import scenes`."""
+    from kcons import scenes
+
+    said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}
+    said |= {"quick": True} if chosen.quick else {}
+    said |= _molecules(chosen)
+    words = [f"{name}={_literal(value)}" for name, value in said.items()]
+    if scenes.is_file(chosen.scene):
+        return f"scenes.from_file({', '.join([_literal(chosen.scene), *words])})"
+    size = [] if chosen.size is None else [str(chosen.size)]
+    return f"scenes.build({', '.join([_literal(chosen.scene), *size, *words])})"
+
+
+def _literal(value: Any) -> str:
+    """Python for it, strings in double quotes."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(map(_literal, value))}]" if isinstance(value, list) else repr(value)
+
+
+def _compare_all(chosen: argparse.Namespace) -> int:
+    from kcons import everything
+    from kcons.progress import Bars
+
+    if chosen.list:
+        print("parts of the whole comparison")
+        for item in everything.PLAN:
+            print(f"  {item.key:<22} {item.heading}")
+        return 0
+    if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
+        raise InputError("--all runs all scenes and methods; choose parts of it by --only", item="all")
+    if chosen.redraw is not None:
+        _say_written(everything.redraw(chosen.redraw))
+        return 0
+    folder: Path = chosen.out or Path("compare-all")
+    items = everything.chosen(chosen.only)
+    folder.mkdir(parents=True, exist_ok=True)
+    with Bars() as watcher:
+        paths = everything.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
+    _say_written(paths)
     return 0
 
 

@@ -11,7 +11,7 @@ import textwrap
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.machine import environment, kernels_cached
-from kcons.methods import chosen
+from kcons.methods import METHODS, chosen
 from kcons.results import Comparison, Measurement, Status, duration
 from kcons.runs import Method, Run
 from kcons.scenes import Reference, Scene
@@ -29,8 +29,8 @@ from kcons.steppers import Rattle, State, System
 #: A first step below this may be slow only because it is the first.
 FIRST_STEP_DOUBT = 0.5
 
-#: A repeat takes at most this part of a method's budget.
-REPEAT_SHARE = 0.3
+#: A run is repeated if it takes at most this part of a method's budget, and so many seconds.
+REPEAT_SHARE, REPEAT_SECONDS = 0.2, 2.0
 #: Points at which the forces are timed, and for how many seconds at most.
 FORCE_POINTS, FORCE_SECONDS = 15, 0.5
 
@@ -79,7 +79,8 @@ def compare(
     settings : mapping, optional
         What else to record with the result.
     repeats : int
-        Each method is run so often again at its longest step, to see how well times repeat.
+        Runs that are short enough are made so often again, after all others; times are then medians of medians, and
+        how well they repeat is known.
     reference : Reference, optional
         If it is known.
 
@@ -111,7 +112,7 @@ def compare(
             measurements.append(Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason))
             continue
         measurements += _all_settings(scene, method, reference, budget, watching)
-    margin = _repeated(scene, picked, measurements, reference, budget, repeats, watching)
+    measurements, margin = _repeated(scene, measurements, reference, budget, repeats, watching)
     unit = scene.units.time_unit
     return Comparison(
         scene={
@@ -195,29 +196,41 @@ def measure(
 
 def _repeated(
     scene: Scene,
-    picked: Iterable[Method],
-    measurements: Iterable[Measurement],
+    measurements: list[Measurement],
     reference: Reference,
     budget: float,
     repeats: int,
     watcher: Watcher,
-) -> float | None:
-    """By what fraction nine tenths of the times of a step changed at most; None where nothing was repeated."""
-    off: list[float] = []
-    for method in picked:
-        done = [m for m in measurements if m.method == method.name and m.status in ("ok", "floor") and m.step_seconds]
-        if not done or repeats < 1:
-            continue
-        first = done[0]
-        once = float(first.step_seconds or 0.0) * first.steps + float(first.setup_seconds or 0.0)
-        if once * repeats > REPEAT_SHARE * budget:
-            continue
-        setting = first.setting if method.adaptive else first.setting * scene.units.time_unit
-        for _ in range(repeats):
+) -> tuple[list[Measurement], float | None]:
+    """Medians over repeated runs, and by what fraction nine tenths of them were off at most; None without any."""
+    limit = min(REPEAT_SHARE * budget, REPEAT_SECONDS)
+    times: dict[int, list[tuple[float, float | None]]] = {}
+    for _ in range(repeats):
+        for k, m in enumerate(measurements):
+            if m.status not in ("ok", "floor") or not m.step_seconds:
+                continue
+            if m.step_seconds * m.steps + float(m.setup_seconds or 0.0) > limit:
+                continue
+            method = METHODS[m.method]
+            setting = m.setting if m.adaptive else m.setting * scene.units.time_unit
             again = measure(scene, method, setting, reference, budget, watcher)
             if again.step_seconds:
-                off.append(abs(np.log(again.step_seconds / float(first.step_seconds or 1.0))))
-    return float(np.expm1(np.quantile(off, 0.9))) if off else None
+                mine = times.setdefault(k, [(m.step_seconds, m.constraint_seconds)])
+                mine.append((again.step_seconds, again.constraint_seconds))
+    found = list(measurements)
+    off: list[float] = []
+    for k, pairs in times.items():
+        m = found[k]
+        step = float(np.median([pair[0] for pair in pairs]))
+        held = [pair[1] for pair in pairs if pair[1] is not None]
+        off += [abs(np.log(pair[0] / step)) for pair in pairs]
+        found[k] = replace(
+            m,
+            step_seconds=step,
+            constraint_seconds=float(np.median(held)) if held else None,
+            seconds_per_time=float(m.seconds_per_time or 0.0) * step / float(m.step_seconds or 1.0),
+        )
+    return found, float(np.expm1(np.quantile(off, 0.9))) if off else None
 
 
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:

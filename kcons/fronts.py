@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -31,8 +31,9 @@ EVERY_HOST = "all hosts"
 
 #: Forces that take less, beyond the call itself, do not count in a step: evaluations decide, in seconds.
 NO_FORCE = 1e-6
-#: Errors this many times that of the reference cannot be told from smaller ones.
+#: Errors this many times that of the reference cannot be told from smaller ones, nor those of rounding.
 RESOLVED = 3.0
+ROUNDING = 1e-13
 #: Errors that differ by this fraction are the same.
 SAME_ERROR = 0.05
 #: Evaluations that differ by this fraction are the same: a first evaluation more or less.
@@ -140,7 +141,7 @@ def cost_of(m: Measurement, cost: Cost) -> float:
 
 def floor_of(comparison: Comparison) -> float:
     """The error below which methods cannot be told apart."""
-    return RESOLVED * float(comparison.reference["error"])
+    return max(RESOLVED * float(comparison.reference["error"]), ROUNDING)
 
 
 def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[Measurement]:
@@ -157,7 +158,7 @@ def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[
 
 
 def front(measurements: Iterable[Measurement], cost: Cost, floor: float = 0.0) -> list[Measurement]:
-    """Those that no other dominates, cheapest first: none costs as little and errs less.
+    """Those that no other dominates, cheapest first: none costs as little and errs less, beyond `SAME_ERROR`.
 
     Parameters
     ----------
@@ -168,7 +169,8 @@ def front(measurements: Iterable[Measurement], cost: Cost, floor: float = 0.0) -
     """
     kept: list[Measurement] = []
     for m in sorted(measurements, key=lambda m: (cost_of(m, cost), float(m.error or 0.0))):
-        if not kept or max(float(m.error or 0.0), floor) < max(float(kept[-1].error or 0.0), floor):
+        last = max(float(kept[-1].error or 0.0), floor) if kept else math.inf
+        if max(float(m.error or 0.0), floor) < last * (1 - SAME_ERROR):
             kept.append(m)
     return kept
 
@@ -260,6 +262,17 @@ def sentence(loss: Loss, length: str) -> str:
     return f"{loss.title} {where} {length}: {much} ({COSTS[loss.cost][1]}, {loss.host})"
 
 
+def together(losses: Sequence[Loss], length: str) -> str:
+    """All losses in one sentence: the worst by name, the others by number; '' without any."""
+    if not losses:
+        return ""
+    worst = max(losses, key=lambda loss: loss.factor)
+    errors = (min(loss.errors[0] for loss in losses), max(loss.errors[1] for loss in losses))
+    others = len(losses) - 1
+    more = "" if not others else f" and {others} other{'s' if others > 1 else ''}"
+    return sentence(replace(worst, title=worst.title + more, errors=errors), length)
+
+
 def summary(comparison: Comparison) -> list[dict[str, Any]]:
     """One row a host: who is on the front of what decides, what kcons gains, and what it loses."""
     found = verdict(comparison)
@@ -279,6 +292,8 @@ def summary(comparison: Comparison) -> list[dict[str, Any]]:
                 "gain_error": standing.gain_error,
                 "ours": standing.ours,
                 "rival": standing.rival,
+                "lost": together(standing.losses, length),
+                "lost_beside": "" if beside is None else together(beside.losses, length),
                 "losses": [sentence(loss, length) for loss in standing.losses],
                 "beside": [] if beside is None else [sentence(loss, length) for loss in beside.losses],
             }

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from kcons.compare import Watcher
+from kcons.results import duration
 
 
 class Bars(Watcher):
@@ -19,6 +20,7 @@ class Bars(Watcher):
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
         self._bars = Progress(*columns, console=self._console, transient=True)
         self._task: TaskID | None = None
+        self._whole: TaskID | None = None
 
     def __enter__(self) -> Self:
         self._bars.start()
@@ -26,6 +28,15 @@ class Bars(Watcher):
 
     def __exit__(self, *_: object) -> None:
         self._bars.stop()
+
+    def overall(self, what: str, done: float, total: float) -> None:
+        left = max(total - done, 0.0)
+        text = f"{what}; {'the last of it' if left == 0 else 'about ' + duration(left) + ' left'}"
+        if not self._console.is_terminal:
+            print(text, file=sys.stderr, flush=True)
+        if self._whole is None:
+            self._whole = self._bars.add_task(text, total=total)
+        self._bars.update(self._whole, description=text, completed=done, total=total)
 
     def begin(self, what: str, total: float) -> None:
         if not self._console.is_terminal:

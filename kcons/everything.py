@@ -1,0 +1,440 @@
+"""The whole comparison: every scene through every method, into one folder and one page.
+
+What is measured is written after every part, and is not measured again while code, scene and settings stay the same:
+an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from kcons import __version__, comparison_page, scenes
+from kcons.compare import Watcher, compare, reference_of
+from kcons.errors import InputError, KconsError
+from kcons.fronts import verdict
+from kcons.machine import code_digest, environment
+from kcons.methods import METHODS
+from kcons.recommendation import sharpen
+from kcons.results import Comparison
+from kcons.scenes import Scene
+
+FORMAT = "kcons-report-1"
+#: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
+QUICK_SECONDS = 280.0
+#: Short runs are made so often again.
+REPEATS = 2
+
+
+@dataclass(frozen=True)
+class Item:
+    """One part of the whole comparison.
+
+    Attributes
+    ----------
+    key : str
+        Name of its files.
+    heading : str
+    scene : str
+        A key of `scenes.SCENES`; '' for a part with a module of its own.
+    size : int or None
+    options : mapping
+        For the scene.
+    steps : sequence of float or None
+        Time steps in the unit the scene shows, instead of its own.
+    pace : float
+        The finest step times this decides about the work of a converged reference.
+    every_stepper : bool
+        Whether all steppers of kcons run in a full run, or the usual ones.
+    without : sequence of str
+        Beginnings of names of methods that are left out, for `why`.
+    why : str
+    needs : str
+        A package without which it cannot run.
+    budget : float
+        Seconds a method.
+    seconds : float
+        What a full run of it takes on one core, for the time left.
+    quick_seconds : float
+        The same in a quick run; 0 where it is left out of it.
+    quick_size : int or None
+        Size in a quick run, by default what the scene says.
+    module : str
+        Where `measure`, `figure` and `table` are, for a part that is no scene.
+    """
+
+    key: str
+    heading: str
+    scene: str = ""
+    size: int | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    steps: Sequence[float] | None = None
+    pace: float | None = None
+    every_stepper: bool = False
+    without: Sequence[str] = ()
+    why: str = ""
+    needs: str = ""
+    budget: float = 15.0
+    seconds: float = 30.0
+    quick_seconds: float = 6.0
+    quick_size: int | None = None
+    module: str = ""
+
+
+def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any) -> Item:
+    key = f"{structure}-{constrain}"
+    return Item(key, f"{text}, {title}", structure, options={"constrain": constrain}, needs="openmm", **more)
+
+
+TOO_LARGE = "too large for it: its own Python loops over bonds, or its set-up, would take hours"
+LEAVE_OUT = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-held", "dop853")
+
+#: All parts, in the order in which they are run and shown.
+PLAN: tuple[Item, ...] = (
+    Item("sphere", "Free particles on spheres", "sphere", every_stepper=True, seconds=25, quick_seconds=6),
+    Item("sphere-pendulum", "Spherical pendulums", "sphere-pendulum", every_stepper=True, seconds=25, quick_seconds=6),
+    Item(
+        "sphere-pendulum-top",
+        "Spherical pendulum that passes near the top",
+        "sphere-pendulum-top",
+        every_stepper=True,
+        seconds=25,
+    ),
+    Item("pendulum", "Planar pendulum from 179.9°", "pendulum", every_stepper=True, seconds=15, quick_seconds=5),
+    Item("triple-pendulum", "Triple pendulum", "triple-pendulum", every_stepper=True, seconds=15, quick_seconds=5),
+    Item("rotor", "Asymmetric top", "rotor", every_stepper=True, seconds=25, quick_seconds=6),
+    Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=25, quick_seconds=6),
+    Item("fekete", "Fekete points on a sphere", "fekete", every_stepper=True, seconds=20),
+    Item("ethanol", "Ethanol, GFN2-xTB", "ethanol", needs="tblite", seconds=90, quick_seconds=20, budget=20),
+    Item("water-216", "Water, 216 molecules", "water", 216, seconds=90, quick_seconds=16, quick_size=8, budget=20),
+    Item("water-900", "Water, 900 molecules", "water", 900, seconds=150, quick_seconds=0, budget=20),
+    Item(
+        "water-5000",
+        "Water, 5000 molecules",
+        "water",
+        5000,
+        steps=(4.0, 2.0, 1.0),
+        pace=2.0,
+        without=("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6"),
+        why="left out to save time; 900 molecules show it",
+        seconds=240,
+        quick_seconds=0,
+        budget=15,
+    ),
+    Item("chain-1e2", "Chain of 10² bonds", "chain", 100, every_stepper=True, seconds=60, quick_seconds=14),
+    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, seconds=90, quick_seconds=14),
+    Item("chain-1e4", "Chain of 10⁴ bonds", "chain", 10_000, seconds=60, quick_seconds=0, budget=10),
+    Item(
+        "chain-1e5",
+        "Chain of 10⁵ bonds",
+        "chain",
+        100_000,
+        steps=(10.0, 5.0, 2.5),
+        pace=2.0,
+        without=LEAVE_OUT,
+        why=TOO_LARGE,
+        seconds=60,
+        quick_seconds=0,
+        budget=10,
+    ),
+    Item(
+        "chain-1e6",
+        "Chain of 10⁶ bonds",
+        "chain",
+        1_000_000,
+        steps=(10.0, 5.0, 2.5),
+        pace=2.0,
+        without=(*LEAVE_OUT, "openmm", "kahan-li6"),
+        why=TOO_LARGE,
+        seconds=240,
+        quick_seconds=0,
+        budget=20,
+    ),
+    *(
+        _molecule("alanine", "Alanine dipeptide", constrain, title, seconds=45, quick_seconds=14)
+        for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"), ("hangles", "HAngles"))
+    ),
+    *(
+        _molecule("dhfr", "DHFR", constrain, title, seconds=90, quick_seconds=0, budget=15)
+        for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"))
+    ),
+    _molecule("dhfr", "DHFR", "hangles", "HAngles", seconds=240, quick_seconds=0, budget=75),
+    Item(
+        "solver-precision",
+        "The solvers alone: residual against time a constraint",
+        module="kcons.solver_precision",
+        seconds=90,
+        quick_seconds=25,
+    ),
+    Item(
+        "scaling",
+        "Scaling: cost and memory against size",
+        module="kcons.scaling",
+        seconds=180,
+        quick_seconds=25,
+    ),
+)
+
+
+def chosen(keys: Sequence[str] | None = None) -> list[Item]:
+    """Parts by key; all by default. A name of a scene stands for all its parts.
+
+    Raises
+    ------
+    InputError
+        Unknown key.
+    """
+    if not keys:
+        return list(PLAN)
+    found: dict[str, Item] = {}
+    for key in keys:
+        fitting = [item for item in PLAN if key == item.key] or [item for item in PLAN if key == item.scene]
+        if not fitting:
+            known = ", ".join(item.key for item in PLAN)
+            raise InputError(f"there is no part {key!r} of the comparison; there are {known}", item="only")
+        found |= {item.key: item for item in fitting}
+    return [item for item in PLAN if item.key in found]
+
+
+def run(
+    items: Sequence[Item],
+    folder: Path,
+    *,
+    quick: bool = False,
+    fresh: bool = False,
+    watcher: Watcher | None = None,
+    limit: float | None = None,
+) -> list[Path]:
+    """Measure what is not there yet, and draw everything that is.
+
+    Parameters
+    ----------
+    items : sequence of Item
+    folder : path
+    quick : bool
+        Smaller scenes, short budgets, large scenes left out; five minutes in all.
+    fresh : bool
+        Measure again what is there.
+    watcher : Watcher, optional
+    limit : float, optional
+        Seconds after which nothing more is begun; by default those of a quick run, otherwise none.
+
+    Returns
+    -------
+    paths : list of Path
+        The page, and the files of every part.
+    """
+    watching = watcher or Watcher()
+    limit = QUICK_SECONDS if quick and limit is None else limit
+    begun = time.perf_counter()
+    expected = {item.key: item.quick_seconds if quick else item.seconds for item in items}
+    pending = []
+    for item in items:
+        old = read(folder, item.key)
+        if not fresh and old is not None and old["key"] == key_of(item, quick) and "failed" not in old:
+            watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
+            expected.pop(item.key)
+        else:
+            pending.append(item)
+    done = spent = 0.0
+    try:
+        for number, item in enumerate(pending, 1):
+            elapsed = time.perf_counter() - begun
+            pace = spent / done if done else 1.0
+            left = pace * sum(expected[i.key] for i in pending[number - 1 :])
+            watching.overall(f"{number} of {len(pending)}: {item.heading}", elapsed, elapsed + left)
+            share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
+            started = time.perf_counter()
+            found = _part(item, quick, share, watching)
+            _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
+            done += expected[item.key]
+            spent += time.perf_counter() - started
+            gc.collect()
+    finally:
+        # An interrupted run has a page, too, and it shows whatever is in the folder.
+        path = _page(folder)
+    return [path, *sorted(folder.glob("*.json")), *sorted(folder.glob("*.png"))]
+
+
+def key_of(item: Item, quick: bool) -> dict[str, Any]:
+    """What a measurement depends on: code, scene, settings."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(item)))
+    for name in ("heading", "seconds", "quick_seconds"):
+        plain.pop(name)
+    return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
+
+
+def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, Any]:
+    """Measure one part; what keeps it from being measured is its result."""
+    reason = _missing(item)
+    if quick and not item.quick_seconds:
+        reason = "in the full run only"
+    elif share < 0.05:
+        reason = "the time of a quick run was over"
+    if reason:
+        return {"not run": reason, "environment": environment()}
+    begun = time.perf_counter()
+    try:
+        if item.module:
+            module = import_module(item.module)
+            found = {"result": module.measure(quick=quick, keep=None, watcher=watcher)}
+        else:
+            found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
+    except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
+        return {"failed": f"{type(error).__name__}: {error}", "environment": environment()}
+    return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
+
+
+def _missing(item: Item) -> str:
+    if item.module and find_spec(item.module) is None:
+        return f"this version of kcons has no {item.module}"
+    if item.scene and item.scene not in scenes.SCENES:
+        return f"this version of kcons has no scene {item.scene!r}"
+    if item.needs and find_spec(item.needs) is None:
+        return f"{item.needs} is not installed; python -m pip install {item.needs}"
+    return ""
+
+
+def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
+    watcher.begin("building the scene", 1)
+    scene = scene_of(item, quick)
+    watcher.end()
+    budget = (item.quick_seconds / 12 if quick else item.budget) * share
+    names, left_out = methods_of(item, scene, quick)
+    reference = reference_of(scene, watcher)
+    found = compare(
+        scene,
+        methods=names,
+        budget=budget,
+        watcher=watcher,
+        reference=reference,
+        repeats=1 if quick else REPEATS,
+        settings={"part": item.key, "quick": quick},
+    )
+    remarks = [*found.remarks, f"not run: {', '.join(left_out)} ({item.why})"] if left_out else found.remarks
+    found = replace(found, remarks=remarks)
+    # Where a peer was more accurate than any method of kcons, the steps of kcons were too long to say who is cheaper.
+    if any(loss.factor == float("inf") for loss in verdict(found).losses):
+        found = sharpen(scene, found, reference=reference, budget=budget, watcher=watcher)
+    return found
+
+
+def scene_of(item: Item, quick: bool) -> Scene:
+    """The scene of a part."""
+    size = item.quick_size if quick and item.quick_size is not None else item.size
+    scene = scenes.build(item.scene, size, quick=quick, **item.options)
+    if item.steps is not None and not quick:
+        scene = scene.with_time_steps(item.steps)
+    return scene if item.pace is None else replace(scene, reference_pace=item.pace)
+
+
+def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], list[str]]:
+    """Names of the methods that run, and of those that are left out though they could.
+
+    Of every host the usual ones, those that refuse with their reasons; of OpenMM and of guests those that can run
+    the scene.
+    """
+    kept: list[str] = []
+    for method in METHODS.values():
+        usual = method.usual or (item.every_stepper and not quick and method.host == "kcons")
+        guest = method.guest or method.host == "openmm"
+        if not usual or not method.follows or (guest and method.refuses(scene) is not None):
+            continue
+        kept.append(method.name)
+    out = [name for name in kept if name.startswith(tuple(item.without))] if item.without else []
+    return [name for name in kept if name not in out], out
+
+
+# -- files ------------------------------------------------------------------------------------------
+
+
+def read(folder: Path, key: str) -> dict[str, Any] | None:
+    """What was measured of a part; None where there is nothing that can be read."""
+    try:
+        data: dict[str, Any] = json.loads((folder / f"{key}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return unpacked(data) if data.get("format") == FORMAT else None
+
+
+def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
+    # Aside and then into place: a run that is interrupted leaves no half of a file.
+    path = folder / f"{item.key}.json"
+    beside = path.with_suffix(".part")
+    beside.write_text(packed(found), encoding="utf-8")
+    beside.replace(path)
+    comparison_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
+
+
+def packed(found: Mapping[str, Any]) -> str:
+    """JSON, four digits, measurements one a line under the names of their columns."""
+    data = _slim(found)
+    lines: list[str] = []
+    if "comparison" in data:
+        measurements = found["comparison"]["measurements"]
+        columns = list(measurements[0]) if measurements else []
+        rows = [[_slim(m[name]) for name in columns] for m in measurements]
+        lines = [json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows]
+        data["comparison"] = {**data["comparison"], "columns": columns, "measurements": "ROWS"}
+    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+    return text.replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]") + "\n"
+
+
+def unpacked(data: dict[str, Any]) -> dict[str, Any]:
+    """What `packed` made, as it was."""
+    if "comparison" not in data:
+        return data
+    comparison = dict(data["comparison"])
+    columns = comparison.pop("columns")
+    comparison["measurements"] = [
+        {name: value for name, value in zip(columns, row, strict=True) if value is not None}
+        for row in comparison["measurements"]
+    ]
+    return {**data, "comparison": comparison}
+
+
+def _slim(value: Any) -> Any:
+    from kcons.report import plain
+
+    value = plain(value)
+    if isinstance(value, dict):
+        return {key: _slim(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_slim(item) for item in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def redraw(folder: Path) -> list[Path]:
+    """Pictures, tables and the page from the numbers in a folder.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    found = [(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+    if not found:
+        raise InputError(f"there are no results of kcons compare --all in {folder}", item="redraw")
+    made = [
+        path
+        for item, data in found
+        for path in comparison_page.write_part(folder, item.key, item.heading, item.module, data)
+    ]
+    return [_page(folder), *made]
+
+
+def parts(folder: Path) -> list[comparison_page.Part]:
+    """All parts that are in a folder, in the order of the plan."""
+    found = ((item, read(folder, item.key)) for item in PLAN)
+    return [comparison_page.Part(i.key, i.heading, i.module, data) for i, data in found if data is not None]
+
+
+def _page(folder: Path) -> Path:
+    return comparison_page.write(folder / "index.html", parts(folder))
