@@ -216,8 +216,8 @@ def _compare_all(chosen: argparse.Namespace) -> int:
     items = everything.chosen(chosen.only)
     folder.mkdir(parents=True, exist_ok=True)
     with Bars() as watcher:
-        paths = everything.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
-    _say_written(paths)
+        path = everything.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
+    print(f"wrote {path}, and beside it JSON, PNG and TXT of every part")
     return 0
 
 

@@ -211,7 +211,7 @@ def run(
     fresh: bool = False,
     watcher: Watcher | None = None,
     limit: float | None = None,
-) -> list[Path]:
+) -> Path:
     """Measure what is not there yet, and draw everything that is.
 
     Parameters
@@ -228,8 +228,8 @@ def run(
 
     Returns
     -------
-    paths : list of Path
-        The page, and the files of every part.
+    path : Path
+        The page.
     """
     watching = watcher or Watcher()
     limit = QUICK_SECONDS if quick and limit is None else limit
@@ -248,19 +248,20 @@ def run(
         for number, item in enumerate(pending, 1):
             elapsed = time.perf_counter() - begun
             pace = spent / done if done else 1.0
-            left = pace * sum(expected[i.key] for i in pending[number - 1 :])
+            left = pace * sum(expected[i.key] for i in pending[number - 1 :] if not _excluded(i, quick))
             watching.overall(f"{number} of {len(pending)}: {item.heading}", elapsed, elapsed + left)
             share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
             started = time.perf_counter()
             found = _part(item, quick, share, watching)
             _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
-            done += expected[item.key]
-            spent += time.perf_counter() - started
+            if "seconds" in found:
+                done += expected[item.key]
+                spent += time.perf_counter() - started
             gc.collect()
     finally:
         # An interrupted run has a page, too, and it shows whatever is in the folder.
         path = _page(folder)
-    return [path, *sorted(folder.glob("*.json")), *sorted(folder.glob("*.png"))]
+    return path
 
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
@@ -273,11 +274,7 @@ def key_of(item: Item, quick: bool) -> dict[str, Any]:
 
 def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, Any]:
     """Measure one part; what keeps it from being measured is its result."""
-    reason = _missing(item)
-    if quick and not item.quick_seconds:
-        reason = "in the full run only"
-    elif share < 0.05:
-        reason = "the time of a quick run was over"
+    reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
     if reason:
         return {"not run": reason, "environment": environment()}
     begun = time.perf_counter()
@@ -292,7 +289,10 @@ def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, 
     return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
 
 
-def _missing(item: Item) -> str:
+def _excluded(item: Item, quick: bool) -> str:
+    """Why a part is not measured here; '' if it is."""
+    if quick and not item.quick_seconds:
+        return "in the full run only"
     if item.module and find_spec(item.module) is None:
         return f"this version of kcons has no {item.module}"
     if item.scene and item.scene not in scenes.SCENES:
