@@ -24,7 +24,7 @@ INTRODUCTION = (
     "solution at the same moment, so early that chaos has not begun to decide. Each point is one method at one time "
     "step or tolerance, after kernels were compiled, on one thread; times are medians over steps. Every method has its "
     "own best settings: steps of high-order methods are longer, tolerances of hosts are varied.",
-    "Fronts are drawn for each host, whose methods share forces and overhead: plain arrays, ASE, OpenMM, LAMMPS. A "
+    "Fronts are drawn for each host, whose methods share forces and overhead: plain arrays, ASE, OpenMM. A "
     "point is on the front if no other one of its host is both cheaper and more accurate. Across hosts, force "
     f"evaluations can be compared. Where forces take less than {1e6 * NO_FORCE:g} µs beyond the call from Python, "
     "evaluations decide and wall time stands beside.",

@@ -24,8 +24,8 @@ COSTS: dict[Cost, tuple[str, str]] = {
     "evaluations": ("evaluations_per_time", "force evaluations"),
 }
 
-#: Hosts with forces of their own; all others call the forces of the scene on plain arrays.
-HOSTS = {"openmm": "OpenMM", "lammps": "LAMMPS", "ase": "ASE"}
+#: Hosts with forces or overhead of their own; all others call the forces of the scene on plain arrays.
+HOSTS = {"openmm": "OpenMM", "ase": "ASE"}
 ARRAYS = "arrays"
 EVERY_HOST = "all hosts"
 

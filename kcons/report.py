@@ -270,7 +270,7 @@ def figure(comparison: Comparison) -> Figure:
 
 
 #: Bands behind the curves, one a host.
-FRONT_STYLES = {ARRAYS: "#999999", "ASE": "#D9B38C", "OpenMM": "#B3A2C7", "LAMMPS": "#A9CBA4"}
+FRONT_STYLES = {ARRAYS: "#999999", "ASE": "#D9B38C", "OpenMM": "#B3A2C7"}
 
 
 def _mark_fronts(axes: Axes, standings: Sequence[Standing], cost: Cost) -> None:
