@@ -19,7 +19,6 @@ from typing import Any
 from kcons import __version__, comparison_page, scenes
 from kcons.compare import Watcher, compare, reference_of
 from kcons.errors import InputError, KconsError
-from kcons.fronts import verdict
 from kcons.machine import code_digest, environment
 from kcons.methods import METHODS
 from kcons.recommendation import sharpen
@@ -320,10 +319,7 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     )
     remarks = [*found.remarks, f"not run: {', '.join(left_out)} ({item.why})"] if left_out else found.remarks
     found = replace(found, remarks=remarks)
-    # Where a peer was more accurate than any method of kcons, the steps of kcons were too long to say who is cheaper.
-    if any(loss.factor == float("inf") for loss in verdict(found).losses):
-        found = sharpen(scene, found, reference=reference, budget=budget, watcher=watcher)
-    return found
+    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher)
 
 
 def scene_of(item: Item, quick: bool) -> Scene:

@@ -176,9 +176,10 @@ def recommend(
 def sharpen(
     scene: Scene, comparison: Comparison, *, reference: Reference, budget: float, watcher: Watcher | None = None
 ) -> Comparison:
-    """Where another method got nearer to the reference than any of kcons: shorter steps for the best one of kcons.
+    """Where another method seems to be ahead of kcons: the step of kcons that makes the same error is tried.
 
-    Without them nothing could be said of who is cheaper at such errors.
+    Steps of a scene are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
+    beyond those of the others, and nothing could be said of who is cheaper there.
 
     Parameters
     ----------
@@ -187,17 +188,21 @@ def sharpen(
     """
     floor = floor_of(comparison)
     curves = _curves(comparison)
+    judged = verdict(comparison)
+    counted = {judged.decides, "evaluations"}
     found: list[Measurement] = []
-    for standing in verdict(comparison).standings:
-        wanted = [max(loss.errors[0], floor) for loss in standing.losses if math.isinf(loss.factor)]
+    tried: set[tuple[str, float]] = set()
+    for standing in judged.standings:
         ours = [c for c in curves.values() if is_ours(c[0]) and standing.host in (host_of(c[0].method), EVERY_HOST)]
-        if not wanted or min(wanted) <= 0 or not ours or any(_reaches(m, min(wanted)) for m in found):
+        if standing.cost not in counted or not ours:
             continue
-        best = min(ours, key=lambda curve: min(float(m.error or 0.0) for m in curve))
-        prediction = predicted(best, SAFETY * min(wanted), floor)
-        if prediction is not None:
-            warm_up(scene, [METHODS[prediction.method]])
-            found += reach(scene, prediction, min(wanted), reference, budget, watcher or Watcher())
+        for target in sorted({max(error, floor) for loss in standing.losses for error in loss.errors}):
+            predictions = [p for c in ours if (p := predicted(c, SAFETY * target, floor)) is not None]
+            best = min(predictions, key=lambda p: p.cost(standing.cost), default=None)
+            if best is not None and (best.method, target) not in tried:
+                tried.add((best.method, target))
+                warm_up(scene, [METHODS[best.method]])
+                found += reach(scene, best, target, reference, budget, watcher or Watcher())
     return replace(comparison, measurements=_sorted([*comparison.measurements, *found]))
 
 
