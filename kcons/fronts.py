@@ -256,9 +256,12 @@ def sentence(loss: Loss, length: str) -> str:
     """One loss in words."""
     low, high = loss.errors
     where = f"at an error of {low:.0e}" if low == high else f"at errors from {low:.0e} to {high:.0e}"
-    much = (
-        "where nothing of kcons was measured" if math.isinf(loss.factor) else f"up to {loss.factor:.2g} times cheaper"
-    )
+    if math.isinf(loss.factor):
+        much = "where nothing of kcons was measured"
+    elif loss.factor < 2:
+        much = f"up to {100 * (1 - 1 / loss.factor):.0f} % cheaper"
+    else:
+        much = f"up to {loss.factor:.2g} times cheaper"
     return f"{loss.title} {where} {length}: {much} ({COSTS[loss.cost][1]}, {loss.host})"
 
 

@@ -148,7 +148,9 @@ def _scipy(rtol: float) -> list[str]:
         "",
         "",
         "start = np.concatenate([scene.positions, scene.velocities]).ravel()",
-        f"end = solve_ivp(rate, (0, scene.horizon), start, method='DOP853', rtol={max(rtol, 1e-13):g}, atol={rtol:g})",
+        "scale = np.repeat([1.0, np.sqrt(np.mean(scene.velocities**2)) or 1.0], start.size // 2)",
+        f"options = dict(method='DOP853', rtol={max(rtol, 1e-13):g}, atol={rtol:g} * scale)",
+        "end = solve_ivp(rate, (0, scene.horizon), start, **options)",
         "assert end.success",
     ]
 

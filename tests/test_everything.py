@@ -1,0 +1,250 @@
+"""The whole comparison: what is measured once is not measured again, and the page shows all of it."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+import pytest
+
+from kcons import cli, comparison_page, everything, scenes
+from kcons.compare import Watcher
+from kcons.errors import InputError
+from kcons.everything import Item
+from kcons.results import Comparison
+
+TINY = (
+    Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
+    Item("gone", "A scene of the future", "no such scene", seconds=1),
+    Item("sphere", "Spheres", "sphere", 1, budget=5, seconds=1, quick_seconds=0),
+    Item("later", "A part of the future", module="kcons.no_such_module", seconds=1),
+)
+METHODS = ["rattle", "blanes-moan4", "dop853", "verlet"]
+
+
+class Listener(Watcher):
+    def __init__(self, interrupt_at=""):
+        self.parts, self.times, self.interrupt_at = [], [], interrupt_at
+
+    def overall(self, what, done, total):
+        if self.interrupt_at and self.interrupt_at in what:
+            raise KeyboardInterrupt
+        self.parts.append(what)
+        self.times.append((done, total))
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    monkeypatch.setattr(everything, "PLAN", TINY)
+    monkeypatch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, []))
+    monkeypatch.setattr(everything, "code_digest", lambda: "digest")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("all")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(everything, "PLAN", TINY)
+        patch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, []))
+        patch.setattr(everything, "code_digest", lambda: "digest")
+        everything.run(TINY, folder)
+    return folder
+
+
+def test_files_of_every_part(finished):
+    names = {path.name for path in finished.iterdir()}
+    assert names >= {"index.html", "gone.json", "later.json"}
+    for key in ("chain-3", "sphere"):
+        assert names >= {f"{key}.json", f"{key}.png", f"{key}.txt"}
+    assert not [name for name in names if name.endswith(".part")]
+    assert "kcons RATTLE" in (finished / "sphere.txt").read_text(encoding="utf-8")
+
+
+def test_numbers_come_back_as_they_were(finished):
+    data = everything.read(finished, "chain-3")
+    found = Comparison.from_dict(data["comparison"])
+    assert list(dict.fromkeys(m.method for m in found.measurements)) == METHODS
+    assert found.timing["repeats"] == everything.REPEATS and found.timing["margin"] is not None
+    for m in found.of("rattle"):
+        assert m.title == "kcons RATTLE" and m.error > 0 and m.steps == round(80 / m.setting)
+    assert found.observed_order("rattle") == pytest.approx(2.0, abs=0.1)
+    assert data["key"]["code"] == "digest"
+    assert data["environment"]["versions"]["numpy"]
+    # Small enough to be kept with the documentation.
+    assert (finished / "chain-3.json").stat().st_size < 10_000
+
+
+def test_what_cannot_be_run_is_said(finished):
+    assert everything.read(finished, "gone")["not run"] == "this version of kcons has no scene 'no such scene'"
+    assert "kcons.no_such_module" in everything.read(finished, "later")["not run"]
+
+
+class Page(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.addresses, self.text, self.tags, self.headings = [], "", [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attributes if name in ("href", "src", "action", "data", "srcset")]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_page_is_one_file_with_everything(finished):
+    page = Page()
+    source = (finished / "index.html").read_text(encoding="utf-8")
+    page.feed(source)
+    assert page.addresses and all(address.startswith(("#", "data:")) for address in page.addresses)
+    assert not {"script", "iframe", "object", "embed", "form"} & set(page.tags)
+    assert "url(" not in source and "@import" not in source
+    assert page.tags.count("img") == 2
+    for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A scene of the future", "not run: this version"):
+        assert text in page.text
+    environment = everything.read(finished, "sphere")["environment"]
+    assert environment["cpu"] in page.text
+    assert (environment["commit"] or "not from a repository") in page.text
+    assert f"numpy {environment['versions']['numpy']}" in page.text
+
+
+def test_winners_name_host_and_gain(finished):
+    table = comparison_page.winners(everything.parts(finished))
+    cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
+    (sphere,) = [row for row in cells if row["scene"] == "Spheres"]
+    assert sphere["decided by"] == "force evaluations" and sphere["over"] == "SciPy DOP853 on eq. 105"
+    text = comparison_page.markdown(table, (0, 1, 3))
+    assert text.splitlines()[0] == "| scene | host | gain |"
+    assert text.splitlines()[1] == "| --- | --- | ---: |"
+    assert len(text.splitlines()) == 2 + len(table.rows)
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        everything.run(TINY, tmp_path, watcher=Listener("Spheres"))
+    assert (tmp_path / "index.html").exists()
+    assert not (tmp_path / "sphere.json").exists()
+    first = (tmp_path / "chain-3.json").read_bytes()
+    listener = Listener()
+    everything.run(TINY, tmp_path, watcher=listener)
+    assert listener.parts[0] == "chain-3: measured already"
+    assert not any("Chain" in part for part in listener.parts)
+    assert any("Spheres" in part for part in listener.parts)
+    assert (tmp_path / "chain-3.json").read_bytes() == first
+    assert (tmp_path / "sphere.json").exists()
+
+
+def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
+    item = TINY[0]
+    key = everything.read(finished, item.key)["key"]
+    assert key == everything.key_of(item, False)
+    assert key != everything.key_of(item, True)
+    assert key != everything.key_of(Item("chain-3", "Chain of 3 bonds", "chain", 4, budget=5), False)
+    monkeypatch.setattr(everything, "code_digest", lambda: "another")
+    assert key != everything.key_of(item, False)
+
+
+def test_fresh_measures_again_and_half_a_file_is_no_result(tmp_path, monkeypatch):
+    monkeypatch.setattr(everything, "methods_of", lambda item, scene, quick: (["rattle"], []))
+    (tmp_path / "sphere.json").write_text('{"format": "kcons-rep')
+    assert everything.read(tmp_path, "sphere") is None
+    sphere = TINY[2:3]
+    everything.run(sphere, tmp_path)
+    again, once = Listener(), Listener()
+    everything.run(sphere, tmp_path, watcher=once)
+    everything.run(sphere, tmp_path, fresh=True, watcher=again)
+    assert once.parts == ["sphere: measured already"]
+    assert again.parts == ["1 of 1: Spheres"]
+
+
+def test_quick_leaves_large_parts_out_and_keeps_to_its_time(tmp_path):
+    listener = Listener()
+    everything.run(TINY, tmp_path, quick=True, limit=1e-9, watcher=listener)
+    assert everything.read(tmp_path, "sphere")["not run"] == "in the full run only"
+    assert everything.read(tmp_path, "chain-3")["not run"] == "the time of a quick run was over"
+    assert all(done <= total for done, total in listener.times)
+
+
+def test_a_scene_that_cannot_be_built_is_a_failure_and_is_tried_again(tmp_path):
+    bad = (Item("chain-0", "No chain", "chain", 0),)
+    for _ in range(2):
+        listener = Listener()
+        everything.run(bad, tmp_path, watcher=listener)
+        assert listener.parts == ["1 of 1: No chain"]
+    assert "at least one bond" in everything.read(tmp_path, "chain-0")["failed"]
+
+
+def test_redraw_makes_the_same_page_from_the_numbers(finished, tmp_path, capsys):
+    for path in finished.glob("*.json"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    assert cli.main(["compare", "--all", "--redraw", str(tmp_path)]) == 0
+    assert f"wrote {tmp_path / 'index.html'}" in capsys.readouterr().out
+    texts = []
+    for folder in (finished, tmp_path):
+        page = Page()
+        page.feed((folder / "index.html").read_text(encoding="utf-8"))
+        texts.append(page.text)
+    assert texts[0] == texts[1]
+    assert (tmp_path / "sphere.png").exists()
+
+
+def test_command(tmp_path, capsys):
+    assert cli.main(["compare", "--all", "--only", "sphere", "--out", str(tmp_path / "o")]) == 0
+    printed = capsys.readouterr()
+    assert "index.html" in printed.out
+    assert "1 of 1: Spheres; about 1.00 s left" in printed.err
+    assert cli.main(["compare", "--all", "--list"]) == 0
+    assert "chain-3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["compare", "--all", "--only", "nothing"], "no part 'nothing'"),
+        (["compare", "chain", "--all"], "--all runs all scenes"),
+        (["compare", "--all", "--target-error", "1e-6"], "--all runs all scenes"),
+    ],
+)
+def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_there_is_nothing_to_redraw(tmp_path):
+    with pytest.raises(InputError, match="no results"):
+        everything.redraw(tmp_path)
+
+
+# -- the real plan ----------------------------------------------------------------------------------
+
+
+def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
+    monkeypatch.undo()
+    plan = {item.key: item for item in everything.PLAN}
+    assert len(plan) == len(everything.PLAN)
+    for item in plan.values():
+        assert item.module or item.scene in scenes.SCENES
+    assert {"sphere", "sphere-pendulum", "sphere-pendulum-top", "pendulum", "triple-pendulum", "rotor"} <= set(plan)
+    assert {"dumbbells", "fekete", "ethanol", "water-216", "water-900", "water-5000"} <= set(plan)
+    assert [plan[f"chain-1e{k}"].size for k in range(2, 7)] == [10**k for k in range(2, 7)]
+    for structure in ("alanine", "dhfr"):
+        for constrain in ("hbonds", "allbonds", "hangles"):
+            assert plan[f"{structure}-{constrain}"].options == {"constrain": constrain}
+    assert sum(item.seconds for item in plan.values()) <= 1900
+    assert sum(item.quick_seconds for item in plan.values()) <= everything.QUICK_SECONDS
+    assert [item.key for item in everything.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
+
+
+def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
+    monkeypatch.undo()
+    scene = scenes.build("chain", 3)
+    names, left_out = everything.methods_of(Item("x", "x", "chain"), scene, False)
+    for name in ("rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853", "verlet"):
+        assert name in names
+    assert "yoshida4" not in names and "openmm-middle-bath" not in names
+    assert not left_out
+    every, _ = everything.methods_of(Item("x", "x", "chain", every_stepper=True), scene, False)
+    assert {"yoshida4", "baumgarte"} <= set(every)
+    assert set(every) >= set(names)
+    kept, out = everything.methods_of(Item("x", "x", "chain", without=("ase-i", "dop")), scene, False)
+    assert out == ["ase-internals", "dop853"] and not set(out) & set(kept)

@@ -1,0 +1,243 @@
+"""What is recommended for an error was measured, and its lines of code run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kcons import cli, compare, methods, recommendation, scenes, snippets
+from kcons.compare import Watcher
+from kcons.errors import InputError
+from kcons.results import Measurement
+
+CHAIN = 'scenes.build("chain", 4)'
+
+
+def point(error, setting, **changes):
+    return Measurement(
+        **{
+            "method": "rattle",
+            "title": "kcons RATTLE",
+            "setting": setting,
+            "adaptive": False,
+            "status": "ok",
+            "error": error,
+            "evaluations_per_time": 1000 / setting,
+            "seconds_per_time": 1 / setting,
+            **changes,
+        }
+    )
+
+
+# -- predictions ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", [1e-1, 3e-3, 1e-5])
+def test_prediction_follows_the_order(target):
+    curve = [point(1e-2 * dt**2 / 16, dt) for dt in (4.0, 2.0, 1.0)]
+    found = recommendation.predicted(curve, target)
+    assert found.order == pytest.approx(2.0)
+    assert found.setting == pytest.approx(4 * (target / 1e-2) ** 0.5)
+    assert found.evaluations == pytest.approx(1000 / found.setting)
+    assert found.wall == pytest.approx(1 / found.setting)
+
+
+def test_prediction_uses_the_points_around_the_error():
+    # Order 2 above, order 6 below.
+    curve = [point(1e-1, 4.0), point(1e-1 / 4, 2.0), point(1e-1 / 4 / 64, 1.0)]
+    assert recommendation.predicted(curve, 5e-2).order == pytest.approx(2.0)
+    assert recommendation.predicted(curve, 1e-3).order == pytest.approx(6.0)
+
+
+def test_nothing_is_predicted_from_a_plateau_one_point_or_too_far():
+    assert recommendation.predicted([point(1e-2, 4.0), point(1e-2, 2.0)], 1e-4) is None
+    assert recommendation.predicted([point(1e-2, 4.0)], 1e-4) is None
+    assert recommendation.predicted([point(1e-2, 4.0), point(1e-9, 2.0)], 1e-4, floor=1e-8) is None
+    assert recommendation.predicted([point(1e-2, 4.0), point(2.5e-3, 2.0)], 1e-9) is None
+
+
+# -- a whole search ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return scenes.build("chain", 4)
+
+
+@pytest.fixture(scope="module")
+def reference(chain):
+    return chain.reference()
+
+
+@pytest.fixture(scope="module")
+def found(chain, reference):
+    names = ["rattle", "blanes-moan4", "ase-kcons", "ase-bonds"]
+    plain = compare.compare(chain, methods=names, reference=reference, budget=20)
+    return recommendation.recommend(chain, plain, 3e-7, reference=reference, made_by=CHAIN, budget=20)
+
+
+def test_the_recommended_step_was_measured_and_reaches_the_error(chain, found):
+    entry = found.recommendation
+    assert entry["reached"] and entry["method"] == "blanes-moan4"
+    (m,) = [m for m in found.of(entry["method"]) if m.setting == entry["setting"]]
+    assert m.error == entry["error"] <= 3e-7
+    # By hand: the next longer step that divides the horizon does not reach it, or was not a useful one to try.
+    assert entry["error"] > 0.02 * 3e-7
+    assert m.steps == round(found.scene["horizon"] / entry["setting"])
+
+
+def test_nothing_cheaper_that_was_measured_reaches_it(found):
+    entry = found.recommendation
+    able = [m for m in found.measurements if m.status == "ok" and m.error is not None and m.error <= 3e-7]
+    assert entry["seconds_per_time"] == min(m.seconds_per_time for m in able)
+
+
+def test_the_default_is_at_its_usual_step_and_at_the_error(found):
+    default = found.recommendation["default"]
+    assert (default["method"], default["setting"]) == ("ase-bonds", 2.0)
+    assert default["error"] > 3e-7
+    assert default["needs"]["setting"] < 2.0
+    # Order 2 against order 4.
+    assert default["gain"]["evaluations"] > 3
+    expected = default["needs"]["evaluations_per_time"] / found.recommendation["evaluations_per_time"]
+    assert default["gain"]["evaluations"] == pytest.approx(expected)
+
+
+def test_what_was_found_is_said(found):
+    text = recommendation.sentences(found)
+    assert "the cheapest in wall time: kcons BlanesMoan4 at" in text
+    assert "The default there, ASE Verlet + FixBondLengths at 2 fs" in text
+    assert "times the force evaluations" in text
+    assert "ConstrainedDynamics" in text
+    assert recommendation.sentences(replace(found, recommendation=None)) == ""
+
+
+def test_an_error_below_that_of_the_reference_is_refused_with_the_reason(chain, reference, found):
+    plain = replace(found, recommendation=None, reference={"how": "a run", "error": 1e-7})
+    entry = recommendation.recommend(chain, plain, 1e-8, reference=reference, made_by=CHAIN).recommendation
+    assert not entry["reached"]
+    assert "good to 1e-07 Å" in entry["why"] and "harmonic sites" in entry["why"]
+    said = recommendation.sentences(replace(plain, recommendation=entry))
+    assert said.startswith("No method reaches an error of 1e-08 Å")
+    assert "Best: " in said
+
+
+def test_what_no_method_reaches_is_said_with_the_best(chain, reference):
+    plain = compare.compare(chain, methods=["rattle"], reference=reference, budget=20)
+    entry = recommendation.recommend(chain, plain, 1e-11, reference=reference, made_by=CHAIN).recommendation
+    assert not entry["reached"]
+    assert entry["best"]["error"] == min(m.error for m in plain.of("rattle"))
+
+
+@pytest.mark.parametrize("target", [0.0, -1.0, float("nan")])
+def test_a_target_has_to_be_positive(chain, reference, found, target):
+    with pytest.raises(InputError, match="positive"):
+        recommendation.recommend(chain, found, target, reference=reference, made_by=CHAIN)
+
+
+def test_reach_stops_where_shorter_steps_do_not_help(chain, reference, monkeypatch):
+    seen = []
+
+    def plateau(scene, method, setting, *_):
+        seen.append(setting)
+        return point(1e-3, setting, steps=1)
+
+    monkeypatch.setattr(recommendation, "measure", plateau)
+    prediction = recommendation.Prediction("rattle", 1.0, 2.0, 1e-3, 1.0)
+    recommendation.reach(chain, prediction, 1e-6, reference, 10.0, Watcher())
+    assert len(seen) == 2
+
+
+def test_sharpening_tries_longer_steps_where_another_method_seems_ahead(chain, reference):
+    fine = chain.with_time_steps([1.25, 0.625])
+    plain = compare.compare(fine, methods=["blanes-moan4"], reference=reference, budget=20)
+    fake = point(1e-5, 0.1, method="dop853", title="SciPy DOP853", evaluations_per_time=120.0, seconds_per_time=1e-3)
+    there = replace(plain, measurements=[*plain.measurements, fake])
+    sharper = recommendation.sharpen(fine, there, reference=reference, budget=20)
+    longest = max(m.setting for m in sharper.of("blanes-moan4"))
+    assert longest > 2 * max(m.setting for m in plain.of("blanes-moan4"))
+
+
+# -- lines of code ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853"])
+def test_lines_of_code_run_to_the_end_of_the_trajectory(chain, reference, name):
+    method = methods.METHODS[name]
+    setting = 1e-6 if method.adaptive else 2.5
+    text = snippets.code(chain, name, setting, CHAIN)
+    space = {}
+    exec(compile(text, name, "exec"), space)
+    if name == "dop853":
+        end = space["end"].y[:15, -1].reshape(5, 3)
+    elif name == "ase-internals":
+        end = space["run"].positions
+    else:
+        end = space["atoms"].positions
+    internal = setting if method.adaptive else setting * chain.units.time_unit
+    wanted = compare.measure(chain, method, internal, reference, 20.0).error
+    assert chain.deviation(end, reference.positions) == pytest.approx(wanted, rel=0.05, abs=1e-12)
+
+
+def test_lines_of_code_on_arrays():
+    scene = scenes.build("sphere", 2)
+    text = snippets.code(scene, "suzuki4", 0.2, 'scenes.build("sphere", 2)')
+    space = {}
+    exec(compile(text, "suzuki4", "exec"), space)
+    assert np.abs(space["end"].positions - scene.reference().positions).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["openmm-verlet", "openmm-middle", "openmm-kcons-blanes-moan4", "openmm-held-rattle"])
+def test_lines_of_code_in_openmm(chain, name):
+    pytest.importorskip("openmm")
+    text = snippets.code(chain, name, 1.25, CHAIN)
+    space = {}
+    exec(compile(text, name, "exec"), space)
+    state = space["context"].getState(positions=True)
+    end = np.array(state.getPositions(asNumpy=True)._value) / chain.openmm.length
+    assert chain.deviation(end, chain.reference().positions) < 2e-3
+
+
+def test_lines_of_code_of_an_unknown_method(chain):
+    with pytest.raises(InputError, match="no method"):
+        snippets.code(chain, "nothing", 1.0, CHAIN)
+
+
+# -- command line -----------------------------------------------------------------------------------
+
+
+def test_command(tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = [
+        "compare",
+        "sphere-pendulum",
+        "--quick",
+        "--methods",
+        "rattle,suzuki4,dop853",
+        "--target-error",
+        "1e-5",
+    ]
+    assert cli.main([*arguments, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "For an error of at most 1e-05 R at 2 τ" in printed
+    entry = json.loads((out / "compare.json").read_text(encoding="utf-8"))["recommendation"]
+    assert entry["reached"] and entry["error"] <= 1e-5
+    assert 'scene = scenes.build("sphere-pendulum", quick=True)' in entry["code"]
+    exec(compile(entry["code"], "recommended", "exec"), {})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["compare", "chain", "--target-error", "0"], "positive number such as 1e-6"),
+        (["compare", "chain", "--target-error", "nan"], "positive number such as 1e-6"),
+        (["compare", "thermostat", "--target-error", "1e-6"], "is for trajectories"),
+    ],
+)
+def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    assert text in capsys.readouterr().err
