@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from kcons import State, System, compare, run, scenes, steppers
 from kcons.methods import METHODS
@@ -73,8 +74,8 @@ def of_rounding(full: bool) -> dict:
     found = {}
     for name, stepper in ROUNDING.items():
         points = []
-        for steps in np.unique(np.geomspace(64, 1_000_000 if full else 4_000, 15 if full else 7).astype(int)):
-            if steps * stepper.force_evaluations > (3_000_000 if full else 20_000):
+        for steps in np.unique(np.geomspace(64, 400_000 if full else 4_000, 13 if full else 7).astype(int)):
+            if steps * stepper.force_evaluations > (600_000 if full else 20_000):
                 continue
             end = run(system, State(scene.positions, scene.velocities), scene.horizon / steps, steps, stepper=stepper)
             residual, _ = scene.residuals(end.positions, end.velocities)
@@ -157,6 +158,8 @@ def plot(result: dict, path: Path) -> None:
         bottom.set_title(f"step {found['tolerances']['step']:.3g} {time}", fontsize=9)
         bottom.legend(fontsize=7)
         top.legend(fontsize=7)
+        top.xaxis.set_major_locator(LogLocator())
+        top.xaxis.set_minor_formatter(NullFormatter())
     part = result["rounding"]
     for row, (index, what) in enumerate(((1, f"error / {part['length']}"), (2, "max |σ|"))):
         axes = panels[row, 3]

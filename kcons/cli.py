@@ -103,6 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     report.add_argument("--fresh", action="store_true", help="measure again what is there already")
     report.add_argument("--redraw", type=Path, metavar="DIR", help="pictures and page from the numbers in DIR, no run")
+    report.add_argument("--into", type=Path, metavar="PAGE", help="with --redraw: the table into this page, too")
     compare.set_defaults(run=_compare)
 
     plan = commands.add_parser(
@@ -210,7 +211,7 @@ def _compare_all(chosen: argparse.Namespace) -> int:
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
         raise InputError("--all runs all scenes and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
-        _say_written(everything.redraw(chosen.redraw))
+        _say_written(everything.redraw(chosen.redraw, chosen.into))
         return 0
     folder: Path = chosen.out or Path("compare-all")
     items = everything.chosen(chosen.only)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import page, report
+from kcons.errors import InputError
 from kcons.fronts import COSTS, EVERY_HOST, LEAST_MARGIN, NO_FORCE, summary, verdict
 from kcons.page import PageTable, Section
 from kcons.results import Comparison, duration
@@ -165,6 +166,45 @@ def winners(parts: Sequence[Part]) -> PageTable:
             )
             marks.append("bad" if row["losses"] else "good")
     return PageTable(headings, rows, text_columns=(0, 1, 2, 5, 6, 7, 8, 9), marks=marks)
+
+
+#: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+PICTURES = ("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol")
+#: Columns of the table of winners that go there.
+SHORT = (0, 1, 2, 3, 4, 5)
+
+
+def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
+    """Put the table of winners and some figures between the marks of a page in Markdown; the paths written.
+
+    Raises
+    ------
+    InputError
+        The page has no marks.
+    """
+    text = path.read_text(encoding="utf-8")
+    if BEGIN not in text or END not in text:
+        raise InputError(f"{path} has no place for results, {BEGIN} and {END}", item="into")
+    before, after = text.split(BEGIN)[0], text.split(END)[1]
+    (path.parent / "figures").mkdir(exist_ok=True)
+    written = [path]
+    pictures = []
+    for part in parts:
+        if part.key in PICTURES and "comparison" in part.data:
+            target = path.parent / "figures" / f"report-{part.key}.png"
+            report.figure(Comparison.from_dict(part.data["comparison"])).savefig(target, dpi=75)
+            pictures.append(f"![{part.heading}](figures/{target.name})")
+            written.append(target)
+    path.write_text(f"{before}{BEGIN}\n{results(parts)}\n" + "\n".join(pictures) + f"\n{END}{after}", encoding="utf-8")
+    return written
+
+
+def results(parts: Sequence[Part]) -> str:
+    """The table of winners in Markdown, with where and with what it was measured."""
+    machines = _machines(parts)
+    where = [f"{row[0]}; {row[2]}; commit {row[3]}; {row[4]} run, {row[6]} to {row[7]}." for row in machines.rows]
+    return "\n\n".join([*where, *_lost_and_won(parts), markdown(winners(parts), SHORT), ""])
 
 
 def factor(ratio: float) -> str:

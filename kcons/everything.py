@@ -407,8 +407,8 @@ def _slim(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-def redraw(folder: Path) -> list[Path]:
-    """Pictures, tables and the page from the numbers in a folder.
+def redraw(folder: Path, into: Path | None = None) -> list[Path]:
+    """Pictures, tables and the page from the numbers in a folder; the table of winners goes `into` a page, too.
 
     Raises
     ------
@@ -423,7 +423,8 @@ def redraw(folder: Path) -> list[Path]:
         for item, data in found
         for path in comparison_page.write_part(folder, item.key, item.heading, item.module, data)
     ]
-    return [_page(folder), *made]
+    filled = [] if into is None else comparison_page.fill(into, parts(folder))
+    return [_page(folder), *made, *filled]
 
 
 def parts(folder: Path) -> list[comparison_page.Part]:

@@ -210,6 +210,23 @@ def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
     assert text in capsys.readouterr().err
 
 
+def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(comparison_page, "PICTURES", ("sphere",))
+    page = tmp_path / "page.md"
+    page.write_text(f"head\n{comparison_page.BEGIN}\nold\n{comparison_page.END}\ntail\n")
+    parts = everything.parts(finished)
+    assert comparison_page.fill(page, parts) == [page, tmp_path / "figures" / "report-sphere.png"]
+    first = page.read_text(encoding="utf-8")
+    assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
+    assert "| scene | host | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
+    assert "full run" in first
+    comparison_page.fill(page, parts)
+    assert page.read_text(encoding="utf-8") == first
+    page.write_text("no marks")
+    with pytest.raises(InputError, match="no place for results"):
+        comparison_page.fill(page, parts)
+
+
 def test_there_is_nothing_to_redraw(tmp_path):
     with pytest.raises(InputError, match="no results"):
         everything.redraw(tmp_path)
