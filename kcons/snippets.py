@@ -55,7 +55,7 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
         lines = _ase_kcons(dt, steps)
     elif isinstance(found, AseBonds):
         lines = _ase_bonds(dt, steps)
-    elif isinstance(found, ProjectedOde):
+    elif isinstance(found, ProjectedOde) and not found.project:
         lines = _scipy(setting)
     elif isinstance(found, BuiltIn | Held | Projected) and not isinstance(found, OnSurfaces):
         assert scene.openmm is not None
