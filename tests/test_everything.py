@@ -264,4 +264,4 @@ def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
     assert {"yoshida4", "baumgarte"} <= set(every)
     assert set(every) >= set(names)
     kept, out = everything.methods_of(Item("x", "x", "chain", without=("ase-i", "dop")), scene, False)
-    assert out == ["ase-internals", "dop853"] and not set(out) & set(kept)
+    assert out == ["ase-internals", "dop853", "dop853-projected"] and not set(out) & set(kept)
