@@ -130,6 +130,7 @@ def compare(
                 "long_time": scene.units.long_time,
             },
             "forces": scene.potential.name,
+            **({"error": "energy above the optimum"} if scene.shortfall is not None else {}),
         },
         reference={"how": reference.how, "error": reference.error},
         settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {})},

@@ -200,14 +200,14 @@ PLAN: tuple[Item, ...] = (
         "solver-precision",
         "The solvers alone: residual against time a constraint",
         module="kcons.solver_precision",
-        seconds=60,
+        seconds=400,
         quick_seconds=25,
     ),
     Item(
         "scaling",
         "Scaling: cost and memory against size",
         module="kcons.scaling",
-        seconds=150,
+        seconds=600,
         quick_seconds=25,
     ),
 )
@@ -268,7 +268,8 @@ def run(
     pending = []
     for item in items:
         old = read(folder, item.key)
-        if not fresh and old is not None and old["key"] == key_of(item, quick) and "failed" not in old:
+        unfinished = old is None or "failed" in old or "unfinished" in old
+        if not fresh and old is not None and old["key"] == key_of(item, quick) and not unfinished:
             watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
             expected.pop(item.key)
         else:
@@ -282,7 +283,7 @@ def run(
             watching.overall(f"{number} of {len(pending)}: {item.heading}", elapsed, elapsed + left)
             share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
             started = time.perf_counter()
-            found = _part(item, quick, share, watching)
+            found = _part(item, quick, share, watching, folder, fresh)
             _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
             if "seconds" in found:
                 done += expected[item.key]
@@ -302,7 +303,7 @@ def key_of(item: Item, quick: bool) -> dict[str, Any]:
     return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
 
 
-def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, Any]:
+def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
     """Measure one part; what keeps it from being measured is its result."""
     reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
     if reason:
@@ -310,13 +311,27 @@ def _part(item: Item, quick: bool, share: float, watcher: Watcher) -> dict[str, 
     begun = time.perf_counter()
     try:
         if item.module:
-            module = import_module(item.module)
-            found = {"result": module.measure(quick=quick, keep=None, watcher=watcher)}
+            found = {"result": _by_module(item, quick, watcher, folder, fresh)}
         else:
             found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
     except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
         return {"failed": f"{type(error).__name__}: {error}", "environment": environment()}
     return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
+
+
+def _by_module(item: Item, quick: bool, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
+    """A part with a module of its own; what it has measured is kept from time to time."""
+    head = {"format": FORMAT, "key": key_of(item, quick), "unfinished": True}
+    old = None if fresh else read(folder, item.key)
+    earlier = old["result"] if old is not None and "result" in old and old["key"] == head["key"] else None
+
+    def keep(result: dict[str, Any]) -> None:
+        _put(folder, item, {**head, "result": result, "environment": environment()})
+
+    result: dict[str, Any] = import_module(item.module).measure(
+        quick=quick, keep=keep, watcher=watcher, earlier=earlier
+    )
+    return result
 
 
 def _excluded(item: Item, quick: bool) -> str:
@@ -391,12 +406,16 @@ def read(folder: Path, key: str) -> dict[str, Any] | None:
     return unpacked(data) if data.get("format") == FORMAT else None
 
 
-def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
+def _put(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
     # Aside and then into place: a run that is interrupted leaves no half of a file.
     path = folder / f"{item.key}.json"
     beside = path.with_suffix(".part")
     beside.write_text(packed(found), encoding="utf-8")
     beside.replace(path)
+
+
+def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
+    _put(folder, item, found)
     comparison_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
 
 

@@ -84,8 +84,11 @@ def style(name: str) -> tuple[str, str | int]:
     return SPARE[others.index(name) % len(SPARE)] if name in others else ("black", "x")
 
 
+#: What the error is, unless the scene says something else.
+ERROR = "root-mean-square distance an atom from the reference"
+
 EXPLANATION = (
-    "error: root-mean-square distance an atom from the reference at t = {horizon:g} {time}; reference: {how}{good}.",
+    "error: {error_is} at t = {horizon:g} {time}; reference: {how}{good}.",
     "|σ|: largest violation of a held value after the last step, in {length} or rad. "
     "|Av|: largest velocity off the constraints, over v_rms.",
     "slope: linear fit of the total energy, in {energy}/{long_time} a degree of freedom; "
@@ -182,6 +185,7 @@ def explanation(comparison: Comparison) -> str:
     known = {
         "horizon": comparison.scene["horizon"],
         "how": comparison.reference["how"],
+        "error_is": comparison.scene.get("error", ERROR),
         "good": f", good to {error:.0e} {units['length']}" if error else "",
         **units,
     }

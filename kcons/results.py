@@ -96,8 +96,11 @@ class Comparison:
     def observed_order(self, method: str) -> float | None:
         """Slope of log(error) against log(time step) at the two finest steps whose error is above the reference's.
 
-        None with fewer than two such steps. Coarser steps are left out: high orders show at small steps only.
+        None with fewer than two such steps, and where the error is no distance from a trajectory. Coarser steps are
+        left out: high orders show at small steps only.
         """
+        if "error" in self.scene:
+            return None
         floor = 5 * float(self.reference["error"])
         used = [m for m in self.of(method) if not m.adaptive and m.error is not None and m.error > max(floor, 1e-12)]
         if len(used) < 2:

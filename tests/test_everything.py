@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from html.parser import HTMLParser
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -57,6 +59,33 @@ def test_files_of_every_part(finished):
         assert names >= {f"{key}.json", f"{key}.png", f"{key}.txt"}
     assert not [name for name in names if name.endswith(".part")]
     assert "kcons RATTLE" in (finished / "sphere.txt").read_text(encoding="utf-8")
+
+
+def test_a_part_of_a_module_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    measured = []
+
+    def measure(*, quick, keep, watcher, earlier=None):
+        found = {"points": list(earlier["points"]) if earlier else []}
+        for point in range(len(found["points"]), 3):
+            if point == 2 and len(measured) == 2:
+                measured.append("interrupted")
+                raise KeyboardInterrupt
+            measured.append(point)
+            found["points"].append(point)
+            keep(found)
+        return found
+
+    monkeypatch.setattr(everything, "import_module", lambda name: SimpleNamespace(measure=measure))
+    monkeypatch.setattr(everything, "find_spec", lambda name: True)
+    monkeypatch.setattr(everything, "comparison_page", Mock())
+    items = [Item("alone", "A module", module="kcons.some_module", seconds=1)]
+    with pytest.raises(KeyboardInterrupt):
+        everything.run(items, tmp_path)
+    assert everything.read(tmp_path, "alone")["result"] == {"points": [0, 1]}
+    everything.run(items, tmp_path)
+    everything.run(items, tmp_path)
+    assert measured == [0, 1, "interrupted", 2]
+    assert everything.read(tmp_path, "alone")["result"] == {"points": [0, 1, 2]}
 
 
 def test_numbers_come_back_as_they_were(finished):
@@ -247,7 +276,7 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     for structure in ("alanine", "dhfr"):
         for constrain in ("hbonds", "allbonds", "hangles"):
             assert plan[f"{structure}-{constrain}"].options == {"constrain": constrain}
-    assert sum(item.seconds for item in plan.values()) <= 1800
+    assert sum(item.seconds for item in plan.values()) <= 3600
     assert sum(item.quick_seconds for item in plan.values()) <= everything.QUICK_SECONDS
     assert [item.key for item in everything.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
 
