@@ -268,7 +268,7 @@ def far_out() -> list[dict[str, Any]]:
                 try:
                     with np.errstate(all="ignore"):
                         ivp = solve_ivp(patient, (0.0, end), start, solver, rtol=1e-8, atol=1e-11)
-                except TimeoutError:
+                except (TimeoutError, ValueError):  # Radau: NaN in its matrix
                     row["reached"] = float(reached[0])
                 else:
                     x = ivp.y[:, -1]

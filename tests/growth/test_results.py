@@ -32,7 +32,7 @@ def test_random_systems(script):
     assert found["trajectories"] == found["finite"] == 60
     assert found["failed"] == 0
     assert found["worst_row"] < 1e-13
-    assert 0 < found["worst_of_terms"] < 1e-14
+    assert 0 < found["worst_of_terms"] < 1e-13
 
 
 def test_ensemble(script):
@@ -74,7 +74,7 @@ def test_a_million_random_systems(script):
     assert max(group["total"] for group in found["groups"]) < 1e-13
     # The terms of g can be hundreds of times as large as max(1, |g_0|): one of its last digits is more.
     assert found["above_1e-13"] < 50
-    assert found["worst_of_terms"] < 1e-14
+    assert found["worst_of_terms"] < 1e-13
 
 
 @pytest.mark.validation
