@@ -11,6 +11,7 @@ from kcons.ase.calculator import ConstrainedCalculator
 from kcons.ase.constraint import Constraints, constrain
 from kcons.ase.dynamics import ConstrainedDynamics
 from kcons.ase.thermostats import ConstrainedLangevin, ConstrainedNoseHoover, IsokineticDynamics, draw_velocities
+from kcons.ase.topology import constraints_of, mend_elements
 from kcons.ase.translation import from_ase_constraints
 from kcons.ase.water import rigid_water
 
@@ -22,7 +23,9 @@ __all__ = [
     "Constraints",
     "IsokineticDynamics",
     "constrain",
+    "constraints_of",
     "draw_velocities",
     "from_ase_constraints",
+    "mend_elements",
     "rigid_water",
 ]

@@ -12,6 +12,7 @@ from kcons.openmm.langevin import Langevin
 from kcons.openmm.projected import ProjectedIntegrator
 from kcons.openmm.row_forces import Row, each_term
 from kcons.openmm.surface import SurfaceIntegrator, surface_parts
+from kcons.openmm.topology import constraints_of
 from kcons.openmm.transfer import hold, take_constraints
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "ProjectedIntegrator",
     "Row",
     "SurfaceIntegrator",
+    "constraints_of",
     "each_term",
     "hold",
     "surface_parts",

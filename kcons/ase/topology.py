@@ -1,0 +1,230 @@
+"""Topologies of ASE `Atoms`: residues as ASE's readers leave them, bonds where there are any."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from ase import Atoms, units
+from ase.data import atomic_masses, atomic_numbers, chemical_symbols
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.constraint import IntArray
+from kcons.errors import InputError
+from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology import MASSES, BoolArray, Snapshot, Topology, elements_of, sorted_pairs, split_residues
+
+__all__ = ["atoms_of", "constraints_of", "mend_elements", "snapshot_of"]
+
+#: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
+BONDS = "bonds"
+#: ASE's unit of time in ps, to the power that velocities need.
+PS = 1000 * units.fs
+_REMEDY = "put pairs of atoms into atoms.info['bonds']"
+
+
+def constraints_of(
+    atoms: Atoms,
+    constrain: str | None = "hbonds",
+    *,
+    rigid_water: bool = True,
+    water_names: Iterable[str] = (),
+    water_geometry: str | tuple[float, float] | None = None,
+    rigid_residues: Iterable[str] = (),
+    rigid_bodies: Iterable[Sequence[int] | IntArray] = (),
+    on: Mapping[Any, RowMaker] | None = None,
+    select: ArrayLike | str = "all",
+    angles: Literal["angles", "distances"] = "angles",
+    guess_bonds: bool | Literal["missing"] = "missing",
+) -> HeldRows:
+    """Rows by name for ASE `Atoms`, in angstrom; give them to `kcons.ase.constrain`.
+
+    Residues are those of ``atoms.arrays['residuenames']`` and ``['residuenumbers']``, as ASE reads them from PDB files;
+    without them, molecules are found by their bonds and water by its composition. Bonds are the pairs in
+    ``atoms.info['bonds']``; missing ones are guessed.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+    constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
+        See `kcons.held_rows.held_rows`.
+    on : mapping, optional
+        Tuples of atoms -> callable that makes a row of them.
+    select : 'all', mask or atoms
+        Rows are kept if all of their atoms are among these.
+    guess_bonds : bool or 'missing'
+
+    Returns
+    -------
+    HeldRows
+        A list of constraints; ``.constraint_set`` has them as a set.
+
+    Raises
+    ------
+    InputError
+        As `held_rows`.
+    """
+    return held_rows(
+        snapshot_of(atoms),
+        constrain,
+        rigid_water=rigid_water,
+        water_names=water_names,
+        water_geometry=water_geometry,
+        rigid_residues=rigid_residues,
+        rigid_bodies=rigid_bodies,
+        on=as_makers(on, lambda key: _numbers(key, len(atoms))),
+        selected=None if isinstance(select, str) and select == "all" else _mask(select, len(atoms)),
+        angles=angles,
+        guess=guess_bonds,
+        remedy=_REMEDY,
+    )
+
+
+def snapshot_of(atoms: Atoms) -> Snapshot:
+    """Topology and positions of `atoms`.
+
+    Atoms with names and residues get the element that the name says, since ASE reads PDB files without a column of
+    elements as if 'HG' were mercury; `mend_elements` corrects the atoms themselves.
+
+    Raises
+    ------
+    InputError
+        Bonds that name atoms which do not exist.
+    """
+    n = len(atoms)
+    arrays = atoms.arrays
+    symbols = np.array(chemical_symbols)[atoms.numbers]
+    elements = np.where(atoms.numbers == 0, "", symbols)
+    names = np.asarray(arrays["atomtypes"]).astype(str) if "atomtypes" in arrays else symbols
+    names = np.char.strip(names)
+    masses = atoms.get_masses()
+    if "masses" not in arrays:
+        masses[atoms.numbers == 0] = 0.0
+    known = "residuenames" in arrays
+    if known:
+        called = np.char.strip(np.asarray(arrays["residuenames"]).astype(str))
+        numbers = np.asarray(arrays["residuenumbers"]) if "residuenumbers" in arrays else np.zeros(n, np.int64)
+        chains = np.asarray(arrays["chainids"]).astype(str) if "chainids" in arrays else np.full(n, "")
+        residues, first = split_residues(names, called, numbers, chains)
+        residue_names, ids, chains = called[first], numbers[first].astype(str), chains[first]
+    else:
+        residues = np.zeros(n, np.int64)
+        residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
+    if known and "atomtypes" in arrays:
+        elements, masses = _mended(elements, masses, names, residues, residue_names, "masses" in arrays)
+    bonds = np.asarray(atoms.info.get(BONDS, np.zeros((0, 2))), dtype=np.int64).reshape(-1, 2)
+    if bonds.size and (bonds.min() < 0 or bonds.max() >= n):
+        raise InputError(f"atoms.info['bonds'] names atoms beyond 0 to {n - 1}", item="bonds")
+    charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
+    topology = Topology(
+        names,
+        elements,
+        masses,
+        residues,
+        residue_names,
+        ids,
+        chains,
+        sorted_pairs(bonds),
+        charges,
+        residues_known=known,
+    )
+    cell = atoms.cell.array.copy() if atoms.pbc.any() else None
+    velocities = atoms.get_velocities() * PS if "momenta" in arrays else None
+    return Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
+
+
+def mend_elements(atoms: Atoms) -> int:
+    """Give atoms of residues the elements that their names say, in place; how many changed.
+
+    ASE's reader takes atom names for symbols where a PDB file has no column of elements.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        topology = snapshot_of(atoms).topology
+    numbers = np.array([atomic_numbers[e] if e else 0 for e in topology.elements.tolist()], dtype=np.int64)
+    changed = int(np.sum(numbers != atoms.numbers))
+    atoms.numbers[:] = numbers
+    return changed
+
+
+def atoms_of(snapshot: Snapshot) -> Atoms:
+    """`Atoms` with names, residues, bonds, masses, charges, cell and velocities."""
+    snapshot = snapshot.in_unit(1.0)
+    topology = snapshot.topology
+    numbers = [atomic_numbers.get(e, 0) if e else 0 for e in topology.elements.tolist()]
+    atoms = Atoms(numbers, positions=snapshot.positions, masses=topology.masses, cell=snapshot.cell, pbc=snapshot.pbc)
+    atoms.new_array("atomtypes", topology.names)
+    if topology.residues_known:
+        atoms.new_array("residuenames", topology.residue_names[topology.residues])
+        atoms.new_array("residuenumbers", _as_integers(topology.residue_ids)[topology.residues])
+        atoms.new_array("chainids", topology.chains[topology.residues])
+    if topology.charges is not None:
+        atoms.set_initial_charges(topology.charges)
+    if len(topology.bonds):
+        atoms.info[BONDS] = topology.bonds
+    if snapshot.velocities is not None:
+        atoms.set_velocities(snapshot.velocities / PS)
+    return atoms
+
+
+def _mended(
+    elements: NDArray[np.str_],
+    masses: NDArray[np.float64],
+    names: NDArray[np.str_],
+    residues: IntArray,
+    residue_names: NDArray[np.str_],
+    keep_masses: bool,
+) -> tuple[NDArray[np.str_], NDArray[np.float64]]:
+    """Elements by name where a name contradicts the symbol, and their masses."""
+    by_name = elements_of(names, residues, residue_names, None)
+    wrong = (by_name != elements) & (by_name != "") & (np.char.upper(elements) != np.char.upper(by_name))
+    # A name that begins otherwise says nothing about the element (C1 of a chlorine, X1): the symbol stays.
+    start = np.array([name.lstrip("0123456789")[:2].upper() for name in names[wrong].tolist()] or [""])[: wrong.sum()]
+    wrong[np.flatnonzero(wrong)] = np.char.upper(elements[wrong]) == start
+    if not wrong.any():
+        return elements, masses
+    atom = int(np.argmax(wrong))
+    warnings.warn(
+        f"{int(wrong.sum())} atoms have elements that their names contradict, such as {names[atom]} of "
+        f"{residue_names[residues[atom]]}, which is no {elements[atom]}; the names are followed. "
+        "kcons.ase.mend_elements(atoms) corrects the atoms",
+        UserWarning,
+        stacklevel=4,
+    )
+    elements = np.where(wrong, by_name, elements)
+    if not keep_masses:
+        standard = {s: float(atomic_masses[atomic_numbers[s]]) for s in set(by_name[wrong].tolist()) & set(MASSES)}
+        masses = masses.copy()
+        masses[wrong] = [standard[s] for s in by_name[wrong].tolist()]
+    return elements, masses
+
+
+def _as_integers(ids: NDArray[np.str_]) -> IntArray:
+    digits = [("".join(c for c in text if c.isdigit() or c == "-") or "0") for text in ids.tolist()]
+    return np.array([int(d) for d in digits] or [], dtype=np.int64)
+
+
+def _mask(select: Any, n: int) -> BoolArray:
+    mask = np.zeros(n, dtype=bool)
+    mask[_numbers(select, n)] = True
+    return mask
+
+
+def _numbers(select: Any, n: int) -> IntArray:
+    """Numbers of the atoms that a mask or a list of numbers names."""
+    given = np.asarray(select)
+    if given.dtype == bool and given.shape == (n,):
+        given = np.flatnonzero(given)
+    if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
+        raise InputError(
+            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
+            "for kcons.mdanalysis",
+            item="select",
+        )
+    if not given.size:
+        raise InputError("the selection has no atoms; widen it", item="select")
+    if given.min() < 0 or given.max() >= n:
+        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
+    return given.astype(np.int64)

@@ -1,0 +1,134 @@
+"""Bonds for systems that come without: by distance and covalent radii, one way for all hosts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.topology import BoolArray, Snapshot, sorted_pairs
+
+#: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
+RADII: dict[str, float] = {
+    "H": 0.31, "B": 0.84, "C": 0.76, "N": 0.71, "O": 0.66, "F": 0.57, "Si": 1.11, "P": 1.07, "S": 1.05, "Cl": 1.02,
+    "Ge": 1.20, "As": 1.19, "Se": 1.20, "Br": 1.20, "Te": 1.38, "I": 1.39,
+}  # fmt: skip
+#: Atoms closer than this times the sum of their radii are bonded. C-C up to 1.90, C-H 1.34, O-H 1.21 angstrom.
+STRETCH = 1.25
+#: Atoms closer than this, in angstrom, are one atom twice.
+COINCIDENT = 0.3
+
+
+def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
+    """Bonds that the distances suggest, shape (n, 2).
+
+    Two atoms are bonded if they are closer than 1.25 times the sum of their covalent radii, under minimum images. A
+    hydrogen keeps its nearest neighbour only. Metals and noble gases get no bonds.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    atoms : ndarray of bool, shape (n_atoms,), optional
+        Bonds are returned where at least one of the two atoms is marked.
+
+    Raises
+    ------
+    InputError
+        No elements; positions that are not finite; two atoms on top of each other.
+    """
+    topology = snapshot.topology
+    radius = np.zeros(topology.n_atoms)
+    for symbol, value in RADII.items():
+        radius[topology.elements == symbol] = value
+    able = np.flatnonzero(radius > 0)
+    if topology.n_atoms and not (topology.elements != "").any():
+        raise InputError(
+            "there are no bonds and no elements to guess them from; give a topology with bonds, or elements",
+            item="elements",
+        )
+    x = snapshot.positions / snapshot.angstrom
+    bad = ~np.isfinite(x).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise InputError(f"position of {topology.atom_name(atom)} is not finite", item="positions", atoms=[atom])
+    if len(able) < 2:
+        return np.zeros((0, 2), np.int64)
+    cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
+    reach = 2 * STRETCH * float(radius.max())
+    pairs, away = _close(x[able], cell, snapshot.pbc, reach)
+    pairs = able[pairs]
+    i, j = pairs.T
+    near = away < STRETCH * (radius[i] + radius[j])
+    hydrogen = topology.hydrogen
+    near &= ~(hydrogen[i] & hydrogen[j]) | (away < 0.9)
+    pairs, away = pairs[near], away[near]
+    if atoms is not None:
+        wanted = atoms[pairs].any(axis=1)
+        pairs, away = pairs[wanted], away[wanted]
+    if len(away) and away.min() < COINCIDENT:
+        i, j = (int(k) for k in pairs[np.argmin(away)])
+        raise InputError(
+            f"{topology.atom_name(i)} and {topology.atom_name(j)} are {away.min():.2g} angstrom apart: bonds cannot be "
+            "guessed; remove double or alternative atoms, or give a topology with bonds",
+            item="positions",
+            atoms=[i, j],
+        )
+    return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
+
+
+def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:
+    """Which pairs stay when every hydrogen keeps only its nearest neighbour."""
+    best = np.full(len(hydrogen), np.inf)
+    for side in (0, 1):
+        np.minimum.at(best, pairs[:, side], away)
+    keep = np.ones(len(pairs), dtype=bool)
+    for side in (0, 1):
+        atom = pairs[:, side]
+        keep &= ~hydrogen[atom] | (away <= best[atom])
+    return keep
+
+
+def _close(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
+    """Pairs closer than `reach` in any image, shape (n, 2), and their distances."""
+    from scipy.spatial import cKDTree
+
+    if cell is None or not pbc.any():
+        pairs = cKDTree(x).query_pairs(reach, output_type="ndarray").astype(np.int64)
+        return pairs, np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
+    full = cell.copy()
+    axes = np.flatnonzero(pbc)
+    if len(axes) < 3:
+        full[~pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
+    inverse = np.linalg.inv(full)
+    fractional = x @ inverse
+    fractional[:, axes] -= np.floor(fractional[:, axes])
+    y = fractional @ full
+    # Atoms within reach of a face of the cell are repeated beyond the opposite one.
+    depth = reach * np.linalg.norm(inverse, axis=0)
+    whole, number, place = y, np.arange(len(x)), fractional
+    for axis in axes.tolist():
+        copies, owners, places = [whole], [number], [place]
+        for sign in range(-int(np.ceil(depth[axis])), int(np.ceil(depth[axis])) + 1):
+            if sign == 0:
+                continue
+            moved = place[:, axis] + sign
+            inside = (moved > -depth[axis]) & (moved < 1 + depth[axis])
+            copies.append(whole[inside] + sign * full[axis])
+            owners.append(number[inside])
+            shifted = place[inside].copy()
+            shifted[:, axis] += sign
+            places.append(shifted)
+        whole, number, place = np.concatenate(copies), np.concatenate(owners), np.concatenate(places)
+    pairs = cKDTree(whole).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    pairs = pairs[(pairs < len(x)).any(axis=1)]
+    away = np.linalg.norm(whole[pairs[:, 0]] - whole[pairs[:, 1]], axis=1)
+    owned = np.sort(number[pairs], axis=1)
+    other = owned[:, 0] != owned[:, 1]
+    owned, away = owned[other], away[other]
+    # The shortest image of each pair.
+    order = np.lexsort((away, owned[:, 1], owned[:, 0]))
+    owned, away = owned[order], away[order]
+    first = np.ones(len(owned), dtype=bool)
+    first[1:] = (owned[1:] != owned[:-1]).any(axis=1)
+    return owned[first], away[first]

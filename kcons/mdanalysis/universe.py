@@ -1,0 +1,245 @@
+"""Constraints from an MDAnalysis `Universe`, with its selection language."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+import MDAnalysis
+import numpy as np
+from MDAnalysis.lib.mdamath import triclinic_vectors
+from numpy.typing import NDArray
+
+from kcons.constraints.constraint import IntArray
+from kcons.errors import InputError
+from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology import Snapshot, Topology, as_written, elements_of, listed, near_misses, sorted_pairs
+
+__all__ = ["constraints_of", "selected", "snapshot_of"]
+
+_REMEDY = "load a topology that has them (PSF, TPR, PRMTOP, MOL2, ...)"
+
+
+def constraints_of(
+    universe: Any,
+    constrain: str | None = "hbonds",
+    *,
+    rigid_water: bool = True,
+    water_names: Iterable[str] = (),
+    water_geometry: str | tuple[float, float] | None = None,
+    rigid_residues: Iterable[str] = (),
+    rigid_bodies: Iterable[str | Sequence[int] | IntArray] = (),
+    on: Mapping[str, RowMaker] | None = None,
+    select: str = "all",
+    angles: Literal["angles", "distances"] = "angles",
+    guess_bonds: bool | Literal["missing"] = "missing",
+) -> HeldRows:
+    """Rows by name, in angstrom, with targets of the present frame.
+
+    Parameters
+    ----------
+    universe : Universe or AtomGroup
+        Atoms of a group are counted within the group; those of a Universe as it counts them.
+    constrain : {'hbonds', 'allbonds', 'hangles', 'allangles', 'none'} or None
+        Bonds with hydrogens; all bonds; these and the angles H-X-H and H-O-X; all bonds and angles.
+    rigid_water : bool
+        Hold water by three distances; found by residue name and composition. Sites without mass (TIP4P) are placed,
+        not held: ``.virtual_sites``.
+    water_names : iterable of str
+        Residue names that are water besides the usual ones.
+    water_geometry : str, (float, float) or None
+        'tip3p', 'spc', ..., or O-H length and H-O-H angle in degrees; None holds each molecule as it is.
+    rigid_residues : iterable of str
+        Names of residues held rigid.
+    rigid_bodies : iterable
+        Atoms or selections, each held rigid as a whole.
+    on : mapping, optional
+        Rows on selections: selection -> callable, for example ``{"protein": CenterOfMass}``.
+    select : str
+        Rows are kept if all of their atoms are in this selection.
+    angles : {'angles', 'distances'}
+        Angles as rows in radian, or as distances of their ends as in OpenMM.
+    guess_bonds : bool or 'missing'
+        'missing' guesses bonds of atoms without any, with a warning; False never; True all of them.
+
+    Returns
+    -------
+    HeldRows
+        A list of constraints; ``.constraint_set`` has them as a set.
+
+    Raises
+    ------
+    InputError
+        Selections that match nothing, unknown names, no coordinates, masses, elements or bonds.
+    """
+    group = universe.atoms
+    local = not isinstance(universe, MDAnalysis.Universe)
+
+    def numbers(words: str) -> IntArray:
+        found = selected(group, words)
+        return np.flatnonzero(np.isin(group.indices, found)) if local else found
+
+    mask = None
+    if select != "all":
+        mask = np.zeros(len(group), dtype=bool)
+        mask[numbers(select)] = True
+    return held_rows(
+        snapshot_of(universe),
+        constrain,
+        rigid_water=rigid_water,
+        water_names=water_names,
+        water_geometry=water_geometry,
+        rigid_residues=rigid_residues,
+        rigid_bodies=[numbers(body) if isinstance(body, str) else np.asarray(body) for body in rigid_bodies],
+        on=as_makers(on, numbers),
+        selected=mask,
+        angles=angles,
+        guess=guess_bonds,
+        remedy=_REMEDY,
+    )
+
+
+def selected(universe: Any, words: str) -> IntArray:
+    """Numbers of the atoms that a selection matches, as the Universe counts them.
+
+    Raises
+    ------
+    InputError
+        Words that MDAnalysis does not understand, or that match nothing; with names that exist.
+    """
+    try:
+        found = universe.atoms.select_atoms(words)
+    except Exception as error:  # MDAnalysis raises SelectionError, and others for odd words
+        raise InputError(
+            f"selection {words!r} cannot be read: {' '.join(str(error).split()) or type(error).__name__}", item="select"
+        ) from error
+    if not len(found):
+        raise InputError(f"selection {words!r} matches nothing{_hint(universe.atoms, words)}", item="select")
+    return found.indices.astype(np.int64)
+
+
+def _hint(group: Any, words: str) -> str:
+    tokens = words.replace("(", " ").replace(")", " ").split()
+    for keyword, attribute in (
+        ("resname", "resnames"),
+        ("name", "names"),
+        ("segid", "segids"),
+        ("element", "elements"),
+    ):
+        if keyword in tokens and hasattr(group, attribute):
+            present = [str(v) for v in np.unique(getattr(group, attribute).astype(str))]
+            given = tokens[tokens.index(keyword) + 1] if tokens.index(keyword) + 1 < len(tokens) else ""
+            if given not in present:
+                return f": no {keyword} {given}{near_misses(given, present)}; there are {listed(present)}"
+    if "resid" in tokens and hasattr(group, "resids"):
+        return f"; residues are numbered {group.resids.min()} to {group.resids.max()}"
+    return "; look at universe.atoms for what there is"
+
+
+def snapshot_of(universe: Any) -> Snapshot:
+    """Topology, positions and cell of a Universe or AtomGroup at the present frame.
+
+    MDAnalysis keeps positions in single precision; decimals of the file they came from are restored.
+
+    Raises
+    ------
+    InputError
+        No coordinates.
+    """
+    group = universe.atoms
+    whole = group.universe
+    if not len(group):
+        raise InputError("there are no atoms in the group", item="atoms")
+    try:
+        step = whole.trajectory.ts
+        x = as_written(group.positions)
+    except (AttributeError, MDAnalysis.exceptions.NoDataError):
+        raise InputError(
+            f"{_file(whole)} has no coordinates; load a coordinates file beside it", item="positions"
+        ) from None
+    # Of a part, only the atoms of the part; but whole residues keep their numbers.
+    described = topology_of(universe)
+    cell = None
+    if step.dimensions is not None and np.all(step.dimensions[:3] > 2.0):
+        cell = _cell(step)
+    velocities = as_written(group.velocities) if step.has_velocities else None
+    return Snapshot(described, x, 1.0, cell, np.full(3, cell is not None), velocities, f"topology {_file(whole)}")
+
+
+def topology_of(universe: Any) -> Topology:
+    """Names, elements, residues, bonds and masses of a Universe or AtomGroup."""
+    group = universe.atoms
+    whole = group.universe
+    n = len(group)
+    resindex = group.resindices
+    old, residues = np.unique(resindex, return_inverse=True)
+    names = _texts(group, "names", n) if hasattr(group, "names") else _texts(group, "types", n)
+    residue_names = _texts(whole.residues[old], "resnames", len(old))
+    known = hasattr(group, "resnames") and bool((np.char.strip(residue_names) != "").any())
+    masses = np.asarray(group.masses, dtype=np.float64) if hasattr(group, "masses") else np.zeros(n)
+    measured = hasattr(group, "masses") and not _guessed(whole, "masses")
+    elements = _texts(group, "elements", n) if hasattr(group, "elements") else np.full(n, "")
+    elements = np.char.capitalize(np.char.strip(elements))
+    elements = np.where(elements == "D", "H", elements)
+    lacking = elements == ""
+    if lacking.any():
+        found = elements_of(names, residues.astype(np.int64), residue_names, masses if measured else None)
+        elements = np.where(lacking, found, elements)
+    ids = _texts(whole.residues[old], "resids", len(old)) if hasattr(whole.residues, "resids") else old.astype(str)
+    chain = next((a for a in ("chainIDs", "segids") if hasattr(group, a)), None)
+    if chain == "chainIDs":
+        first = np.unique(residues, return_index=True)[1]
+        chains = _texts(group[first], "chainIDs", len(old))
+    else:
+        chains = _texts(whole.residues[old], "segids", len(old)) if chain else np.full(len(old), "")
+    charges = np.asarray(group.charges, dtype=np.float64) if hasattr(group, "charges") else None
+    bonds = _bonds(whole)
+    if n != len(whole.atoms) or not np.array_equal(group.indices, np.arange(n)):
+        new = np.full(len(whole.atoms), -1, dtype=np.int64)
+        new[group.indices] = np.arange(n)
+        bonds = new[bonds]
+        bonds = bonds[(bonds >= 0).all(axis=1)]
+    return Topology(
+        names=names,
+        elements=elements,
+        masses=masses,
+        residues=residues.astype(np.int64),
+        residue_names=residue_names,
+        residue_ids=ids,
+        chains=np.where(chains == "SYSTEM", "", chains),
+        bonds=sorted_pairs(bonds),
+        charges=charges,
+        residues_known=known,
+    )
+
+
+def _cell(step: Any) -> NDArray[np.float64]:
+    """Lattice vectors in double precision; right angles are right."""
+    sizes = as_written(np.asarray(step.dimensions))
+    if np.all(sizes[3:] == 90.0):
+        return np.diag(sizes[:3])
+    return np.asarray(triclinic_vectors(sizes, dtype=np.float64), dtype=np.float64)
+
+
+def _bonds(whole: Any) -> IntArray:
+    """All bonds of a Universe, without the objects that MDAnalysis makes of them."""
+    attribute = next((a for a in whole._topology.attrs if a.attrname == "bonds"), None)
+    if attribute is None or not len(attribute.values):
+        return np.zeros((0, 2), np.int64)
+    return np.asarray(attribute.values, dtype=np.int64).reshape(-1, 2)
+
+
+def _guessed(whole: Any, name: str) -> bool:
+    attribute = next((a for a in whole._topology.attrs if a.attrname == name), None)
+    return attribute is None or bool(attribute.is_guessed)
+
+
+def _texts(holder: Any, name: str, n: int) -> NDArray[np.str_]:
+    if not hasattr(holder, name):
+        return np.full(n, "")
+    values = np.asarray(getattr(holder, name))
+    return values.astype(str) if n else np.zeros(0, dtype="U1")
+
+
+def _file(whole: Any) -> str:
+    return str(getattr(whole, "filename", None) or "of the Universe")

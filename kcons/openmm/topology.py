@@ -1,0 +1,250 @@
+"""Topologies of OpenMM: `openmm.app.Topology` with positions, rows by name, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology import Snapshot, Topology, sorted_pairs
+
+__all__ = ["constraints_of", "openmm_topology", "snapshot_of"]
+
+#: One angstrom in nm.
+ANGSTROM = 0.1
+_REMEDY = "give a Topology with bonds (createStandardBonds, addBond)"
+
+
+def constraints_of(
+    topology: Any,
+    positions: unit.Quantity | ArrayLike,
+    constrain: str | None = "hbonds",
+    *,
+    system: openmm.System | None = None,
+    rigid_water: bool = True,
+    water_names: Iterable[str] = (),
+    water_geometry: str | tuple[float, float] | None = None,
+    rigid_residues: Iterable[str] = (),
+    rigid_bodies: Iterable[Sequence[int] | IntArray] = (),
+    on: Mapping[Any, RowMaker] | None = None,
+    select: ArrayLike | str = "all",
+    angles: Literal["angles", "distances"] = "angles",
+    guess_bonds: bool | Literal["missing"] = "missing",
+) -> HeldRows:
+    """Rows by name for an OpenMM Topology, in nm; give them to `kcons.openmm.hold`.
+
+    Parameters
+    ----------
+    topology : openmm.app.Topology
+    positions : Quantity or array_like, shape (n_atoms, 3)
+        Plain numbers are in nm.
+    constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
+        See `kcons.held_rows.held_rows`.
+    system : openmm.System, optional
+        Where the masses are taken from; otherwise they are those of the elements.
+    on : mapping, optional
+        Tuples of atoms -> callable that makes a row of them.
+    select : 'all', mask or atoms
+        Rows are kept if all of their atoms are among these.
+    guess_bonds : bool or 'missing'
+
+    Returns
+    -------
+    HeldRows
+        A list of constraints; ``.constraint_set`` has them as a set.
+
+    Raises
+    ------
+    InputError
+        As `held_rows`.
+    """
+    snapshot = snapshot_of(topology, positions, system=system)
+    n = snapshot.topology.n_atoms
+    selected = None
+    if not (isinstance(select, str) and select == "all"):
+        selected = np.zeros(n, dtype=bool)
+        selected[_numbers(select, n)] = True
+    return held_rows(
+        snapshot,
+        constrain,
+        rigid_water=rigid_water,
+        water_names=water_names,
+        water_geometry=water_geometry,
+        rigid_residues=rigid_residues,
+        rigid_bodies=rigid_bodies,
+        on=as_makers(on, lambda key: _numbers(key, n)),
+        selected=selected,
+        angles=angles,
+        guess=guess_bonds,
+        remedy=_REMEDY,
+    )
+
+
+def snapshot_of(
+    topology: Any,
+    positions: unit.Quantity | ArrayLike,
+    *,
+    system: openmm.System | None = None,
+    velocities: unit.Quantity | ArrayLike | None = None,
+    box: Any = None,
+) -> Snapshot:
+    """Topology, positions, box of OpenMM; in nm.
+
+    Parameters
+    ----------
+    system : openmm.System, optional
+        For masses and charges, and for the box if the Topology has none.
+    velocities : Quantity or array_like, optional
+        Plain numbers are in nm/ps.
+    box : box vectors, optional
+        In place of those of the Topology.
+
+    Raises
+    ------
+    InputError
+        Different numbers of atoms.
+    """
+    atoms = list(topology.atoms())
+    n = len(atoms)
+    x = _plain(positions, unit.nanometer)
+    if x.shape != (n, 3):
+        raise InputError(
+            f"the Topology has {n} atoms, but positions have shape {x.shape}; give those of the same system",
+            item="positions",
+        )
+    residues = list(topology.residues())
+    elements = np.array([a.element.symbol if a.element is not None else "" for a in atoms] or [""])[:n]
+    elements = np.where(elements == "D", "H", elements)
+    if system is None:
+        weights = {a.element: a.element.mass._value for a in atoms if a.element is not None}
+        masses = np.array([weights.get(a.element, 0.0) for a in atoms])
+        charges = None
+    else:
+        if system.getNumParticles() != n:
+            raise InputError(
+                f"the Topology has {n} atoms, the System {system.getNumParticles()} particles", item="system"
+            )
+        masses = np.array([system.getParticleMass(k)._value for k in range(n)])
+        charges = _charges(system)
+    described = Topology(
+        names=np.array([a.name for a in atoms] or [""])[:n],
+        elements=elements,
+        masses=masses,
+        residues=np.array([a.residue.index for a in atoms], dtype=np.int64),
+        residue_names=np.array([r.name for r in residues] or [""])[: len(residues)],
+        residue_ids=np.array([str(r.id) for r in residues] or [""])[: len(residues)],
+        chains=np.array([str(r.chain.id) for r in residues] or [""])[: len(residues)],
+        bonds=sorted_pairs([(b[0].index, b[1].index) for b in topology.bonds()]),
+        charges=charges,
+    )
+    vectors = box if box is not None else topology.getPeriodicBoxVectors()
+    if vectors is None and system is not None and system.usesPeriodicBoundaryConditions():
+        vectors = system.getDefaultPeriodicBoxVectors()
+    cell = None if vectors is None else _plain(vectors, unit.nanometer)
+    # One angstrom on all sides is what files without a box say.
+    if cell is not None and np.diag(cell).max() < 0.2:
+        cell = None
+    return Snapshot(
+        described,
+        x,
+        ANGSTROM,
+        cell,
+        np.full(3, cell is not None),
+        None if velocities is None else _plain(velocities, unit.nanometer / unit.picosecond),
+        "OpenMM Topology",
+    )
+
+
+def openmm_topology(snapshot: Snapshot) -> tuple[Any, unit.Quantity]:
+    """An `openmm.app.Topology` with residues, bonds and box, and the positions."""
+    from openmm import app
+
+    snapshot = snapshot.in_unit(ANGSTROM)
+    described = snapshot.topology
+    topology = app.Topology()
+    symbols = {s: app.Element.getBySymbol(s) for s in set(described.elements.tolist()) if s}
+    members: list[list[int]] = [[] for _ in range(described.n_residues)]
+    for atom, residue in enumerate(described.residues.tolist()):
+        members[residue].append(atom)
+    flat = [a for group in members for a in group]
+    if flat != list(range(described.n_atoms)):
+        raise InputError(
+            "OpenMM keeps the atoms of a residue together, here they are scattered; sort the atoms by residue",
+            item="atoms",
+        )
+    made: list[Any] = []
+    chain, last = None, None
+    names, elements = described.names.tolist(), described.elements.tolist()
+    for residue, group in enumerate(members):
+        if chain is None or described.chains[residue] != last:
+            last = described.chains[residue]
+            chain = topology.addChain(str(last) or None)
+        entry = topology.addResidue(str(described.residue_names[residue]), chain, str(described.residue_ids[residue]))
+        made += [topology.addAtom(names[a], symbols.get(elements[a]), entry) for a in group]
+    for i, j in described.bonds.tolist():
+        topology.addBond(made[i], made[j])
+    if snapshot.cell is not None:
+        topology.setPeriodicBoxVectors(reduced(snapshot.cell) * unit.nanometer)
+    return topology, snapshot.positions * unit.nanometer
+
+
+def reduced(cell: FloatArray) -> FloatArray:
+    """The same lattice as OpenMM wants it: lower triangular, and the vectors as short as that allows.
+
+    Raises
+    ------
+    InputError
+        A cell that would have to be turned, which would turn the positions too.
+    """
+    size = float(np.abs(cell).max())
+    if np.abs(np.triu(cell, 1)).max() > 1e-6 * size or np.diag(cell).min() <= 0:
+        raise InputError(
+            "OpenMM wants the first cell vector along x, the second in the xy plane; turn cell and positions "
+            "(ase: atoms.cell.standard_form()) before",
+            item="cell",
+        )
+    a, b, c = np.tril(cell)
+    c = c - b * np.round(c[1] / b[1])
+    c = c - a * np.round(c[0] / a[0])
+    b = b - a * np.round(b[0] / a[0])
+    return np.stack([a, b, c])
+
+
+def _charges(system: openmm.System) -> FloatArray | None:
+    for force in system.getForces():
+        if isinstance(force, openmm.NonbondedForce):
+            return np.array([force.getParticleParameters(k)[0]._value for k in range(system.getNumParticles())])
+    return None
+
+
+def _plain(values: Any, wanted: Any) -> FloatArray:
+    if unit.is_quantity(values):
+        return np.array(values.value_in_unit(wanted), dtype=np.float64)
+    if isinstance(values, list | tuple) and len(values) and unit.is_quantity(values[0]):
+        return np.array([v.value_in_unit(wanted) for v in values], dtype=np.float64)
+    return np.array(values, dtype=np.float64)
+
+
+def _numbers(select: Any, n: int) -> IntArray:
+    given = np.asarray(select)
+    if given.dtype == bool and given.shape == (n,):
+        given = np.flatnonzero(given)
+    if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
+        raise InputError(
+            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
+            "for kcons.mdanalysis",
+            item="select",
+        )
+    if not given.size:
+        raise InputError("the selection has no atoms; widen it", item="select")
+    if given.min() < 0 or given.max() >= n:
+        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
+    return given.astype(np.int64)

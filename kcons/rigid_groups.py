@@ -1,0 +1,358 @@
+"""Rigid groups of atoms as rows: water, residues, bodies; linear and planar ones by linear rows.
+
+A rigid body of n atoms needs 3n - 6 rows. All of its distances would be far more, and where it is linear or planar
+they are singular. So a few atoms, the bases, keep their distances, and every other atom is tied to the bases by
+x_a = sum w_i x_i (`LinearRelation`): two bases for atoms on a line, three in a plane, four in space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraints import Constraint, Distance, LinearRelation
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, SingularGeometryError
+from kcons.topology import Snapshot, listed, near_misses
+from kcons.virtual_sites import VirtualSites, fitted
+
+#: Residues that are water, and the molecule when there are no residues.
+WATER = frozenset(
+    ["HOH", "H2O", "WAT", "SOL", "DOD", "OH2", "HHO", "OHH", "TIP", "TIP2", "TIP3", "TIP3P", "TIP4", "TIP4P", "TIP4E"]
+    + ["TIP5", "TIP5P", "T3P", "T4P", "T5P", "T3H", "T4E", "TP3", "TP4", "TP5", "TP3M", "TIPS", "SPC", "SPCE", "SPC/E"]
+    + ["OPC", "OPC3"]
+)
+#: O-H length (angstrom), H-O-H angle (degrees), O-M length (angstrom) of named models.
+GEOMETRIES: dict[str, tuple[float, float, float]] = {
+    "spc": (1.0, np.degrees(np.arccos(-1 / 3)), 0.0),
+    "spce": (1.0, np.degrees(np.arccos(-1 / 3)), 0.0),
+    "tip3p": (0.9572, 104.52, 0.0),
+    "tip4p": (0.9572, 104.52, 0.15),
+    "tip4pew": (0.9572, 104.52, 0.125),
+    "tip4p2005": (0.9572, 104.52, 0.1546),
+    "tip4pice": (0.9572, 104.52, 0.1577),
+    "tip5p": (0.9572, 104.52, 0.0),
+    "opc": (0.8724, 103.6, 0.1594),
+    "opc3": (0.97888, 109.47, 0.0),
+}
+#: Extent across a line or a plane, relative to the extent along it, that still counts as flat: what three decimals
+#: of a file leave of a ring that was planar.
+FLAT = 2e-3
+#: Bases are the first atoms that are this close to the best.
+_AS_GOOD = 1 - 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Waters:
+    """Rigid waters of a system.
+
+    Attributes
+    ----------
+    triples : ndarray of int, shape (n, 3)
+        Oxygen and hydrogens.
+    sites : VirtualSites
+    """
+
+    triples: IntArray
+    sites: VirtualSites
+
+    def rows(self, geometry: tuple[float, float] | None, angstrom: float) -> list[Constraint]:
+        """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""
+        if not len(self.triples):
+            return []
+        pairs = self.triples[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
+        if geometry is None:
+            return [Distance(pairs)]
+        length, angle = geometry
+        lengths = np.array([length, length, 2 * length * np.sin(np.radians(angle) / 2)]) * angstrom
+        return [Distance(pairs, np.tile(lengths, len(self.triples)))]
+
+
+def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: float = 0.0) -> Waters:
+    """Waters by residue name and composition: one oxygen, two hydrogens, massless sites.
+
+    Waters of one oxygen alone, as in crystal structures, are left out.
+
+    Parameters
+    ----------
+    names : frozenset of str
+        Residue names, in capitals.
+    model_site : float
+        Length O-M in angstrom where the geometry was given by name; 0 takes the sites where they are.
+
+    Raises
+    ------
+    InputError
+        A residue that is called water and is composed otherwise; it is named.
+    """
+    topology = snapshot.topology
+    kinds, kind = np.unique(topology.residue_names, return_inverse=True)
+    called = np.isin(np.char.upper(np.char.strip(kinds)), list(names))[kind]
+    atoms = np.flatnonzero(called[topology.residues])
+    number, residue = np.unique(topology.residues[atoms], return_inverse=True)
+    symbol = topology.elements[atoms]
+    oxygen, hydrogen = symbol == "O", symbol == "H"
+    # Anything else counts as a site if it is neither of these elements and has no mass, or no element.
+    site = ~oxygen & ~hydrogen & ((symbol == "") | (topology.masses[atoms] == 0))
+    count = [
+        np.bincount(residue, weights=mask, minlength=len(number)) for mask in (oxygen, hydrogen, site, symbol != "?")
+    ]
+    whole = (count[0] == 1) & (count[1] == 2) & (count[0] + count[1] + count[2] == count[3])
+    alone = (count[0] == 1) & (count[3] == 1)
+    odd = np.flatnonzero(~whole & ~alone)
+    if len(odd):
+        where = atoms[residue == odd[0]]
+        raise InputError(
+            f"residue {topology.residue_name(int(number[odd[0]]))} (atoms {where[0]} to {where[-1]}) is called water "
+            f"but has the atoms {listed(topology.names[where])}, with {int(count[0][odd[0]])} oxygens and "
+            f"{int(count[1][odd[0]])} hydrogens; rename it, mend the file, or pass rigid_water=False",
+            item="rigid_water",
+            atoms=where.tolist(),
+        )
+    member = whole[residue]
+    # Atoms of a residue in their order, so that oxygen comes before its hydrogens in the triples.
+    o = atoms[member & oxygen]
+    h = atoms[member & hydrogen]
+    triples = np.zeros((len(o), 3), np.int64)
+    triples[:, 0] = o[np.argsort(residue[member & oxygen], kind="stable")]
+    triples[:, 1:] = h[np.argsort(residue[member & hydrogen], kind="stable")].reshape(-1, 2)
+    rank = np.cumsum(whole) - 1
+    sites = atoms[member & site]
+    parents = triples[rank[residue[member & site]]]
+    return Waters(triples, _water_sites(snapshot, sites, parents, number[residue[member & site]], model_site))
+
+
+def _water_sites(
+    snapshot: Snapshot, sites: IntArray, parents: IntArray, residue: IntArray, model_site: float
+) -> VirtualSites:
+    """The sites with one set of coefficients for each name, the median of all molecules, mirrored where it may be."""
+    if not len(sites):
+        return VirtualSites(sites, parents, np.zeros((0, 3)))
+    r = whole_groups(snapshot, np.column_stack([parents, sites]))
+    found = fitted(sites, parents, r[:, 3], r[:, :3]).coefficients
+    u, w = r[:, 1] - r[:, 0], r[:, 2] - r[:, 0]
+    topology = snapshot.topology
+    key = np.char.add(np.char.add(topology.residue_names[residue], "/"), topology.names[sites])
+    for name in np.unique(key):
+        these = key == name
+        a, b, c = np.median(found[these], axis=0)
+        a = b = 0.5 * (a + b)
+        height = abs(c) * float(np.median(np.linalg.norm(np.cross(u[these], w[these]), axis=1)))
+        in_plane = height < 0.05 * snapshot.angstrom
+        if model_site and in_plane:
+            middle = np.linalg.norm(0.5 * (u[these] + w[these]), axis=1)
+            a = b = 0.5 * model_site * snapshot.angstrom / float(np.median(middle))
+        found[these] = (a, b, 0.0 if in_plane else c)
+    return VirtualSites(sites, parents, found)
+
+
+# -- bodies ---------------------------------------------------------------------------------------
+
+
+def residue_bodies(snapshot: Snapshot, names: Sequence[str]) -> list[IntArray]:
+    """The atoms of the residues with these names, one array of shape (n_residues, n_atoms) for each size.
+
+    Raises
+    ------
+    InputError
+        A name that no residue has.
+    """
+    topology = snapshot.topology
+    present = np.char.upper(np.char.strip(topology.residue_names))
+    chosen = np.zeros(len(present), dtype=bool)
+    for name in names:
+        same = present == str(name).strip().upper()
+        if not same.any():
+            raise InputError(
+                f"no residue is called {name}{near_misses(str(name), present)}; there are "
+                + listed(topology.residue_names),
+                item="rigid_residues",
+            )
+        chosen |= same
+    # Virtual sites follow the others by themselves.
+    real = (topology.masses > 0) | (topology.elements != "")
+    atoms = np.flatnonzero(chosen[topology.residues] & real)
+    atoms = atoms[np.argsort(topology.residues[atoms], kind="stable")]
+    _, size = np.unique(topology.residues[atoms], return_counts=True)
+    starts = np.cumsum(size) - size
+    return [atoms[starts[size == n][:, None] + np.arange(n)] for n in np.unique(size).tolist() if n > 1]
+
+
+def listed_bodies(snapshot: Snapshot, bodies: Sequence[Sequence[int] | IntArray]) -> list[IntArray]:
+    """Checked lists of atoms, grouped by their size.
+
+    Raises
+    ------
+    InputError
+        Atoms that do not exist or come twice; bodies of one atom.
+    """
+    by_size: dict[int, list[IntArray]] = {}
+    n = snapshot.topology.n_atoms
+    for k, body in enumerate(bodies):
+        atoms = np.asarray(body)
+        if atoms.dtype == bool and atoms.shape == (n,):
+            atoms = np.flatnonzero(atoms)
+        if atoms.ndim != 1 or len(atoms) < 2 or not np.issubdtype(atoms.dtype, np.integer):
+            raise InputError(
+                f"rigid body {k} has shape {atoms.shape}; give the numbers of two atoms or more", item="rigid_bodies"
+            )
+        atoms = np.sort(atoms.astype(np.int64))
+        if atoms[0] < 0 or atoms[-1] >= n:
+            raise InputError(
+                f"rigid body {k} names atom {atoms[0] if atoms[0] < 0 else atoms[-1]}; there are atoms 0 to {n - 1}",
+                item="rigid_bodies",
+            )
+        if (np.diff(atoms) == 0).any():
+            twice = int(atoms[np.argmax(np.diff(atoms) == 0)])
+            raise InputError(f"rigid body {k} names atom {twice} twice", item="rigid_bodies", atoms=[twice])
+        by_size.setdefault(len(atoms), []).append(atoms)
+    return [np.array(group) for _, group in sorted(by_size.items())]
+
+
+def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT) -> list[Constraint]:
+    """Rows that hold every group rigid: distances between bases, and relations for all other atoms.
+
+    Parameters
+    ----------
+    groups : sequence of ndarray, shape (n_bodies, n_atoms)
+        Bodies of one size each.
+    flat : float
+        Extent across a line or a plane, relative to that along it, up to which a body is held as linear or planar.
+        It is then held exactly flat, so that positions may be off by that much.
+
+    Raises
+    ------
+    SingularGeometryError
+        Two atoms of a body at one point.
+    """
+    pairs: list[IntArray] = []
+    lengths: list[FloatArray] = []
+    tied: dict[int, list[tuple[IntArray, IntArray, FloatArray]]] = {2: [], 3: [], 4: []}
+    for atoms in groups:
+        r = whole_groups(snapshot, atoms)
+        center = r.mean(axis=1, keepdims=True)
+        _, s, axes = np.linalg.svd(r - center, full_matrices=False)
+        if atoms.shape[1] == 2:
+            dimension = np.ones(len(atoms), dtype=np.int64)
+        else:
+            dimension = 1 + (s[:, 1:3] > flat * s[:, :1]).sum(axis=1)
+        _refuse_coincident(snapshot, atoms, s)
+        for d in np.unique(dimension).tolist():
+            these = np.flatnonzero(dimension == d)
+            along = axes[these, :d]
+            y = (r[these] - center[these]) @ np.swapaxes(along, 1, 2)
+            bases = _bases(y)
+            corners = np.take_along_axis(y, bases[:, :, None], axis=1)
+            own = np.take_along_axis(atoms[these], bases, axis=1)
+            i, j = np.triu_indices(d + 1, 1)
+            pairs.append(own[:, np.stack([i, j], axis=1)].reshape(-1, 2))
+            lengths.append(np.linalg.norm(corners[:, i] - corners[:, j], axis=2).ravel())
+            n = atoms.shape[1]
+            if n == d + 1:
+                continue
+            others = np.ones((len(these), n), dtype=bool)
+            np.put_along_axis(others, bases, False, axis=1)
+            rest = y[others].reshape(len(these), n - d - 1, d)
+            edges = corners[:, 1:] - corners[:, :1]
+            # rest - corner_0 = sum_i w_i edge_i
+            w = np.linalg.solve(np.swapaxes(edges, 1, 2), np.swapaxes(rest - corners[:, :1], 1, 2))
+            w = np.swapaxes(w, 1, 2)
+            w = np.concatenate([1 - w.sum(axis=2, keepdims=True), w], axis=2)
+            tied[d + 1].append(
+                (
+                    atoms[these][others],
+                    np.repeat(own[:, None], n - d - 1, axis=1).reshape(-1, d + 1),
+                    w.reshape(-1, d + 1),
+                )
+            )
+    rows: list[Constraint] = []
+    if pairs:
+        joined, first = _each_once(np.concatenate(pairs))
+        rows.append(Distance(joined, np.concatenate(lengths)[first]))
+    for parts in tied.values():
+        if parts:
+            rows.append(LinearRelation(*(np.concatenate([part[k] for part in parts]) for k in range(3))))
+    return rows
+
+
+def _bases(y: FloatArray) -> IntArray:
+    """d + 1 atoms far apart from each other, one after the other, ascending; y has shape (n_bodies, n_atoms, d)."""
+    many, n, d = y.shape
+    if n == d + 1:
+        return np.tile(np.arange(n), (many, 1))
+    row = np.arange(many)
+    chosen = [_farthest(np.linalg.norm(y - y.mean(axis=1, keepdims=True), axis=2))]
+    away = y - y[row, chosen[0]][:, None]
+    for _ in range(d):
+        far = _farthest(np.linalg.norm(away, axis=2))
+        chosen.append(far)
+        direction = away[row, far]
+        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        # What is left is normal to the bases so far.
+        away = away - np.einsum("bnd,bd->bn", away, direction)[:, :, None] * direction[:, None]
+    return np.sort(np.stack(chosen, axis=1), axis=1)
+
+
+def _farthest(distance: FloatArray) -> IntArray:
+    """The first atom as far as the farthest, up to rounding: the same choice whatever the unit of length."""
+    return np.argmax(distance >= _AS_GOOD * distance.max(axis=1, keepdims=True), axis=1).astype(np.int64)
+
+
+def _each_once(pairs: IntArray) -> tuple[IntArray, IntArray]:
+    """Pairs sorted within and listed once, in their order, and where they came first."""
+    ordered = np.sort(pairs, axis=1)
+    code = ordered[:, 0] * (int(ordered.max()) + 1) + ordered[:, 1]
+    _, first = np.unique(code, return_index=True)
+    first = np.sort(first)
+    return ordered[first], first
+
+
+def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> None:
+    points = np.flatnonzero(s[:, 0] < 1e-6 * snapshot.angstrom)
+    if len(points):
+        body = atoms[points[0]]
+        raise SingularGeometryError(
+            f"the atoms of a rigid body coincide: {snapshot.topology.atom_name(int(body[0]))} and "
+            f"{snapshot.topology.atom_name(int(body[1]))}; give positions",
+            atoms=body.tolist(),
+        )
+
+
+def whole_groups(snapshot: Snapshot, atoms: IntArray) -> FloatArray:
+    """Positions of groups, each made whole by minimum images from atom to atom, shape (n, width, 3)."""
+    r = snapshot.positions[atoms]
+    if snapshot.cell is None or not snapshot.pbc.any():
+        return r
+    steps = minimum_image(snapshot, np.diff(r, axis=1))
+    r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
+    return r
+
+
+def minimum_image(snapshot: Snapshot, d: FloatArray) -> FloatArray:
+    """Shortest images of difference vectors, shape (..., 3)."""
+    if snapshot.cell is None or not snapshot.pbc.any():
+        return d
+    cell = snapshot.cell.copy()
+    axes = np.flatnonzero(snapshot.pbc)
+    if len(axes) < 3:
+        cell[~snapshot.pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
+    inverse = np.linalg.inv(cell)
+    inverse[:, ~snapshot.pbc] = 0.0
+    return d - np.round(d @ inverse) @ cell
+
+
+def inside_bodies(n_atoms: int, pairs: IntArray, groups: Sequence[IntArray]) -> IntArray:
+    """Which of the pairs lie within one body, a mask of shape (n_pairs,)."""
+    inside = np.zeros(len(pairs), dtype=bool)
+    for atoms in groups:
+        # Atoms may belong to several bodies: those are looked at one by one.
+        body = np.full(n_atoms, -1, dtype=np.int64)
+        body[atoms.ravel()] = np.repeat(np.arange(len(atoms)), atoms.shape[1])
+        inside |= (body[pairs] >= 0).all(axis=1) & (body[pairs[:, 0]] == body[pairs[:, -1]])
+        if len(np.unique(atoms)) < atoms.size:
+            for one in atoms:
+                inside |= np.isin(pairs, one).all(axis=1)
+    return inside
