@@ -51,18 +51,29 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
-    scene_help = "one of the built-in scenes, --list shows them; or a PDB or mmCIF file"
+    scene_help = "one of the built-in scenes, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("scene", nargs="?", help=scene_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
     molecules = common.add_argument_group("molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files")
-    molecules.add_argument("--constrain", choices=("hbonds", "allbonds", "hangles"), help="(default hbonds for files)")
+    molecules.add_argument(
+        "--constrain",
+        choices=("hbonds", "allbonds", "hangles", "allangles", "none"),
+        help="beside rigid water (default hbonds for files; the last two for files that MDAnalysis reads)",
+    )
     molecules.add_argument(
         "--forcefield", nargs="+", metavar="XML", help="files of OpenMM (default amber14-all.xml amber14/tip3pfb.xml)"
     )
     molecules.add_argument("--add-hydrogens", action="store_true", help="that a file lacks, at pH 7")
     molecules.add_argument("--platform", help="of OpenMM (default: Reference up to 200 atoms, CPU above)")
+    files = common.add_argument_group("any file that MDAnalysis reads; these options make it read PDB files, too")
+    files.add_argument("--coordinates", type=Path, metavar="FILE", help="coordinates of a topology without")
+    files.add_argument(
+        "--forces", help="openmm (default), emt, lj, tip3p, gfn1, gfn2, or another calculator of ASE; not for plan"
+    )
+    files.add_argument("--select", metavar="WORDS", help="hold only what is within this selection of MDAnalysis")
+    files.add_argument("--rigid-residues", nargs="+", metavar="NAME", help="residues held rigid")
     common.add_argument("--list", action="store_true", help="list scenes and methods, and leave")
 
     compare = commands.add_parser(
@@ -263,7 +274,7 @@ def _check_scene(chosen: argparse.Namespace) -> None:
     known = ", ".join((*scenes.SCENES, *scenes.FLUIDS))
     if chosen.scene is None:
         raise InputError(f"name a scene: {known}; or a PDB file", item="scene")
-    if scenes.is_file(chosen.scene):
+    if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
         if not Path(chosen.scene).is_file():
             raise InputError(f"there is no file {chosen.scene}", item="scene")
         if chosen.size is not None:
@@ -281,6 +292,10 @@ def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
         "force_field": chosen.forcefield,
         "add_hydrogens": chosen.add_hydrogens or None,
         "platform": chosen.platform,
+        "coordinates": chosen.coordinates,
+        "forces": chosen.forces,
+        "select": chosen.select,
+        "rigid_residues": chosen.rigid_residues,
     }
     return {name: value for name, value in said.items() if value is not None}
 
@@ -288,10 +303,14 @@ def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
 def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
     from kcons import scenes
 
-    if scenes.is_file(chosen.scene):
+    if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
+        if chosen.add_hydrogens and scenes.by_mdanalysis(chosen.scene, _molecules(chosen)):
+            raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
         return scenes.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
     if chosen.add_hydrogens:
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
+    for name in sorted(scenes.FILE_OPTIONS & set(_molecules(chosen))):
+        raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in scenes", item=name)
     return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
@@ -329,6 +348,9 @@ def _plan(chosen: argparse.Namespace) -> int:
     from kcons import scenes
 
     _check_scene(chosen)
+    given = _molecules(chosen)
+    if scenes.is_other_file(chosen.scene) and scenes.by_mdanalysis(chosen.scene, given):
+        return _plan_file(chosen, given)
     if chosen.scene in scenes.FLUIDS:
         fluid = _fluid(chosen)
         print(fluid.title)
@@ -340,6 +362,25 @@ def _plan(chosen: argparse.Namespace) -> int:
     return 0
 
 
+def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
+    """Nothing but the rows: no forces are needed."""
+    from kcons.scenes import any_file
+
+    for name in ("forces", "force_field", "platform", "add_hydrogens"):
+        if name in given:
+            option = name.replace("_", "-") if name == "add_hydrogens" else name.replace("_", "")
+            raise InputError(f"a plan needs no forces; leave --{option} out", item=name)
+    found = any_file.plan(chosen.scene, **given)
+    print(found.title)
+    for note in found.notes:
+        print(note)
+    sites = len(found.rows.virtual_sites)
+    if sites:
+        print(f"{sites:,} virtual sites, placed by their molecules")
+    print(found.motion.report(found.positions))
+    return 0
+
+
 def _list() -> int:
     from kcons import methods, sampling, scenes
 
@@ -347,6 +388,7 @@ def _list() -> int:
     for name, entry in scenes.SCENES.items():
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
     print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
+    print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
     print("methods")
     for name, method in methods.METHODS.items():
         print(f"  {name:<27} {method.title}{_when(method)}")

@@ -20,7 +20,7 @@ STRETCH = 1.25
 COINCIDENT = 0.3
 
 
-def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
+def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolArray | None = None) -> IntArray:
     """Bonds that the distances suggest, shape (n, 2).
 
     Two atoms are bonded if they are closer than 1.25 times the sum of their covalent radii, under minimum images. A
@@ -32,6 +32,9 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
     atoms : ndarray of bool, shape (n_atoms,), optional
         Bonds are returned where at least one of the two atoms is marked.
 
+    among : ndarray of bool, shape (n_atoms,), optional
+        Only these atoms form bonds.
+
     Raises
     ------
     InputError
@@ -41,7 +44,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
     radius = np.zeros(topology.n_atoms)
     for symbol, value in RADII.items():
         radius[topology.elements == symbol] = value
-    able = np.flatnonzero(radius > 0)
+    able = np.flatnonzero((radius > 0) if among is None else (radius > 0) & among)
     if topology.n_atoms and not (topology.elements != "").any():
         raise InputError(
             "there are no bonds and no elements to guess them from; give a topology with bonds, or elements",
@@ -55,7 +58,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
     if len(able) < 2:
         return np.zeros((0, 2), np.int64)
     cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
-    reach = 2 * STRETCH * float(radius.max())
+    reach = 2 * STRETCH * float(radius[able].max())
     pairs, away = _close(x[able], cell, snapshot.pbc, reach)
     pairs = able[pairs]
     i, j = pairs.T

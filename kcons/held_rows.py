@@ -27,11 +27,11 @@ from kcons.rigid_groups import (
     find_waters,
     inside_bodies,
     listed_bodies,
-    minimum_image,
     residue_bodies,
 )
 from kcons.topology import BoolArray, Snapshot, Topology, near_misses, sorted_pairs
 from kcons.virtual_sites import VirtualSites
+from kcons.whole import minimum_image
 
 #: What can be held by name, and what that means.
 CONSTRAIN: dict[str, str] = {
@@ -173,16 +173,22 @@ def held_rows(
     geometry, model_site = _geometry(water_geometry)
     if not (kind != "none" or rigid_water or residues or bodies or on):
         raise InputError("nothing is to be held; name bonds, water, residues, bodies or rows", item="constrain")
-    # Without residues, molecules decide what is water, and bonds what are molecules.
-    needs_bonds = kind != "none" or ((rigid_water or residues) and not snapshot.topology.residues_known)
+    called = WATER | {str(n).strip().upper() for n in water_names} if rigid_water else frozenset()
+    nowhere = np.zeros(snapshot.topology.n_atoms, dtype=bool)
     guessed = 0
-    if needs_bonds:
-        snapshot, guessed = _with_bonds(snapshot, guess, remedy)
-    if not snapshot.topology.residues_known:
+    if snapshot.topology.residues_known:
+        waters = find_waters(snapshot, called, model_site)
+        if kind != "none":
+            # The bonds of rigid water are known; guessing them would take most of the time.
+            snapshot = _with_water_bonds(snapshot, waters.triples)
+            nowhere[waters.triples] = nowhere[waters.sites.sites] = True
+            snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
+    else:
+        # Molecules take the place of residues, and bonds make molecules.
+        if kind != "none" or rigid_water or residues:
+            snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
         snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
-    waters = find_waters(
-        snapshot, WATER | {str(n).strip().upper() for n in water_names} if rigid_water else frozenset(), model_site
-    )
+        waters = find_waters(snapshot, called, model_site)
     if selected is not None:
         inside = selected[waters.triples].all(axis=1)
         seen = selected[waters.sites.parents].all(axis=1)
@@ -213,7 +219,7 @@ def held_rows(
     )
     if guessed:
         warnings.warn(
-            f"{guessed} of {len(snapshot.topology.bonds)} bonds were guessed from distances and covalent radii, since "
+            f"{guessed} bonds were guessed from distances and covalent radii, since "
             f"the {snapshot.host or 'topology'} does not have them; {remedy}, or pass guess_bonds=False to refuse",
             UserWarning,
             stacklevel=3,
@@ -245,34 +251,42 @@ def _geometry(given: str | tuple[float, float] | None) -> tuple[tuple[float, flo
 # -- bonds ----------------------------------------------------------------------------------------
 
 
-def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str) -> tuple[Snapshot, int]:
-    """The snapshot with bonds, and how many of them are guessed."""
+def _with_water_bonds(snapshot: Snapshot, triples: IntArray) -> Snapshot:
+    if not len(triples):
+        return snapshot
+    known = snapshot.topology.bonds
+    both = np.concatenate([known, triples[:, [[0, 1], [0, 2]]].reshape(-1, 2)])
+    return replace(snapshot, topology=snapshot.topology.with_bonds(both))
+
+
+def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: BoolArray) -> tuple[Snapshot, int]:
+    """The snapshot with bonds, and how many of them are guessed; `settled` atoms have theirs."""
     topology = snapshot.topology
-    n = topology.n_atoms
-    if guess is True:
-        found = guess_bonds(snapshot)
-        return replace(snapshot, topology=topology.with_bonds(found)), len(found)
-    bonded = np.zeros(n, dtype=bool)
+    bonded = settled.copy()
     bonded[topology.bonds] = True
     size = np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues]
     # Ions and united atoms have no bonds, hydrogens always have.
-    lacking = ~bonded & ((size > 1) | ~np.bool_(topology.residues_known)) & (topology.elements != "")
-    if not lacking.any() and len(topology.bonds):
+    lacking = ~bonded & (topology.elements != "")
+    if topology.residues_known:
+        lacking &= size > 1
+    if guess is True:
+        known = topology.bonds[settled[topology.bonds].any(axis=1)]
+        found = guess_bonds(snapshot, ~settled, ~settled)
+        both = sorted_pairs(np.concatenate([known, found]))
+        return replace(snapshot, topology=topology.with_bonds(both)), len(found)
+    if not lacking.any():
         return snapshot, 0
     if guess is False:
-        if len(topology.bonds):
-            atom = int(np.argmax(lacking))
-            raise InputError(
-                f"{topology.atom_name(atom)} has no bond, as {int(lacking.sum())} atoms; {remedy}, or let them be "
-                "guessed (guess_bonds='missing')",
-                item="bonds",
-                atoms=[atom],
-            )
+        atom = int(np.argmax(lacking))
+        others = f", nor have {int(lacking.sum()) - 1} others" if lacking.sum() > 1 else ""
+        where = f"the {snapshot.host}" if snapshot.host else "the topology"
         raise InputError(
-            f"the {snapshot.host or 'topology'} has no bonds; {remedy}, or let them be guessed (guess_bonds='missing')",
+            f"{where} has no bonds of {topology.atom_name(atom)}{others}; {remedy}, or let them be guessed "
+            "(guess_bonds='missing')",
             item="bonds",
+            atoms=[atom],
         )
-    found = guess_bonds(snapshot, lacking)
+    found = guess_bonds(snapshot, lacking, ~settled)
     both = sorted_pairs(np.concatenate([topology.bonds, found]))
     return replace(snapshot, topology=topology.with_bonds(both)), len(both) - len(topology.bonds)
 

@@ -3,6 +3,26 @@
 Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
 """
 
+from kcons.mdanalysis.conversions import (
+    ase_to_openmm,
+    from_ase,
+    from_openmm,
+    openmm_to_ase,
+    to_ase,
+    to_openmm,
+    universe_of,
+)
 from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
 
-__all__ = ["constraints_of", "selected", "snapshot_of"]
+__all__ = [
+    "ase_to_openmm",
+    "constraints_of",
+    "from_ase",
+    "from_openmm",
+    "openmm_to_ase",
+    "selected",
+    "snapshot_of",
+    "to_ase",
+    "to_openmm",
+    "universe_of",
+]

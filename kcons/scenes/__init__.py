@@ -14,12 +14,26 @@ from kcons.scenes.scene import Reference, Scene, Units
 if TYPE_CHECKING:
     from kcons.scenes.fluid import Fluid
 
-__all__ = ["FLUIDS", "SCENES", "Entry", "Reference", "Scene", "Units", "build", "build_fluid", "from_file", "is_file"]
+__all__ = [
+    "FLUIDS",
+    "SCENES",
+    "Entry",
+    "Reference",
+    "Scene",
+    "Units",
+    "build",
+    "build_fluid",
+    "from_file",
+    "is_file",
+    "is_other_file",
+]
 
 #: Files that are read as molecules.
 SUFFIXES = (".pdb", ".ent", ".cif", ".pdbx", ".mmcif")
 #: What can be chosen for molecules with forces of OpenMM only.
 STRUCTURE_OPTIONS = frozenset({"constrain", "force_field", "platform", "add_hydrogens"})
+#: What can be chosen for files that MDAnalysis reads only.
+FILE_OPTIONS = frozenset({"coordinates", "forces", "select", "rigid_residues"})
 
 
 @dataclass(frozen=True)
@@ -144,7 +158,7 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
 
 
 def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:
-    """The molecules of a PDB or mmCIF file, with forces of OpenMM.
+    """The molecules of a PDB or mmCIF file with forces of OpenMM, or of any file that MDAnalysis reads.
 
     Parameters
     ----------
@@ -153,19 +167,36 @@ def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options
     quick : bool
         Half the horizon.
     **options
-        What `kcons.scenes.structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax.
+        What `kcons.scenes.structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax; or, for
+        other files and where one of coordinates, forces, select, rigid_residues is given, what
+        `kcons.scenes.any_file.from_file` takes.
 
     Raises
     ------
     InputError, UnsupportedError
         The file cannot be read, or does not fit the force field.
     """
-    from kcons.scenes import structure
+    if by_mdanalysis(str(path), options):
+        from kcons.scenes import any_file
 
-    scene = structure.from_file(path, seed, **options)
+        scene = any_file.from_file(path, seed, **options)
+    else:
+        from kcons.scenes import structure
+
+        scene = structure.from_file(path, seed, **options)
     return scene.shortened(2) if quick else scene
+
+
+def by_mdanalysis(name: str, options: Mapping[str, Any]) -> bool:
+    """Whether MDAnalysis reads the file, and not OpenMM."""
+    return not is_file(name) or bool(FILE_OPTIONS & set(options))
 
 
 def is_file(name: str) -> bool:
     """Whether a name is that of a structure file and not of a scene."""
     return name not in SCENES and Path(name).suffix.lower() in SUFFIXES
+
+
+def is_other_file(name: str) -> bool:
+    """Whether a name is that of a file that MDAnalysis may read: one that exists, or has a suffix and is no scene."""
+    return name not in SCENES and name not in FLUIDS and (Path(name).is_file() or Path(name).suffix != "")

@@ -99,7 +99,7 @@ def build(
         _nanometers(molecule),
         seed,
         constrain=constrain or known.constrain,
-        field=_force_field(force_field),
+        field=force_field_of(force_field),
         platform=platform,
         relax=known.relax,
     )
@@ -154,7 +154,7 @@ def from_file(
         raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}", item="file") from error
     if not len(x):
         raise InputError(f"{path} has no atoms", item="file")
-    field = _force_field(force_field)
+    field = force_field_of(force_field)
     if add_hydrogens:
         topology, x = _with_hydrogens(topology, molecule.positions, field)
     return _scene(
@@ -182,7 +182,7 @@ def _nanometers(molecule: Any) -> FloatArray:
     return np.array(molecule.getPositions(asNumpy=True)._value, dtype=float)
 
 
-def _force_field(files: Sequence[str]) -> Any:
+def force_field_of(files: Sequence[str]) -> Any:
     from openmm import app
 
     try:
@@ -223,7 +223,7 @@ def _explained(error: Exception, topology: Any) -> InputError:
     return InputError(f"the force field has no template for {where}: {found[3]} Remedy: {remedy}", item="residue")
 
 
-def _system(topology: Any, field: Any, constraints: Any, rigid_water: bool) -> Any:
+def system_of(topology: Any, field: Any, constraints: Any, rigid_water: bool) -> Any:
     from openmm import app
 
     box = _box(topology)
@@ -288,14 +288,14 @@ def _scene(
     few = len(x) <= FEW_ATOMS
     platform = platform or ("Reference" if few else "CPU")
     place(platform)  # complain before the long part
-    system = _system(topology, field, getattr(app, CONSTRAIN[constrain]), True)
+    system = system_of(topology, field, getattr(app, CONSTRAIN[constrain]), True)
     _refuse_sites(system, topology)
     rows = SystemRows.of(system)
     if not rows.n_rows:
         raise InputError(f"nothing is held in {text} with constrain = {constrain}; try allbonds", item="constrain")
     _refuse_torn(rows, x, topology)
     if relax:
-        x = _relaxed(_system(topology, field, None, False), x, platform, relax)
+        x = _relaxed(system_of(topology, field, None, False), x, platform, relax)
     # SETTLE's lengths are rounded to single precision: with the same ones, all hosts run the same system.
     held = ConstraintSet(Distance(rows.pairs, rows.lengths / ASE_LENGTH), x / ASE_LENGTH, rows.masses)
     motion = Motion(held, x / ASE_LENGTH)

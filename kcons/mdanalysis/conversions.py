@@ -1,0 +1,403 @@
+"""Universe, ASE `Atoms` and OpenMM Topology with System: one into the other, with what is held.
+
+Positions pass in double precision; only a Universe keeps them in single precision. Units are those of each side:
+MDAnalysis angstrom, ps, dalton, elementary charges; ASE angstrom, eV, its own time; OpenMM nm, ps.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import MDAnalysis
+import numpy as np
+from MDAnalysis.lib.mdamath import triclinic_box
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint, Distance
+from kcons.constraints.constraint import IntArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.held_rows import HeldRows
+from kcons.mdanalysis.universe import snapshot_of
+from kcons.motion import Motion
+from kcons.rescaled import all_rescaled
+from kcons.topology import Snapshot
+from kcons.virtual_sites import VirtualSites
+from kcons.whole import whole_molecules
+
+if TYPE_CHECKING:
+    import ase
+    import openmm
+    from openmm import unit
+
+__all__ = [
+    "FromHost",
+    "ToOpenMM",
+    "ase_to_openmm",
+    "from_ase",
+    "from_openmm",
+    "openmm_to_ase",
+    "to_ase",
+    "to_openmm",
+    "universe_of",
+]
+
+NM = 0.1
+
+
+class FromHost(NamedTuple):
+    """A Universe, and what was held where it came from, in angstrom and radian."""
+
+    universe: Any
+    constraints: list[Constraint]
+
+
+class ToOpenMM(NamedTuple):
+    """What OpenMM needs.
+
+    Attributes
+    ----------
+    topology : openmm.app.Topology
+    positions : Quantity
+        On the constraints, molecules whole.
+    velocities : Quantity or None
+    system : openmm.System
+        Distances are among its constraints, virtual sites are set.
+    part : kcons.openmm.CarriedConstraints or None
+        All other rows, for ``ProjectedIntegrator(..., parts=[part])``.
+    """
+
+    topology: Any
+    positions: unit.Quantity
+    velocities: unit.Quantity | None
+    system: openmm.System
+    part: Any
+
+
+# -- Universe and ASE -----------------------------------------------------------------------------
+
+
+def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
+    """ASE `Atoms` of the present frame, with `constraints` on them.
+
+    Parameters
+    ----------
+    universe : Universe or AtomGroup
+    constraints : HeldRows or iterable of Constraint
+        What is held, in angstrom; atoms are moved onto it, where rigid bodies were made flat.
+
+    Raises
+    ------
+    InputError, ConstraintError
+        What does not fit the atoms.
+    """
+    from kcons.ase import constrain
+    from kcons.ase.topology import atoms_of
+
+    rows = _rows(constraints, 1.0)
+    atoms = atoms_of(_with_bonds_of(snapshot_of(universe), constraints))
+    if rows:
+        constrain(atoms, rows, project=True)
+    return atoms
+
+
+def from_ase(atoms: ase.Atoms) -> FromHost:
+    """A Universe of one frame, and the constraints of the atoms.
+
+    Raises
+    ------
+    UnsupportedError
+        An ASE constraint that kcons cannot express.
+    InputError
+        A cell that MDAnalysis cannot keep, since its boxes have no orientation.
+    """
+    from kcons.ase.topology import snapshot_of as snapshot_of_atoms
+
+    return FromHost(universe_of(snapshot_of_atoms(atoms)), _constraints_on(atoms))
+
+
+def _constraints_on(atoms: ase.Atoms) -> list[Constraint]:
+    from kcons.ase import Constraints
+    from kcons.ase.translation import translated
+
+    for item in atoms.constraints:
+        if isinstance(item, Constraints):
+            item.engine(atoms)  # binds targets
+    return translated(atoms, atoms.constraints)
+
+
+# -- Universe and OpenMM --------------------------------------------------------------------------
+
+
+def to_openmm(
+    universe: Any,
+    constraints: Iterable[Constraint] = (),
+    *,
+    force_field: Sequence[str] = (),
+    **options: Any,
+) -> ToOpenMM:
+    """Topology, positions and System of the present frame, with `constraints` held in the System.
+
+    Parameters
+    ----------
+    universe : Universe or AtomGroup
+    constraints : HeldRows or iterable of Constraint
+        In angstrom. Distances become constraints of the System, all else is carried by kcons.
+    force_field : sequence of str
+        Files for openmm.app.ForceField; without them the System has masses, constraints and no forces.
+    **options
+        For createSystem, beside ``constraints`` and ``rigidWater``, which are given here.
+
+    Raises
+    ------
+    InputError
+        The force field does not know a residue; a cell that OpenMM does not take; atoms of a residue scattered.
+    """
+    return _openmm(snapshot_of(universe), constraints, 1.0, force_field, options)
+
+
+def from_openmm(
+    topology: Any,
+    positions: unit.Quantity,
+    system: openmm.System | None = None,
+    *,
+    velocities: unit.Quantity | None = None,
+    part: Any = None,
+) -> FromHost:
+    """A Universe of one frame, and what the System holds.
+
+    Parameters
+    ----------
+    topology : openmm.app.Topology
+    positions, velocities : Quantity
+    system : openmm.System, optional
+        For masses, charges and constraints.
+    part : CarriedConstraints, optional
+        Rows that kcons carries in this System.
+    """
+    from kcons.openmm.topology import snapshot_of as snapshot_of_topology
+
+    snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
+    return FromHost(universe_of(snapshot), all_rescaled(_constraints_in(system, part), 1 / NM))
+
+
+def _constraints_in(system: openmm.System | None, part: Any) -> list[Constraint]:
+    """What a System and a part hold, in nm."""
+    rows: list[Constraint] = []
+    if system is not None and system.getNumConstraints():
+        held = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+        rows.append(Distance([(i, j) for i, j, _ in held], [length._value for _, _, length in held]))
+    if part is not None:
+        rows += part.motion.constraint_set.constraints
+    return rows
+
+
+# -- ASE and OpenMM -------------------------------------------------------------------------------
+
+
+def ase_to_openmm(atoms: ase.Atoms, *, force_field: Sequence[str] = (), **options: Any) -> ToOpenMM:
+    """Topology, positions and System of `Atoms`, with what is held on them; see `to_openmm`."""
+    from kcons.ase.topology import snapshot_of as snapshot_of_atoms
+
+    return _openmm(snapshot_of_atoms(atoms), _constraints_on(atoms), 1.0, force_field, options)
+
+
+def openmm_to_ase(
+    topology: Any,
+    positions: unit.Quantity,
+    system: openmm.System | None = None,
+    *,
+    velocities: unit.Quantity | None = None,
+    part: Any = None,
+) -> ase.Atoms:
+    """`Atoms` with what a System holds; see `from_openmm`."""
+    from kcons.ase import constrain
+    from kcons.ase.topology import atoms_of
+    from kcons.openmm.topology import snapshot_of as snapshot_of_topology
+
+    atoms = atoms_of(snapshot_of_topology(topology, positions, system=system, velocities=velocities))
+    rows = all_rescaled(_constraints_in(system, part), 1 / NM)
+    if rows:
+        constrain(atoms, rows, project=True)
+    return atoms
+
+
+# -- pieces ---------------------------------------------------------------------------------------
+
+
+def universe_of(snapshot: Snapshot) -> Any:
+    """A Universe of one frame with names, elements, residues, chains, bonds, masses, charges, velocities and box.
+
+    Raises
+    ------
+    InputError
+        A cell whose first vector is not along x or whose second is not in the xy plane.
+    """
+    snapshot = snapshot.in_unit(1.0)
+    topology = snapshot.topology
+    chains, first, segment = np.unique(topology.chains, return_index=True, return_inverse=True)
+    # Chains keep their order.
+    order = np.argsort(np.argsort(first))
+    dimensions = _dimensions(snapshot)
+    universe = MDAnalysis.Universe.empty(
+        topology.n_atoms,
+        n_residues=topology.n_residues,
+        n_segments=len(chains),
+        atom_resindex=topology.residues,
+        residue_segindex=order[segment],
+        trajectory=True,
+        velocities=snapshot.velocities is not None,
+    )
+    names = chains[np.argsort(first)]
+    ids = np.array(
+        ["".join(c for c in text if c.isdigit() or c == "-") or "0" for text in topology.residue_ids.tolist()]
+    )
+    attributes: dict[str, Any] = {
+        "names": topology.names.astype(object),
+        "types": np.where(topology.elements == "", "X", topology.elements).astype(object),
+        "elements": topology.elements.astype(object),
+        "masses": topology.masses,
+        "resids": ids.astype(np.int64),
+        "resnums": ids.astype(np.int64),
+        "segids": names.astype(object),
+        "chainIDs": topology.chains[topology.residues].astype(object),
+    }
+    if topology.residues_known:
+        attributes["resnames"] = topology.residue_names.astype(object)
+    if topology.charges is not None:
+        attributes["charges"] = topology.charges
+    for name, values in attributes.items():
+        universe.add_TopologyAttr(name, values)
+    if len(topology.bonds):
+        universe.add_TopologyAttr("bonds", topology.bonds)
+    universe.atoms.positions = snapshot.positions
+    if snapshot.velocities is not None:
+        universe.atoms.velocities = snapshot.velocities
+    universe.dimensions = dimensions
+    return universe
+
+
+def _dimensions(snapshot: Snapshot) -> Any:
+    if snapshot.cell is None or not snapshot.pbc.any():
+        return None
+    cell = snapshot.cell
+    if not snapshot.pbc.all():
+        warnings.warn("boxes of MDAnalysis are periodic in all directions; this cell is not", UserWarning, stacklevel=4)
+    if np.abs(np.triu(cell, 1)).max() > 1e-6 * np.abs(cell).max():
+        raise InputError(
+            "MDAnalysis wants the first cell vector along x, the second in the xy plane; turn cell and positions "
+            "(ase: atoms.cell.standard_form()) before",
+            item="cell",
+        )
+    return triclinic_box(*cell)
+
+
+def _rows(constraints: Iterable[Constraint], angstrom: float) -> list[Constraint]:
+    """Constraints in the given unit."""
+    if isinstance(constraints, HeldRows):
+        return all_rescaled(constraints, angstrom / constraints.snapshot.angstrom)
+    return list(constraints)
+
+
+def _with_bonds_of(snapshot: Snapshot, constraints: Iterable[Constraint]) -> Snapshot:
+    """Bonds that were guessed for the constraints are worth keeping."""
+    if isinstance(constraints, HeldRows) and constraints.topology.n_atoms == snapshot.topology.n_atoms:
+        return replace(snapshot, topology=snapshot.topology.with_bonds(constraints.topology.bonds))
+    return snapshot
+
+
+def _openmm(
+    snapshot: Snapshot, constraints: Iterable[Constraint], angstrom: float, force_field: Sequence[str], options: Any
+) -> ToOpenMM:
+    from openmm import unit
+
+    from kcons.openmm import hold
+    from kcons.openmm.topology import openmm_topology
+
+    rows = all_rescaled(_rows(constraints, angstrom), NM / angstrom)
+    sites = constraints.virtual_sites if isinstance(constraints, HeldRows) else None
+    snapshot = _with_bonds_of(snapshot, constraints).in_unit(NM)
+    links = np.concatenate([snapshot.topology.bonds, *(_chained(item) for item in rows if item.translation_invariant)])
+    snapshot = whole_molecules(snapshot, links)
+    x = snapshot.positions
+    if rows:
+        held = ConstraintSet(rows, x, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist())
+        x = Motion(held, x).restore_positions(x)
+        if sites is not None:
+            x = sites.in_unit(NM).place(x)
+        snapshot = replace(snapshot, positions=x)
+    topology, positions = openmm_topology(snapshot)
+    system = _system(snapshot, topology, sites, force_field, options)
+    distances = [item for item in rows if isinstance(item, Distance)]
+    known: set[tuple[int, int]] = set()
+    for item in distances:
+        for (i, j), length in zip(np.sort(item.atoms, axis=1).tolist(), np.asarray(item.target).tolist(), strict=True):
+            if (i, j) not in known:
+                known.add((i, j))
+                system.addConstraint(i, j, length)
+    others = [item for item in rows if not isinstance(item, Distance)]
+    part = hold(system, others, x, periodic=snapshot.cell is not None) if others else None
+    velocities = None
+    if snapshot.velocities is not None:
+        velocities = snapshot.velocities * (unit.nanometer / unit.picosecond)
+    return ToOpenMM(topology, positions, velocities, system, part)
+
+
+def _chained(item: Constraint) -> IntArray:
+    """Pairs of neighbours in the rows of a constraint."""
+    return np.stack([item.atoms[:, :-1], item.atoms[:, 1:]], axis=-1).reshape(-1, 2)
+
+
+def _system(
+    snapshot: Snapshot, topology: Any, sites: VirtualSites | None, force_field: Sequence[str], options: Any
+) -> openmm.System:
+    import openmm
+
+    described = snapshot.topology
+    if force_field:
+        return _with_forces(topology, force_field, options)
+    if options:
+        raise InputError(f"{', '.join(options)} is for a force field; give force_field", item=next(iter(options)))
+    system = openmm.System()
+    for mass in described.masses.tolist():
+        system.addParticle(mass)
+    if topology.getPeriodicBoxVectors() is not None:
+        system.setDefaultPeriodicBoxVectors(*topology.getPeriodicBoxVectors())
+    if sites is not None and len(sites):
+        placed = sites.in_unit(NM)
+        for site, parents, (a, b, c) in zip(
+            placed.sites.tolist(), placed.parents.tolist(), placed.coefficients.tolist(), strict=True
+        ):
+            system.setParticleMass(site, 0.0)
+            system.setVirtualSite(
+                site,
+                openmm.OutOfPlaneSite(*parents, a, b, c)
+                if c
+                else openmm.ThreeParticleAverageSite(*parents, 1 - a - b, a, b),
+            )
+    return system
+
+
+def _with_forces(topology: Any, files: Sequence[str], options: Any) -> openmm.System:
+    from openmm import app, unit
+
+    try:
+        field = app.ForceField(*([files] if isinstance(files, str) else files))
+    except Exception as error:  # whatever went wrong inside of OpenMM's reader
+        raise InputError(f"force field {files}: {' '.join(str(error).split())}", item="force_field") from error
+    settings: dict[str, Any] = {"constraints": None, "rigidWater": False, "removeCMMotion": False}
+    vectors = topology.getPeriodicBoxVectors()
+    if vectors is None:
+        settings["nonbondedMethod"] = app.NoCutoff
+    else:
+        width = min(float(vectors[k][k].value_in_unit(unit.nanometer)) for k in range(3))
+        settings |= {"nonbondedMethod": app.PME, "nonbondedCutoff": min(0.9, 0.45 * width)}
+    for taken in ("constraints", "rigidWater"):
+        if taken in options:
+            raise UnsupportedError(f"{taken} is what `constraints` says here; leave it out")
+    try:
+        return field.createSystem(topology, **(settings | options))
+    except ValueError as error:
+        raise InputError(f"the force field does not fit: {' '.join(str(error).split())}", item="force_field") from error
