@@ -268,6 +268,15 @@ class ConstraintSet:
         """Atoms that some row touches, sorted."""
         return _distinct(self.incidence.indices, self.n_atoms)
 
+    @cached_property
+    def n_moving(self) -> int:
+        """Atoms that count for degrees of freedom: all but virtual sites (no mass, and no row touches them)."""
+        if np.all(self.masses != 0):
+            return self.n_atoms
+        sites = self.masses == 0
+        sites[self.touched] = False
+        return self.n_atoms - int(np.sum(sites))
+
     # -- sigma, A, b ----------------------------------------------------------------------------
 
     def minimum_image(self, d: FloatArray) -> FloatArray:

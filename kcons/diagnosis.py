@@ -123,7 +123,7 @@ def make_report(
     return Report(
         rows=constraint_set.n_rows,
         rank=plan.rank,
-        degrees_of_freedom=3 * constraint_set.n_atoms - plan.rank,
+        degrees_of_freedom=3 * constraint_set.n_moving - plan.rank,
         condition=float(np.max(conditions, initial=1.0)),
         residual=float(np.max(sigma, initial=0.0)),
         velocity_residual=speed,

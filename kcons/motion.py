@@ -106,7 +106,7 @@ class Motion:
 
     @property
     def degrees_of_freedom(self) -> int:
-        return 3 * self.n_atoms - self.plan.rank
+        return 3 * self.constraint_set.n_moving - self.plan.rank
 
     @property
     def triangles(self) -> RigidTriangles | None:

@@ -129,8 +129,8 @@ def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
     except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
         text = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the same "
-            "atoms",
+            f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the "
+            "same atoms",
             item="file",
         ) from error
 
@@ -235,8 +235,8 @@ def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], plat
 
     if not all(isinstance(item, Distance) for item in rows):
         raise UnsupportedError(
-            "OpenMM's System holds distances only; leave out what needs linear rows (rigid residues), or give --forces of "
-            "an ASE calculator"
+            "OpenMM's System holds distances only; leave out what needs linear rows (rigid residues), or give --forces "
+            "of an ASE calculator"
         )
     topology, _ = openmm_topology(snapshot)
     platform = platform or ("Reference" if snapshot.topology.n_atoms <= FEW_ATOMS else "CPU")

@@ -1,0 +1,169 @@
+"""Rows by name: what is held, in which order, and what is said where a topology does not do."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from snapshots import WATER, snapshot
+
+from kcons.constraints import CenterOfMass
+from kcons.errors import InputError
+from kcons.held_rows import bond_angles, held_rows
+from kcons.motion import Motion
+
+# Ethanol, C C O H(O) and five H, and a water.
+ETHANOL = np.array(
+    [
+        [1.1879, -0.3829, 0.0], [0.0, 0.5526, 0.0], [-1.1867, -0.2472, 0.0], [-1.9237, 0.385, 0.0],
+        [2.0985, 0.2306, 0.0], [1.1184, -1.0093, 0.8869], [1.1184, -1.0093, -0.8869], [-0.0227, 1.1812, 0.8852],
+        [-0.0227, 1.1812, -0.8852],
+    ]
+)  # fmt: skip
+BONDS = [(0, 1), (1, 2), (2, 3), (0, 4), (0, 5), (0, 6), (1, 7), (1, 8)]
+
+
+def solution(bonds=(*BONDS, (9, 10), (9, 11)), **options):
+    return snapshot(
+        ["C", "C", "O", "H", "H", "H", "H", "H", "H", "O", "H", "H"],
+        np.concatenate([ETHANOL, WATER + 4.0]),
+        bonds,
+        residues=[0] * 9 + [1] * 3,
+        residue_names=["EOH", "HOH"],
+        **options,
+    )
+
+
+def counts(rows):
+    return {item.family: sum(i.n_rows for i in rows if i.family == item.family) for item in rows}
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("none", {"Distance": 3}),
+        ("hbonds", {"Distance": 6 + 3}),
+        ("allbonds", {"Distance": 8 + 3}),
+        # H-C-H: 3 of the methyl, 1 of the methylene; H-O-C.
+        ("hangles", {"Distance": 8 + 3, "Angle": 5}),
+        ("allangles", {"Distance": 8 + 3, "Angle": 6 + 6 + 1}),
+    ],
+)
+def test_what_is_held_by_name(kind, expected):
+    assert counts(held_rows(solution(), kind)) == expected
+
+
+def test_flexible_water_has_bonds_and_an_angle():
+    assert counts(held_rows(solution(), "hangles", rigid_water=False)) == {"Distance": 10, "Angle": 6}
+    with_third = solution((*BONDS, (9, 10), (9, 11), (10, 11)))  # as CHARMM and Amber list it
+    assert counts(held_rows(with_third, "hangles", rigid_water=False)) == {"Distance": 10, "Angle": 6}
+
+
+def test_given_order_of_bonds_does_not_matter():
+    shuffled = solution([pair[::-1] for pair in reversed((*BONDS, (9, 10), (9, 11)))])
+    for one, two in zip(held_rows(solution(), "hangles"), held_rows(shuffled, "hangles"), strict=True):
+        np.testing.assert_array_equal(one.atoms, two.atoms)
+        np.testing.assert_array_equal(one.target, two.target)
+
+
+def test_missing_bonds_are_guessed_and_said():
+    with pytest.warns(UserWarning, match=r"^8 bonds were guessed from distances and covalent radii.*guess_bonds=False"):
+        rows = held_rows(solution(()), "hangles")
+    assert rows.bonds_guessed == 8
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = held_rows(solution(), "hangles")
+    for one, two in zip(rows, expected, strict=True):
+        np.testing.assert_array_equal(one.atoms, two.atoms)
+    with pytest.warns(UserWarning, match="^1 bonds were guessed"):
+        held_rows(solution([*BONDS[:-1]]), "allbonds")
+    with pytest.raises(InputError, match=r"no bonds of C of EOH 1 \(atom 0\), nor have 8 others; give a topology"):
+        held_rows(solution(()), "hbonds", guess=False)
+
+
+def test_without_residues_molecules_are_found():
+    made = solution()
+    made = replace(made, topology=replace(made.topology, residues_known=False))
+    assert counts(held_rows(made, "hbonds")) == {"Distance": 9}
+    rows = held_rows(made, "none", rigid_residues=["C2H6O"])
+    assert Motion(rows.constraint_set, made.positions).degrees_of_freedom == 12
+
+
+def test_rigid_residues_and_bodies_replace_bonds_inside():
+    rows = held_rows(solution(), "allbonds", rigid_residues=["EOH"])
+    motion = Motion(rows.constraint_set, rows.snapshot.positions)
+    assert motion.rank == rows.constraint_set.n_rows == 3 * 9 - 6 + 3
+    rows = held_rows(solution(), "allbonds", rigid_bodies=[[0, 4, 5, 6]])
+    pairs = {tuple(p) for item in rows if item.family == "Distance" for p in item.atoms.tolist()}
+    assert set(combinations([0, 4, 5, 6], 2)) <= pairs
+    assert len(pairs) == 5 + 6 + 3
+
+
+def test_a_straight_angle_is_a_linear_row():
+    x = [[0.0, 0, 0], [1.06, 0, 0], [2.26, 1e-4, 0], [3.32, 0, 0]]
+    rows = held_rows(snapshot(["H", "C", "C", "H"], x, [(0, 1), (1, 2), (2, 3)]), "allangles")
+    assert counts(rows) == {"Distance": 3, "LinearRelation": 6}
+    motion = Motion(rows.constraint_set, np.array(x))
+    on = motion.restore_positions(np.array(x))
+    assert np.abs(rows.constraint_set.value(on)).max() < 1e-8
+    assert np.abs(on - x).max() < 1e-3
+
+
+def test_named_water_geometry():
+    rows = held_rows(solution(), "none", water_geometry="SPC/E")
+    np.testing.assert_allclose(rows[0].target, [1.0, 1.0, np.sqrt(8 / 3)])
+    with pytest.raises(InputError, match=r"no water model 'tip3' \(did you mean TIP3P"):
+        held_rows(solution(), "none", water_geometry="tip3")
+
+
+def test_rows_on_selections_and_their_names():
+    rows = held_rows(solution(), "none", on=[(np.arange(9), CenterOfMass)])
+    assert counts(rows) == {"Distance": 3, "CenterOfMass": 3}
+    assert rows.row_name(1) == "#1 Distance: O of HOH 2 (atom 9), H of HOH 2 (atom 11)"
+    assert rows.summary() == "3 Distance, 3 CenterOfMass; 6 rows on 12 atoms"
+
+
+def test_virtual_sites_are_no_degrees_of_freedom():
+    m = 0.128 * (WATER[1] + WATER[2])
+    made = snapshot(["O", "H", "H", ""], np.vstack([WATER, m]), names=["OW", "HW1", "HW2", "MW"], residue_names=["SOL"])
+    rows = held_rows(made, "hangles")
+    assert len(rows.virtual_sites) == 1
+    assert Motion(rows.constraint_set, made.positions).degrees_of_freedom == 6
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"constrain": "hbond"}, r"cannot constrain 'hbond' \(did you mean HBONDS"),
+        ({"constrain": "none", "rigid_water": False}, "nothing is to be held"),
+        ({"angles": "cosines"}, "angles must be"),
+        ({"water_geometry": (1.0, 190.0)}, "give both positive"),
+        ({"selected": np.zeros(12, bool)}, "nothing to hold within the selection of 0 atoms"),
+    ],
+)
+def test_bad_input_is_named(options, said):
+    with pytest.raises(InputError, match=said):
+        held_rows(solution(), **options)
+
+
+def test_no_masses_no_hydrogens_and_torn_molecules():
+    with pytest.raises(InputError, match=r"C of EOH 1 \(atom 0\) has no mass, as 11 other atoms; held atoms need"):
+        held_rows(solution(masses=np.zeros(12)), "allbonds")
+    with pytest.raises(InputError, match="there are no hydrogens; add them"):
+        held_rows(snapshot(["C", "C"], [[0, 0, 0], [1.5, 0, 0]], [(0, 1)]), "hbonds")
+    torn = [[0.0, 0, 0], [28.5, 0, 0]]
+    with pytest.raises(InputError, match=r"28.5 angstrom apart; give the periodic cell"):
+        held_rows(snapshot(["C", "C"], torn, [(0, 1)]), "allbonds")
+    whole = held_rows(snapshot(["C", "C"], torn, [(0, 1)], cell=np.eye(3) * 30), "allbonds")
+    assert whole[0].target == pytest.approx(1.5)
+
+
+def test_bond_angles_are_all_of_them():
+    rng = np.random.default_rng(0)
+    bonds = np.array([p for p in combinations(range(12), 2) if rng.random() < 0.3])
+    linked = {tuple(b) for b in bonds.tolist()} | {tuple(b[::-1]) for b in bonds.tolist()}
+    expected = [(i, j, k) for j in range(12) for i in range(12) for k in range(i + 1, 12) if {(i, j), (j, k)} <= linked]
+    assert [tuple(t) for t in bond_angles(bonds, 12).tolist()] == expected

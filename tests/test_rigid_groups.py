@@ -1,0 +1,132 @@
+"""Rigid water, residues and bodies: rank, all distances, flat groups, names and compositions."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from snapshots import WATER, rotations, snapshot
+
+from kcons.constraint_set import ConstraintSet
+from kcons.errors import InputError
+from kcons.motion import Motion
+from kcons.rigid_groups import body_rows, find_waters, listed_bodies, residue_bodies
+
+RNG = np.random.default_rng(11)
+SHAPES = {
+    "pair": (np.array([[0.0, 0, 0], [1.1, 0, 0]]), 1),
+    "line of three": (np.array([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]]), 3 * 3 - 5),
+    "line of five": (np.outer([0, 1.2, 2.5, 3.6, 5.0], [0.6, 0.8, 0.0]), 3 * 5 - 5),
+    "bent": (WATER, 3),
+    "hexagon": (1.4 * np.array([[np.cos(a), np.sin(a), 0] for a in np.arange(6) * np.pi / 3]), 3 * 6 - 6),
+    "square": (np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), 3 * 4 - 6),
+    "tetrahedron": (np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), 6),
+    "cloud": (2 * RNG.normal(size=(30, 3)), 3 * 30 - 6),
+}
+
+
+def moved(x, count=3, seed=5):
+    """Copies turned and apart."""
+    return np.concatenate([x @ q + 20 * k for k, q in enumerate(rotations(count, seed))])
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_rows_hold_all_distances_of_bodies(name):
+    shape, rows_each = SHAPES[name]
+    n = len(shape)
+    x = moved(shape)
+    made = snapshot(["C"] * len(x), x)
+    groups = [np.arange(len(x)).reshape(3, n)]
+    held = ConstraintSet(body_rows(made, groups), x, made.topology.masses)
+    assert held.n_rows == 3 * rows_each
+    motion = Motion(held, x)
+    assert motion.rank == held.n_rows  # regular, also where flat
+    assert np.abs(held.value(x)).max(initial=0.0) < 1e-12
+    # A rigid motion keeps the rows; and what the rows keep is rigid.
+    shaken = motion.project_positions(x + 0.02 * RNG.normal(size=x.shape), x)
+    for k in range(3):
+        before, after = x[k * n : (k + 1) * n], shaken[k * n : (k + 1) * n]
+        for i, j in combinations(range(n), 2):
+            assert np.linalg.norm(after[i] - after[j]) == pytest.approx(
+                np.linalg.norm(before[i] - before[j]), abs=1e-10
+            )
+
+
+def test_a_ring_out_of_a_file_is_held_flat():
+    ring, rows = SHAPES["hexagon"]
+    x = np.round(ring @ rotations(1, 2)[0] + 31.7, 3)
+    held = ConstraintSet(body_rows(snapshot(["C"] * 6, x), [np.arange(6)[None]]), x, np.full(6, 12.0))
+    assert held.n_rows == rows
+    on = Motion(held, x).restore_positions(x)
+    assert np.abs(on - x).max() < 2e-3  # the three decimals
+    y = on - on.mean(axis=0)
+    assert np.linalg.svd(y, compute_uv=False)[2] < 1e-12
+
+
+def test_bodies_across_the_cell_are_whole():
+    cloud, rows = SHAPES["cloud"]
+    cell = np.diag([40.0, 42.0, 41.0])
+    x = (cloud + 39.0) % 40.0
+    x[:, 1] = (cloud[:, 1] + 41.0) % 42.0
+    x[:, 2] = (cloud[:, 2] + 40.0) % 41.0
+    cut = snapshot(["C"] * 30, x, cell=cell)
+    made = body_rows(cut, [np.arange(30)[None]])
+    whole = body_rows(snapshot(["C"] * 30, cloud), [np.arange(30)[None]])
+    held = ConstraintSet(made, x, cut.topology.masses, cell=cell)
+    assert held.n_rows == rows
+    assert np.abs(held.value(x)).max() < 1e-12
+    np.testing.assert_allclose(made[0].target, whole[0].target, atol=1e-12)
+
+
+def test_bodies_that_share_an_edge_hold_it_once():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0.2, 1.0]])
+    rows = body_rows(snapshot(["C"] * 4, x), listed_bodies(snapshot(["C"] * 4, x), [[0, 1, 2], [0, 1, 3]]))
+    assert sum(r.n_rows for r in rows) == 5
+
+
+@pytest.mark.parametrize(
+    ("bodies", "said"),
+    [([[0]], "two atoms or more"), ([[0, 9]], "names atom 9; there are atoms 0 to 2"), ([[0, 1, 0]], "atom 0 twice")],
+)
+def test_impossible_bodies_are_named(bodies, said):
+    with pytest.raises(InputError, match=said):
+        listed_bodies(snapshot(["O", "H", "H"], WATER), bodies)
+
+
+def test_unknown_residue_is_named_with_near_misses():
+    with pytest.raises(InputError, match=r"no residue is called BNZZ \(did you mean BNZ\?\); there are ALA, BNZ"):
+        residue_bodies(snapshot(["C", "C"], WATER[:2], residues=[0, 1], residue_names=["BNZ", "ALA"]), ["BNZZ"])
+
+
+def test_four_site_water_with_its_site_placed():
+    m = 0.15 * (WATER[1] + WATER[2]) / np.linalg.norm(WATER[1] + WATER[2])
+    molecule = np.vstack([WATER, m])
+    x = np.round(moved(molecule), 3)
+    made = snapshot(
+        ["O", "H", "H", ""] * 3,
+        x,
+        names=["OW", "HW1", "HW2", "MW"] * 3,
+        residues=np.repeat([0, 1, 2], 4),
+        residue_names=["SOL"] * 3,
+    )
+    waters = find_waters(made)
+    np.testing.assert_array_equal(waters.triples, [[0, 1, 2], [4, 5, 6], [8, 9, 10]])
+    assert waters.sites.sites.tolist() == [3, 7, 11]
+    # Published: 0.128012065 for TIP4P, up to the decimals of the file.
+    np.testing.assert_allclose(waters.sites.coefficients, [[0.128012065, 0.128012065, 0.0]] * 3, atol=2e-3)
+    exact = find_waters(made, model_site=0.15)
+    placed = exact.sites.place(x)
+    np.testing.assert_allclose(np.linalg.norm(placed[3::4] - placed[0::4], axis=1), 0.15, atol=1e-3)
+    assert [r.n_rows for r in waters.rows(None, 1.0)] == [9]
+
+
+def test_hydrogens_may_come_before_the_oxygen():
+    made = snapshot(["H", "O", "H"], WATER[[1, 0, 2]], residue_names=["HOH"])
+    assert find_waters(made).triples.tolist() == [[1, 0, 2]]
+
+
+def test_oxygens_alone_are_left_and_odd_waters_named():
+    assert not len(find_waters(snapshot(["O"], WATER[:1], residue_names=["HOH"])).triples)
+    with pytest.raises(InputError, match=r"residue HOH 1 \(atoms 0 to 1\).*1 oxygens and 1 hydrogens; rename it"):
+        find_waters(snapshot(["O", "H"], WATER[:2], residue_names=["HOH"]))

@@ -1,0 +1,96 @@
+"""What is read out of names and numbers: elements, residues, molecules, decimals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from snapshots import WATER, snapshot
+
+from kcons.errors import InputError
+from kcons.topology import Snapshot, as_written, connected, elements_of, near_misses, sorted_pairs, split_residues
+
+
+@pytest.mark.parametrize(
+    ("name", "residue", "element"),
+    [
+        ("CA", "ALA", "C"), ("HG", "SER", "H"), ("HG21", "ILE", "H"), ("1HB", "ALA", "H"), ("NE", "ARG", "N"),
+        ("CD1", "LEU", "C"), ("OW", "SOL", "O"), ("MW", "SOL", ""), ("EPW", "WAT", ""), ("CL1", "LIG", "Cl"),
+        ("SE", "MSE", "Se"), ("FE", "HEM", "Fe"), ("NA", "HEM", "N"), ("SD", "MET", "S"), ("D1", "DOD", "H"),
+    ],
+)  # fmt: skip
+def test_elements_of_atoms_in_molecules(name, residue, element):
+    names = np.array([name, "XX1", "XX2"])
+    assert elements_of(names, np.zeros(3, int), np.array([residue]), None)[0] == element
+
+
+@pytest.mark.parametrize(
+    ("name", "residue", "element"),
+    [
+        ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
+        ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"), ("K", "K", "K"),
+    ],
+)  # fmt: skip
+def test_elements_of_single_atoms(name, residue, element):
+    assert elements_of(np.array([name]), np.zeros(1, int), np.array([residue]), None)[0] == element
+
+
+def test_masses_that_were_read_decide():
+    names, zeros = np.array(["CLA", "X7", "H1", "MW", "CA"]), np.zeros(5, int)
+    found = elements_of(names, zeros, np.array(["LIG"]), np.array([35.45, 15.999, 3.024, 0.0, 12.011]))
+    assert found.tolist() == ["Cl", "O", "H", "", "C"]  # 3.024: hydrogens made heavier stay hydrogens
+
+
+def test_residues_end_where_a_name_comes_again():
+    names = np.array(["O", "H1", "H2"] * 3 + ["N"])
+    called = np.array(["HOH"] * 9 + ["ALA"])
+    residues, first = split_residues(names, called, np.array([1, 1, 1, 1, 1, 1, 2, 2, 2, 2]))
+    assert residues.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+    assert first.tolist() == [0, 3, 6, 9]
+
+
+def test_molecules_are_named_by_formula():
+    made = snapshot(
+        ["O", "H", "H", "C", "O", "Na"], np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]
+    ).topology.with_molecules()
+    assert made.residue_names.tolist() == ["H2O", "CO", "Na"]
+    assert made.residues.tolist() == [0, 0, 0, 1, 1, 2]
+
+
+def test_single_precision_gives_back_the_decimals_of_a_file():
+    rng = np.random.default_rng(1)
+    for decimals in (3, 4):
+        written = np.round(rng.uniform(-90, 90, size=(500, 3)), decimals)
+        np.testing.assert_array_equal(as_written(written.astype(np.float32)), written)
+    # What a simulation left in single precision stays what it is, up to its rounding.
+    x = rng.uniform(-90, 90, size=(500, 3)).astype(np.float32)
+    assert np.abs(as_written(x) - x).max() <= np.spacing(np.float32(90))
+    y = rng.uniform(-90, 90, size=(5, 3))
+    np.testing.assert_array_equal(as_written(y), y)
+
+
+def test_pairs_and_components():
+    assert sorted_pairs([(3, 1), (0, 2), (1, 3)]).tolist() == [[0, 2], [1, 3]]
+    number, count = connected(np.array([[1, 3]]), 5)
+    assert (number.tolist(), count) == ([0, 1, 2, 1, 3], 4)
+
+
+def test_subset_keeps_bonds_inside():
+    part = snapshot(["O", "H", "H"] * 2, np.zeros((6, 3)), [(0, 1), (0, 2), (3, 4)]).topology.subset(
+        np.array([0, 2, 3])
+    )
+    assert part.bonds.tolist() == [[0, 1]]
+
+
+def test_units_and_numbers_of_atoms():
+    made = snapshot(["O", "H", "H"], WATER, cell=np.eye(3) * 20, velocities=WATER)
+    there = made.in_unit(0.1)
+    np.testing.assert_allclose(there.positions, WATER / 10)
+    np.testing.assert_allclose(there.cell, np.eye(3) * 2)
+    np.testing.assert_allclose(there.velocities, WATER / 10)
+    with pytest.raises(InputError, match="3 atoms in the topology, but positions have shape"):
+        Snapshot(made.topology, WATER[:2])
+
+
+def test_near_misses():
+    assert near_misses("tip3", ["TIP3P", "SPC"]) == " (did you mean TIP3P?)"
+    assert near_misses("benzene", ["SPC"]) == ""
