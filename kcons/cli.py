@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
@@ -306,7 +307,12 @@ def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
     if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
         if chosen.add_hydrogens and scenes.by_mdanalysis(chosen.scene, _molecules(chosen)):
             raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
-        return scenes.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", UserWarning)
+            scene = scenes.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
+        for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
+            print(f"kcons: {text}", file=sys.stderr)
+        return scene
     if chosen.add_hydrogens:
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
     for name in sorted(scenes.FILE_OPTIONS & set(_molecules(chosen))):

@@ -27,7 +27,8 @@ def test_elements_of_atoms_in_molecules(name, residue, element):
     ("name", "residue", "element"),
     [
         ("CA", "CA", "Ca"), ("NA", "NA", "Na"), ("NA+", "NA+", "Na"), ("SOD", "SOD", "Na"), ("CLA", "CLA", "Cl"),
-        ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"), ("K", "K", "K"),
+        ("CL", "CL-", "Cl"), ("CA", "GLY", "C"), ("OW", "SOL", "O"), ("O", "HOH", "O"), ("ZN", "ZN", "Zn"),
+        ("K", "K", "K"),
     ],
 )  # fmt: skip
 def test_elements_of_single_atoms(name, residue, element):

@@ -9,6 +9,7 @@ from openmm import app
 
 DATA = Path(__file__).resolve().parent.parent / "data"
 VILLIN = Path(app.__file__).parent / "data" / "test.pdb"
+ALANINE = DATA / "alanine-dipeptide-implicit.pdb"
 DHFR = DATA / "5dfr_minimized.pdb"
 
 

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("MDAnalysis")
-pytest.importorskip("openmm")
-
 from host_systems import DHFR, VILLIN, quietly, read_atoms, read_universe
 from openmm import app
 

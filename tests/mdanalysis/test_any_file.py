@@ -1,0 +1,149 @@
+"""kcons plan and compare on files that MDAnalysis reads."""
+
+from __future__ import annotations
+
+import json
+
+import ase.io
+import numpy as np
+import pytest
+from ase.build import molecule
+from host_systems import ALANINE, quietly, read_universe
+
+from kcons import cli, scenes
+from kcons.errors import InputError, UnsupportedError
+from kcons.scenes import any_file
+
+
+@pytest.fixture
+def ethanol(tmp_path):
+    """An XYZ file: elements and positions, nothing else."""
+    path = tmp_path / "ethanol.xyz"
+    ase.io.write(path, molecule("CH3CH2OH"), format="xyz")
+    return path
+
+
+@pytest.fixture
+def alanine(tmp_path):
+    """Alanine dipeptide as GRO: no bonds, no elements."""
+    universe = read_universe(ALANINE)
+    path = tmp_path / "alanine.gro"
+    universe.dimensions = None
+    quietly(universe.atoms.write, path)
+    return path
+
+
+def plan(*arguments, capsys):
+    status = cli.main(["plan", *map(str, arguments)])
+    told = capsys.readouterr()
+    return status, told.out, told.err
+
+
+def test_plan_of_an_xyz_file(ethanol, capsys):
+    status, out, err = plan(ethanol, "--constrain", "hangles", capsys=capsys)
+    assert (status, err) == (0, "")
+    assert "ethanol.xyz, 9 atoms, hangles: 8 Distance, 5 Angle; 13 rows on 9 atoms" in out
+    assert "8 bonds were guessed" in out
+    assert "rank 13, degrees of freedom 14" in out
+
+
+def test_plan_with_a_selection_and_rigid_residues(alanine, capsys):
+    status, out, _ = plan(alanine, "--rigid-residues", "ALA", "--constrain", "none", capsys=capsys)
+    assert status == 0
+    assert "rank 24" in out  # ten atoms
+    status, out, _ = plan(alanine, "--select", "resname ALA", "--constrain", "allbonds", capsys=capsys)
+    assert status == 0
+    assert "9 rows on 10 atoms" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--select", "resname ALAX"], "no resname ALAX (did you mean ALA?)"),
+        (["--rigid-residues", "ALAX"], "no residue is called ALAX (did you mean ALA?)"),
+        (["--coordinates", "nowhere.xtc"], "there is no file nowhere.xtc"),
+        (["--forces", "emt"], "a plan needs no forces; leave --forces out"),
+    ],
+)
+def test_errors_name_the_file_and_the_item(alanine, arguments, said, capsys):
+    status, _, err = plan(alanine, *arguments, capsys=capsys)
+    assert status == 2
+    assert said in err
+    if arguments[0] in ("--select", "--rigid-residues"):
+        assert "alanine.gro" in err
+
+
+def test_coordinates_of_another_system_are_refused(alanine, ethanol, capsys):
+    status, _, err = plan(alanine, "--coordinates", ethanol, capsys=capsys)
+    assert status == 2
+    assert "alanine.gro" in err
+    assert "ethanol.xyz" in err
+    assert "same number of atoms" in err
+
+
+def test_unreadable_files_and_unknown_names(tmp_path, capsys):
+    broken = tmp_path / "broken.gro"
+    broken.write_text("nothing\n3\nno atoms here\n")
+    status, _, err = plan(broken, capsys=capsys)
+    assert status == 2
+    assert f"{broken} cannot be read" in " ".join(err.split())
+    assert plan("missing.gro", capsys=capsys)[2] == "kcons: there is no file missing.gro\n"
+    assert "there is no scene 'watr'" in plan("watr", capsys=capsys)[2]
+    assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]
+
+
+def test_scene_with_a_calculator_of_ase(ethanol):
+    scene = quietly(scenes.from_file, ethanol, forces="emt", constrain="hangles")
+    assert scene.constraint_set.n_rows == len(scene.bonds) == 13
+    assert scene.openmm is None
+    assert max(scene.residuals(scene.positions, scene.velocities)) < 1e-12
+    assert "ASE's emt" in scene.title
+
+
+def test_scene_with_a_force_field_is_the_one_of_openmm(alanine):
+    by_openmm = scenes.build("alanine", constrain="hbonds")
+    scene = quietly(scenes.from_file, alanine)
+    assert scene.openmm.home
+    assert {tuple(sorted(p)) for p in scene.bonds.tolist()} == {tuple(sorted(p)) for p in by_openmm.bonds.tolist()}
+    x = by_openmm.positions
+    assert scene.potential.energy(x) == pytest.approx(by_openmm.potential.energy(x), abs=1e-9)
+    assert scene.openmm.system.getNumConstraints() == 12
+
+
+def test_forces_that_do_not_fit(ethanol, alanine):
+    with pytest.raises(InputError, match="no forces 'emtt'; there are openmm, emt"):
+        quietly(scenes.from_file, ethanol, forces="emtt")
+    with pytest.raises(InputError, match="residue"):
+        quietly(scenes.from_file, ethanol)  # no template
+    with pytest.raises(UnsupportedError, match="holds distances only"):
+        quietly(scenes.from_file, alanine, rigid_residues=["ALA"])
+
+
+def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["compare", str(ethanol), "--forces", "emt", "--constrain", "allbonds", "--quick", "--budget", "0.5"]
+    status = cli.main([*arguments, "--methods", "rattle", "--dt", "4"])
+    told = capsys.readouterr()
+    assert status == 0, told.err
+    assert "kcons: 8 bonds were guessed" in told.err
+    assert "ethanol.xyz, 9 atoms, allbonds: 8 Distance" in told.out
+    assert json.loads((tmp_path / "compare-ethanol" / "compare.json").read_text())
+
+
+def test_virtual_sites_have_a_plan_and_no_scene(tmp_path):
+    path = tmp_path / "tip4p.gro"
+    lines = ["water", "    4"]
+    for name, x, y in (("OW", 0.0, 0.0), ("HW1", 0.096, 0.0), ("HW2", -0.024, 0.093), ("MW", 0.009, 0.012)):
+        lines.append(f"{1:5d}{'SOL':<5}{name:>5}{1:5d}{x:8.3f}{y:8.3f}{0:8.3f}")
+    path.write_text("\n".join([*lines, "   0.00000   0.00000   0.00000", ""]))
+    found = any_file.plan(path, constrain="none")
+    assert len(found.rows.virtual_sites) == 1
+    assert found.motion.degrees_of_freedom == 6
+    with pytest.raises(UnsupportedError, match="1 virtual sites"):
+        quietly(scenes.from_file, path)
+
+
+def test_pdb_files_go_the_new_way_when_asked(capsys):
+    status, out, _ = plan(ALANINE, "--select", "all", capsys=capsys)
+    assert status == 0
+    assert "hbonds: 12 Distance" in out

@@ -1,0 +1,196 @@
+"""Universe, Atoms, OpenMM: there and back, with units and with what is held."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from ase import units
+from host_systems import ALANINE, DHFR, VILLIN, quietly, read_universe
+from openmm import app, unit
+
+from kcons.ase import constrain
+from kcons.constraints import CenterOfMass, Distance, RadiusOfGyration
+from kcons.errors import InputError, UnsupportedError
+from kcons.mdanalysis import (
+    ase_to_openmm,
+    constraints_of,
+    from_ase,
+    from_openmm,
+    openmm_to_ase,
+    snapshot_of,
+    to_ase,
+    to_openmm,
+)
+
+
+@pytest.fixture(scope="module")
+def villin():
+    return read_universe(VILLIN)
+
+
+@pytest.fixture(scope="module")
+def held(villin):
+    return quietly(constraints_of, villin, "hbonds")
+
+
+def same_rows(one, two, factor=1.0):
+    """The same pairs at the same lengths, in any grouping."""
+
+    def table(rows):
+        pairs = np.concatenate([np.sort(r.atoms, axis=1) for r in rows])
+        targets = np.concatenate([r.target for r in rows])
+        order = np.lexsort(pairs.T)
+        return pairs[order], targets[order]
+
+    (a, b), (c, d) = table(one), table(two)
+    np.testing.assert_array_equal(a, c)
+    np.testing.assert_allclose(b, factor * d, rtol=0, atol=1e-10)
+
+
+def test_universe_to_ase_and_back(villin, held):
+    atoms = to_ase(villin, held)
+    assert atoms.get_chemical_symbols()[:5] == ["N", "H", "H", "H", "C"]
+    np.testing.assert_allclose(atoms.positions, villin.atoms.positions, atol=2e-6)
+    np.testing.assert_allclose(atoms.cell.lengths(), villin.dimensions[:3], atol=1e-5)
+    np.testing.assert_allclose(atoms.get_masses(), villin.atoms.masses)
+    assert atoms.get_number_of_degrees_of_freedom() == 3 * len(atoms) - held.constraint_set.n_rows
+    universe, rows = from_ase(atoms)
+    same_rows(rows, held)
+    for name in ("names", "resnames", "resids", "masses"):
+        np.testing.assert_array_equal(getattr(universe.atoms, name), getattr(villin.atoms, name), err_msg=name)
+    np.testing.assert_allclose(universe.atoms.positions, villin.atoms.positions, atol=2e-6)
+    np.testing.assert_allclose(universe.dimensions, villin.dimensions, atol=1e-5)
+    np.testing.assert_array_equal(universe.bonds.indices, held.topology.bonds)
+
+
+def test_universe_to_openmm_and_back(villin, held):
+    made = to_openmm(villin, held)
+    assert made.part is None
+    assert made.topology.getNumResidues() == len(villin.residues)
+    assert made.topology.getNumBonds() == len(held.topology.bonds)
+    there = made.positions.value_in_unit(unit.angstrom)
+    np.testing.assert_allclose(there, snapshot_of(villin).positions, atol=1e-12)
+    box = made.topology.getPeriodicBoxVectors().value_in_unit(unit.angstrom)
+    np.testing.assert_allclose(np.diag(np.array(box)), villin.dimensions[:3], atol=1e-5)
+    universe, rows = from_openmm(made.topology, made.positions, made.system)
+    same_rows(rows, held)
+    np.testing.assert_allclose(universe.atoms.masses, villin.atoms.masses)
+    np.testing.assert_allclose(universe.atoms.positions, villin.atoms.positions, atol=2e-6)
+    assert universe.atoms.resnames.tolist() == villin.atoms.resnames.tolist()
+
+
+def test_ase_to_openmm_and_back(villin, held):
+    atoms = to_ase(villin, held)
+    made = ase_to_openmm(atoms)
+    again = openmm_to_ase(made.topology, made.positions, made.system)
+    # Double precision all the way.
+    np.testing.assert_allclose(again.positions, atoms.positions, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(again.numbers, atoms.numbers)
+    np.testing.assert_array_equal(again.arrays["residuenames"], atoms.arrays["residuenames"])
+    same_rows(again.constraints[0].constraints, held)
+
+
+def test_velocities_have_the_units_of_their_host(villin):
+    group = villin.select_atoms("protein and resid 1")
+    atoms = to_ase(group)
+    rng = np.random.default_rng(5)
+    v = rng.normal(size=(len(atoms), 3))
+    atoms.set_velocities(v)
+    universe, _ = from_ase(atoms)
+    # Å per ps; the kinetic energy in kJ/mol is that of ASE in eV.
+    np.testing.assert_allclose(universe.atoms.velocities, v * 1000 * units.fs, rtol=1e-6)
+    kinetic = 0.5 * float(np.sum(universe.atoms.masses[:, None] * universe.atoms.velocities.astype(float) ** 2)) / 100
+    assert kinetic == pytest.approx(atoms.get_kinetic_energy() / (units.kJ / units.mol), rel=1e-6)
+    made = ase_to_openmm(atoms)
+    speeds = made.velocities.value_in_unit(unit.angstrom / unit.picosecond)
+    np.testing.assert_allclose(speeds, v * 1000 * units.fs, rtol=1e-12)
+    back = openmm_to_ase(made.topology, made.positions, made.system, velocities=made.velocities)
+    np.testing.assert_allclose(back.get_velocities(), v, rtol=1e-12)
+
+
+def test_forces_of_openmm_on_a_file_of_mdanalysis():
+    universe = read_universe(ALANINE)
+    rows = quietly(constraints_of, universe, "hangles", angles="distances")
+    made = to_openmm(universe, rows, force_field=["amber14-all.xml"])
+    pdb = app.PDBFile(str(ALANINE))
+    field = app.ForceField("amber14-all.xml")
+    held = field.createSystem(pdb.topology, nonbondedMethod=app.NoCutoff, constraints=app.HAngles)
+    assert made.system.getNumConstraints() == held.getNumConstraints() == 30
+    theirs = field.createSystem(pdb.topology, nonbondedMethod=app.NoCutoff)
+    energies = []
+    for system, positions in ((made.system, made.positions), (theirs, pdb.positions)):
+        context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+        context.setPositions(positions)
+        energies.append(context.getState(energy=True).getPotentialEnergy()._value)
+    assert energies[0] == pytest.approx(energies[1], abs=1e-9)
+
+
+def test_rows_that_are_no_distances_are_carried(villin):
+    group = villin.select_atoms("protein and resid 1:4")
+    rows = quietly(
+        constraints_of,
+        group,
+        "hangles",
+        rigid_residues=["LEU"],
+        on={"name CA": RadiusOfGyration, "name N": CenterOfMass},
+    )
+    made = to_openmm(group, rows)
+    assert made.part is not None
+    motion = made.part.motion
+    assert motion.rank + made.system.getNumConstraints() == rows.constraint_set.n_rows
+    x = np.array(made.positions.value_in_unit(unit.nanometer))
+    assert np.abs(motion.constraint_set.value(x)).max() < 1e-10
+    _, back = from_openmm(made.topology, made.positions, made.system, part=made.part)
+    families = {item.family for item in back}
+    assert {"Distance", "Angle", "LinearRelation", "RadiusOfGyration", "CenterOfMass"} <= families
+    gyration = next(item for item in back if item.family == "RadiusOfGyration")
+    expected = next(item for item in rows if item.family == "RadiusOfGyration")
+    np.testing.assert_allclose(gyration.target, expected.target, atol=1e-3)  # Å; the ring was made flat
+    atoms = to_ase(group, rows)
+    assert np.abs(atoms.constraints[0].engine(atoms).constraint_set.value(atoms.positions)).max() < 1e-10
+
+
+def test_cut_molecules_are_whole_in_openmm(villin, held):
+    other = read_universe(VILLIN)
+    rng = np.random.default_rng(1)
+    box = other.dimensions[:3].astype(float)
+    other.atoms.positions = other.atoms.positions + rng.integers(-1, 2, size=(len(other.atoms), 3)) * box
+    rows = quietly(constraints_of, other, "hbonds")
+    for one, two in zip(rows, held, strict=True):
+        np.testing.assert_array_equal(one.atoms, two.atoms)
+        np.testing.assert_allclose(one.target, two.target, atol=3e-5)  # single precision, farther out
+    made = to_openmm(other, rows)
+    x = made.positions.value_in_unit(unit.angstrom)
+    pairs = rows.topology.bonds
+    assert np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1).max() < 2.2
+    moved = (x - snapshot_of(villin).positions) / box
+    assert np.abs(moved - np.round(moved)).max() < 1e-5
+
+
+def test_what_cannot_be_converted_is_refused(villin):
+    group = villin.select_atoms("protein and resid 1")
+    atoms = to_ase(group)
+    atoms.rotate(30, "y", rotate_cell=True)
+    with pytest.raises(InputError, match="turn cell and positions"):
+        from_ase(atoms)
+    with pytest.raises(InputError, match="turn cell and positions"):
+        ase_to_openmm(atoms)
+    with pytest.raises(InputError, match="nonbondedCutoff is for a force field"):
+        to_openmm(group, nonbondedCutoff=1.0)
+    with pytest.raises(UnsupportedError, match="rigidWater is what"):
+        to_openmm(villin, force_field=["amber14-all.xml", "amber14/tip3pfb.xml"], rigidWater=True)
+    with pytest.raises(InputError, match="force field"):
+        to_openmm(group, force_field=["no-such-file.xml"])
+    with pytest.raises(InputError, match="positions have shape"):
+        from_openmm(app.PDBFile(str(DHFR)).topology, np.zeros((3, 3)))
+
+
+def test_ase_constraints_come_along(villin):
+    from ase.constraints import FixAtoms
+
+    atoms = to_ase(villin.select_atoms("protein and resid 1"))
+    constrain(atoms, Distance([[0, 1]]))
+    atoms.set_constraint([*atoms.constraints, FixAtoms([8])])
+    _, rows = from_ase(atoms)
+    assert [item.family for item in rows] == ["Distance", "FixedAtoms"]

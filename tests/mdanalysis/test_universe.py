@@ -1,0 +1,124 @@
+"""Universes: selections, real topologies, four-site water, and a million atoms' worth of arrays."""
+
+from __future__ import annotations
+
+import MDAnalysis as mda
+import numpy as np
+import pytest
+from host_systems import VILLIN, quietly, read_universe
+
+from kcons.constraints import CenterDistance, CenterOfMass, Sphere
+from kcons.errors import InputError
+from kcons.mdanalysis import constraints_of, selected, snapshot_of
+
+
+@pytest.fixture(scope="module")
+def villin():
+    return read_universe(VILLIN)
+
+
+def waters(count, names=("OW", "HW1", "HW2"), **attributes):
+    """A Universe of water without coordinates that mean anything."""
+    width = len(names)
+    universe = mda.Universe.empty(
+        count * width, n_residues=count, atom_resindex=np.repeat(np.arange(count), width), trajectory=True
+    )
+    universe.add_TopologyAttr("names", list(names) * count)
+    universe.add_TopologyAttr("resnames", ["SOL"] * count)
+    universe.add_TopologyAttr("resids", np.arange(count) + 1)
+    for name, values in attributes.items():
+        universe.add_TopologyAttr(name, values)
+    rng = np.random.default_rng(0)
+    angle = np.radians(109.47)
+    shape = np.array([[0, 0, 0], [1, 0, 0], [np.cos(angle), np.sin(angle), 0], [0.1, 0.15, 0]])[:width]
+    universe.atoms.positions = (shape + rng.uniform(0, 90, size=(count, 1, 3))).reshape(-1, 3)
+    return universe
+
+
+def test_selections_in_words(villin):
+    protein = villin.select_atoms("protein")
+    np.testing.assert_array_equal(selected(villin, "protein"), protein.indices)
+    rows = quietly(constraints_of, villin, "none", rigid_water=False, on={
+        "protein": CenterOfMass,
+        "name CA and resid 1:3": lambda atoms: Sphere(atoms, [0.0, 0.0, 0.0]),
+        "resid 1": lambda atoms: CenterDistance(atoms, selected(villin, "protein and resid 30")),
+    })  # fmt: skip
+    masses = protein.masses[:, None]
+    np.testing.assert_allclose(rows[0].target, (masses * protein.positions).sum(0) / masses.sum(), atol=1e-4)
+    assert [item.family for item in rows] == ["CenterOfMass", "Sphere", "CenterDistance"]
+    assert rows[1].n_rows == 3
+
+
+def test_rigid_bodies_in_words(villin):
+    rows = quietly(
+        constraints_of, villin, "none", rigid_water=False, rigid_bodies=["resname TRP and name CA CB CG C N"]
+    )
+    assert rows.constraint_set.n_rows == 3 * 5 - 6
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("resname HIX", r"matches nothing: no resname HIX \(did you mean HIE"),
+        ("name CAA", "matches nothing: no name CAA"),
+        ("resid 9999", "matches nothing; residues are numbered 1 to"),
+        ("resname and and", "cannot be read"),
+        ("name N and name O", "matches nothing; look at"),
+    ],
+)
+def test_selections_that_match_nothing_say_what_there_is(villin, words, said):
+    with pytest.raises(InputError, match=said):
+        selected(villin, words)
+    with pytest.raises(InputError, match=said):
+        constraints_of(villin, "hbonds", select=words)
+
+
+def test_a_universe_without_coordinates_or_masses():
+    bare = mda.Universe.empty(3, n_residues=1, atom_resindex=[0, 0, 0])
+    bare.add_TopologyAttr("names", ["OW", "HW1", "HW2"])
+    bare.add_TopologyAttr("resnames", ["SOL"])
+    with pytest.raises(InputError, match="has no coordinates"):
+        constraints_of(bare)
+    with pytest.raises(InputError, match=r"OW of SOL 1 \(atom 0\) has no mass"):
+        constraints_of(waters(2), "none")
+
+
+def test_sites_without_mass_are_found_by_mass_and_name():
+    masses = np.array([15.9994, 1.008, 1.008, 0.0] * 3)
+    rows = constraints_of(waters(3, ("OW", "HW1", "HW2", "MW"), masses=masses), "hbonds")
+    assert rows.virtual_sites.sites.tolist() == [3, 7, 11]
+    assert rows.constraint_set.n_rows == 9
+
+
+def test_the_frame_decides(villin):
+    first = snapshot_of(villin).positions
+    other = read_universe(VILLIN)
+    other.atoms.positions += 1.0
+    np.testing.assert_allclose(snapshot_of(other).positions, first + 1.0, atol=2e-5)
+
+
+def test_many_waters_are_one_object():
+    count = 40_000
+    rows = constraints_of(waters(count, masses=[15.999, 1.008, 1.008] * count), "hbonds")
+    assert len(rows) == 1
+    assert rows[0].n_rows == 3 * count
+    assert rows.bonds_guessed == 0
+
+
+def test_topologies_of_adenylate_kinase():
+    files = pytest.importorskip("MDAnalysis.tests.datafiles")
+    for topology, coordinates in ((files.PSF, files.CRD), (files.PDB_small, None)):
+        universe = read_universe(topology, *([coordinates] if coordinates else []))
+        rows = quietly(constraints_of, universe, "hangles")
+        # Counted in the PSF: 3365 bonds; 1685 of them with hydrogen.
+        assert [item.n_rows for item in rows] == [3365, 817]
+        assert quietly(constraints_of, universe, "hbonds").constraint_set.n_rows == 1685
+    universe = read_universe(files.TPR, files.GRO)
+    rows = constraints_of(universe, "hbonds")
+    assert rows.bonds_guessed == 0
+    assert len(rows.virtual_sites) == 11084
+    np.testing.assert_allclose(rows.virtual_sites.coefficients[0], [0.128, 0.128, 0.0], atol=2e-3)
+    guessed = quietly(constraints_of, read_universe(files.GRO), "hbonds")
+    for one, two in zip(rows, guessed, strict=True):
+        np.testing.assert_array_equal(one.atoms, two.atoms)
+        np.testing.assert_allclose(one.target, two.target, rtol=0, atol=1e-10)
