@@ -157,7 +157,7 @@ def held_rows(
     Warns
     -----
     UserWarning
-        If bonds were guessed.
+        If bonds were guessed without being asked for (guess='missing').
     """
     kind = "none" if constrain is None else str(constrain).lower()
     if kind not in CONSTRAIN:
@@ -217,7 +217,7 @@ def held_rows(
     held = ConstraintSet(
         rows, snapshot.positions, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist()
     )
-    if guessed:
+    if guessed and guess == "missing":
         warnings.warn(
             f"{guessed} bonds were guessed from distances and covalent radii, since "
             f"the {snapshot.host or 'topology'} does not have them; {remedy}, or pass guess_bonds=False to refuse",

@@ -80,6 +80,7 @@ def test_missing_bonds_are_guessed_and_said():
         np.testing.assert_array_equal(one.atoms, two.atoms)
     with pytest.warns(UserWarning, match="^1 bonds were guessed"):
         held_rows(solution([*BONDS[:-1]]), "allbonds")
+    assert held_rows(solution(), "hbonds", guess=True).bonds_guessed == 8  # asked for: no warning
     with pytest.raises(InputError, match=r"no bonds of C of EOH 1 \(atom 0\), nor have 8 others; give a topology"):
         held_rows(solution(()), "hbonds", guess=False)
 

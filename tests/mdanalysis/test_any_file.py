@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import ase.io
-import numpy as np
 import pytest
 from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
