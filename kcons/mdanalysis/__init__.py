@@ -26,3 +26,10 @@ __all__ = [
     "to_openmm",
     "universe_of",
 ]
+"""kcons on MDAnalysis: checks of trajectories, and writing them."""
+
+from kcons.mdanalysis.check import ConstraintCheck
+from kcons.mdanalysis.loading import load_trajectory, open_universe
+from kcons.mdanalysis.result import CheckResult
+
+__all__ = ["CheckResult", "ConstraintCheck", "load_trajectory", "open_universe"]

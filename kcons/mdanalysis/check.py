@@ -1,0 +1,582 @@
+"""How well a trajectory, of whatever engine, kept its constraints."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from MDAnalysis.analysis.base import AnalysisBase
+from MDAnalysis.analysis.results import Results, ResultsGroup
+from MDAnalysis.exceptions import NoDataError
+from MDAnalysis.lib.log import ProgressBar
+from numpy.typing import NDArray
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError
+from kcons.mdanalysis.loading import READ_ERRORS, last_offset, leftover, quiet
+from kcons.mdanalysis.names import AtomNames
+from kcons.mdanalysis.precision import FilePrecision, precision_of
+from kcons.mdanalysis.rank import rank_of
+from kcons.mdanalysis.result import Break, CheckResult, RowResult, UnitResult, fitted
+from kcons.mdanalysis.rows import UNITS, Deviations, RowTable, cell_matrix
+from kcons.mdanalysis.targets import TargetFile
+from kcons.solvers.frames import coordinate_grid, kinetic
+
+#: Boltzmann's constant in amu Å²/(ps² K).
+BOLTZMANN = 0.831446261815324
+#: Times a run that the largest coordinate is looked up.
+SAMPLES = 32
+#: What second order adds to the error of rows other than distances, at most.
+SECOND_ORDER = 1.1
+#: Part of the kinetic energy that the centre of mass may have where its motion is removed.
+STILL = 1e-2
+
+
+@dataclass
+class Part:
+    """What one worker found in its frames."""
+
+    frames: IntArray
+    times: FloatArray
+    found: Deviations
+    twice_kinetic: FloatArray
+    momentum: FloatArray
+    reach: float
+    broken: Break | None = None
+
+    def with_next(self, other: Part) -> Part:
+        return Part(
+            np.concatenate([self.frames, other.frames]),
+            np.concatenate([self.times, other.times]),
+            self.found.with_next(other.found),
+            np.concatenate([self.twice_kinetic, other.twice_kinetic]),
+            np.concatenate([self.momentum, other.momentum]),
+            max(self.reach, other.reach),
+            other.broken,
+        )
+
+
+class _Remote:
+    """What a worker sends back: no trajectory, no tables."""
+
+    def __init__(self, part: Part) -> None:
+        self.frames, self.times, self.results = part.frames, part.times, Results(part=part)
+
+
+def _joined(parts: Sequence[Part]) -> Part:
+    """Parts in order, up to the first break."""
+    whole = parts[0]
+    for part in parts[1:]:
+        if whole.broken is not None:
+            break
+        whole = whole.with_next(part)
+    return whole
+
+
+class ConstraintCheck(AnalysisBase):
+    """Deviations of all constraints along a trajectory, told by the precision of its file.
+
+    Parameters
+    ----------
+    atoms : MDAnalysis.Universe or AtomGroup
+        With the trajectory; of a group, its Universe.
+    constraints : Constraint, iterable of Constraint, or ConstraintSet
+        What should be held, in angstrom, on the atoms of the Universe.
+    targets : {'given', 'first', 'mean'}, path or TargetFile
+        Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
+        say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
+        parameter file, see `kcons.mdanalysis.targets`.
+    tolerance : float
+        Relative violation that counts as the engine's tolerance and not as a violation, in parts of the length (of
+        1 rad for angles).
+    precision : float, optional
+        Step of the coordinates in the file, in angstrom, for formats where it cannot be known.
+    target_error : float
+        Rounding of the targets, in angstrom a coordinate; for 'given' targets that were measured in another file.
+    removed : int, optional
+        Degrees of freedom that the engine took away besides: 3 where it stops the centre of mass. Found from the
+        total momentum by default.
+    rank : bool
+        Whether to find the rank, which takes longer than the frames of a short trajectory.
+    worst : int
+        Number of rows to name.
+    names : tuple of str, optional
+        What to call trajectory and topology.
+
+    Raises
+    ------
+    InputError
+        No constraints; constraints on atoms that do not exist; a bad option.
+
+    Notes
+    -----
+    A coordinate that was rounded by at most h moves a distance by at most 2 √3 h, any other row by h Σ |∂q/∂x| to first
+    order; targets that were read from a file are rounded themselves, which doubles the bound. Velocities of leapfrog
+    integrators belong to the middle of a step and are not tangent at the positions they are stored with.
+
+    Backends: serial, multiprocessing, dask (`run(backend=..., n_workers=...)`).
+    """
+
+    _analysis_algorithm_is_parallelizable = True
+
+    def __init__(
+        self,
+        atoms: Any,
+        constraints: Constraint | Iterable[Constraint] | ConstraintSet,
+        *,
+        targets: Literal["given", "first", "mean"] | str | Path | TargetFile = "given",
+        tolerance: float = 1e-4,
+        precision: float | None = None,
+        target_error: float = 0.0,
+        removed: int | None = None,
+        rank: bool = True,
+        worst: int = 10,
+        names: tuple[str, str] | None = None,
+        **options: Any,
+    ) -> None:
+        universe = atoms.universe
+        super().__init__(universe.trajectory, **options)
+        if isinstance(constraints, ConstraintSet):
+            given: tuple[Constraint, ...] = constraints.constraints
+        else:
+            given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        if not sum(item.n_rows for item in given):
+            raise InputError(
+                "there are no constraints to check; select others, or look at the bonds of the topology",
+                item="constraints",
+            )
+        if not (np.isfinite(tolerance) and tolerance >= 0):
+            raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
+        if not (np.isfinite(target_error) and target_error >= 0):
+            raise InputError(f"target_error is {target_error}; give a length in angstrom", item="target_error")
+        self._labels = AtomNames(universe)
+        self._remarks: list[str] = []
+        self._masses = self._find_masses(universe, given)
+        if targets not in ("given", "first", "mean"):
+            file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
+            given, self._target_text = tuple(file.apply(given, self._labels)), str(file.path)
+            self._mode = "given"
+        else:
+            self._mode = str(targets)
+            self._target_text = {"first": "the first frame", "mean": "the mean of the frames"}.get(
+                self._mode, "as given"
+            )
+        self._given = given
+        self._tolerance, self._target_error = float(tolerance), float(target_error)
+        self._removed, self._wants_rank, self._n_worst = removed, rank, int(worst)
+        reader = self._trajectory
+        self._path = str(getattr(reader, "filename", None) or "")
+        self._format = _format(reader)
+        self._names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
+        if self._path and Path(self._path).is_file():
+            self._precision = precision_of(self._path, self._format, precision)
+        else:
+            self._precision = FilePrecision(self._format or "MEMORY", precision or 0.0)
+        if getattr(reader, "transformations", ()):
+            # What a transformation did to the coordinates no longer lies on the grid of the file.
+            self._precision = FilePrecision(self._format, self._precision.step, self._precision.unit)
+            self._remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+        self._grid = self._precision.step if self._precision.exact else 0.0
+        self._pass_of_means = False
+
+    def _find_masses(self, universe: Any, given: Sequence[Constraint]) -> FloatArray | None:
+        """Masses, or None where they cannot be used; says why."""
+        advice = "give a topology with masses, or universe.guess_TopologyAttrs(to_guess=['masses'])"
+        self._unit_masses = np.ones(len(universe.atoms))
+        used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
+        if len(used) and used[-1] >= len(universe.atoms):
+            raise InputError(
+                f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
+                item="constraints",
+                atoms=[int(used[-1])],
+            )
+        try:
+            masses = np.asarray(universe.atoms.masses, dtype=np.float64)
+        except (NoDataError, AttributeError):
+            masses, reason = None, "the topology has no masses"
+        else:
+            bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
+            reason = f"{self._labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}" if len(bad) else ""
+        if not reason:
+            return masses
+        needing = next((item for item in given if item.uses_masses), None)
+        if needing is not None:
+            raise InputError(f"{needing!r} needs masses, but {reason}; {advice}", item="masses")
+        self._remarks.append(f"no temperature: {reason}; {advice}")
+        return None
+
+    @classmethod
+    def get_supported_backends(cls) -> tuple[str, ...]:
+        return ("serial", "multiprocessing", "dask")
+
+    # -- running --------------------------------------------------------------------------------
+
+    def run(
+        self,
+        start: int | None = None,
+        stop: int | None = None,
+        step: int | None = None,
+        frames: Any = None,
+        **options: Any,
+    ) -> ConstraintCheck:
+        """Read the frames, by default all of them; arguments are those of MDAnalysis.
+
+        Raises
+        ------
+        InputError
+            There are no frames; the first frame cannot be read.
+        KconsError
+            Constraints that cannot be, at the first frame.
+        """
+        chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
+        self._bind(self._first(chosen))
+        self._pass_of_means = self._mode == "mean"
+        if self._pass_of_means:
+            super().run(**chosen, **options)
+            self._hold_means()
+            self._pass_of_means = False
+        super().run(**chosen, **options)
+        return self
+
+    def _first(self, chosen: dict[str, Any]) -> int:
+        if chosen["frames"] is None:
+            numbers = range(*self._trajectory.check_slice_indices(chosen["start"], chosen["stop"], chosen["step"]))
+            first = numbers[0] if len(numbers) else None
+        else:
+            asked = np.asarray(chosen["frames"])
+            asked = np.flatnonzero(asked) if asked.dtype == bool else asked
+            first = int(asked[0]) if len(asked) else None
+        if first is None:
+            raise InputError(
+                f"{self._names[0]}: no frames are left by start, stop and step; it has {self._trajectory.n_frames}",
+                item="frames",
+            )
+        return first
+
+    def _bind(self, frame: int) -> None:
+        """Rows and their targets at one frame."""
+        try:
+            with quiet():
+                ts = self._trajectory[frame]
+        except READ_ERRORS as error:
+            raise InputError(
+                f"{self._names[0]}: frame {frame}, the first to be checked, cannot be read ({error}); "
+                "start at another frame, or write the file again",
+                item="trajectory",
+            ) from None
+        x = coordinate_grid(ts.positions, self._grid)
+        given = self._given
+        if self._mode != "given":
+            given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
+        masses = self._unit_masses if self._masses is None else self._masses
+        self._from_file = np.concatenate([np.full(item.n_rows, item.target is None) for item in given])
+        cell = cell_matrix(ts.dimensions)
+        held = ConstraintSet(given, x, masses, cell=cell, time=float(ts.time))
+        with np.errstate(all="ignore"):
+            reach = np.asarray(abs(held.jacobian(x, float(ts.time))).sum(axis=1)).ravel()
+            squares = np.asarray(held.jacobian(x, float(ts.time)).power(2).sum(axis=1)).ravel()
+        is_length = np.concatenate([np.full(c.n_rows, c.family == "Distance") for c in held.constraints])
+        # A step h of each coordinate: the error of a row, at most and in the mean square.
+        self._reach = np.where(is_length, 2 * np.sqrt(3.0), SECOND_ORDER * reach)
+        self._spread = np.sqrt(squares / 3.0)
+        self._scale = np.where(is_length, held.scale, 1.0)
+        lengths = ~is_length & (np.concatenate([np.full(c.n_rows, c.period is None) for c in held.constraints]))
+        angles = np.concatenate([np.full(c.n_rows, c.family == "Angle") for c in held.constraints])
+        self._scale = np.where(lengths & ~angles, held.scale, self._scale)
+        self._rank: int | None = None
+        if self._wants_rank:
+            try:
+                self._rank = rank_of(held, x)
+            except KconsError as error:
+                self._remarks.append(f"no rank: {error}")
+        self._table = RowTable(held, self._grid)
+
+    def _hold_means(self) -> None:
+        """Take the means that the first pass found as targets."""
+        part: Part = self.results.part
+        held = self._table.set
+        means = part.found.total / max(len(part.frames), 1)
+        moved = [
+            item if item.moving or not item.holonomic else item.with_target(item.target_at(0.0) + means[a:b])
+            for item, a, b in zip(held.constraints, held.starts[:-1], held.starts[1:], strict=True)
+        ]
+        first = self._trajectory.ts
+        self._table = RowTable(
+            held.replaced(moved, coordinate_grid(first.positions, self._grid), float(first.time)), self._grid
+        )
+
+    def _prepare_sliced_trajectory(self, slicer: Any) -> None:
+        with quiet():
+            super()._prepare_sliced_trajectory(slicer)
+
+    def _compute(
+        self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
+    ) -> Any:
+        """Read one worker's frames, in order and without seeking where they follow each other; stop at a break."""
+        numbers = indexed_frames[:, 1]
+        n = len(numbers)
+        found = Deviations(self._table.set.n_rows, n)
+        part = Part(
+            np.array(numbers, dtype=np.int64),
+            np.zeros(n),
+            found,
+            np.full(n, np.nan),
+            np.zeros((n, 3)),
+            0.0,
+        )
+        done = 0
+        every = max(n // SAMPLES, 1)
+        verbose = getattr(self, "_verbose", False) if verbose is None else verbose
+        turns = ProgressBar(range(n), verbose=verbose, **(progressbar_kwargs or {})) if verbose else range(n)
+        trajectory = self._trajectory
+        previous = None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for k in turns:
+                frame = int(numbers[k])
+                try:
+                    ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
+                    previous = frame
+                    self._look(part, k, ts, k % every == 0 or k == n - 1)
+                except (*READ_ERRORS, KconsError, FloatingPointError) as error:
+                    part.broken = Break(frame, self._reason(error, frame))
+                    break
+                done = k + 1
+        self._table.collect(found)
+        found.cut(done)
+        part.frames, part.times = part.frames[:done], part.times[:done]
+        part.twice_kinetic, part.momentum = part.twice_kinetic[:done], part.momentum[:done]
+        return _Remote(part)
+
+    def _reason(self, error: BaseException, frame: int) -> str:
+        """What the reader says; iteration hides it."""
+        if isinstance(error, StopIteration):
+            try:
+                self._trajectory[frame]
+            except READ_ERRORS as hidden:
+                error = hidden
+        lines = str(error).strip().splitlines()
+        return lines[0].strip() if lines else "the file ends"
+
+    def _look(self, part: Part, k: int, ts: Any, sample: bool) -> None:
+        x = _flat(ts.positions)
+        v = _flat(ts.velocities) if ts.has_velocities else None
+        time = float(ts.time)
+        part.times[k] = time
+        self._table.look(part.found, k, x, v, ts.dimensions, time)
+        if sample:
+            part.reach = max(part.reach, float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
+        if v is not None and self._masses is not None:
+            part.twice_kinetic[k], *part.momentum[k] = kinetic(v, self._masses)
+
+    def _get_aggregator(self) -> ResultsGroup:
+        return ResultsGroup(lookup={"part": _joined})
+
+    # -- conclusions ----------------------------------------------------------------------------
+
+    def _conclude(self) -> None:
+        part: Part = self.results.part
+        self.frames, self.times = part.frames, part.times
+        if self._pass_of_means:
+            return
+        if not len(part.frames):
+            assert part.broken is not None
+            raise InputError(
+                f"{self._names[0]}: frame {part.broken.frame}, the first to be checked, cannot be read "
+                f"({part.broken.reason})",
+                item="trajectory",
+            )
+        self.results.check = self._concluded(part)
+
+    @property
+    def check(self) -> CheckResult:
+        """What was found."""
+        result: CheckResult = self.results.check
+        return result
+
+    def _concluded(self, part: Part) -> CheckResult:
+        found, n_frames = part.found, len(part.frames)
+        held = self._table.set
+        half = self._precision.half_step(part.reach)
+        targets_half = half if self._mode != "given" else self._target_error
+        bound = self._reach * (half + np.where(self._from_file, half, targets_half))
+        allowed = bound + self._tolerance * self._scale
+        excess = found.largest - allowed
+        beyond_file = found.largest > bound
+        violated = excess > 0
+        broken = part.broken
+        if broken is None and self._path and int(part.frames[-1]) == self._trajectory.n_frames - 1:
+            rest = leftover(
+                self._path,
+                self._format,
+                self._trajectory.n_frames,
+                self._trajectory.n_atoms,
+                last_offset(self._trajectory),
+            )
+            broken = Break(self._trajectory.n_frames, rest) if rest else None
+        # Rounding of the file and of the targets; that of a mean averages out.
+        of_target = np.where(self._from_file & (self._mode != "mean"), half, self._target_error)
+        rounding = self._spread * np.sqrt(half**2 + of_target**2)
+        units = self._by_unit(part, bound, rounding)
+        order = np.argsort(-(found.largest / np.maximum(allowed, np.finfo(float).tiny)), kind="stable")
+        worst = [self._row(int(row), part, allowed) for row in order[: self._n_worst]]
+        in_frame = np.zeros(n_frames, dtype=bool)
+        for unit in range(len(UNITS)):
+            rows = found.worst_row[unit]
+            # The worst row of a frame need not be the one that is least allowed, so take the smallest allowance.
+            mine = self._table.units == unit
+            if mine.any():
+                in_frame |= (rows >= 0) & (found.worst[unit] > np.where(rows >= 0, allowed[rows], np.inf))
+        frames = part.frames[in_frame]
+        status = "violated" if violated.any() else "tolerated" if beyond_file.any() else "kept"
+        rank, freedom, temperature = self._temperature(part)
+        series = {
+            f"{name} {UNITS[unit]}": values[unit].tolist()
+            for unit in range(len(UNITS))
+            if (self._table.units == unit).any()
+            for name, values in (("largest", found.worst), ("rms", self._rms(found)))
+        }
+        if temperature is not None:
+            assert freedom is not None
+            series["temperature K"] = (part.twice_kinetic / (BOLTZMANN * freedom)).tolist()
+        return CheckResult(
+            trajectory=self._names[0],
+            topology=self._names[1],
+            n_atoms=held.n_atoms,
+            n_rows=held.n_rows,
+            n_constrained=len(held.touched),
+            status=status,
+            verdict=self._verdict(status, worst[0], units, int(violated.sum()), frames, n_frames),
+            precision=self._precision.describe(part.reach),
+            tolerance=self._tolerance,
+            targets=self._target_text,
+            frames=part.frames.tolist(),
+            times=part.times.tolist(),
+            n_frames_in_file=int(self._trajectory.n_frames),
+            units=units,
+            worst=worst,
+            violated_rows=int(violated.sum()),
+            violated_frames=int(in_frame.sum()),
+            first_violated_frame=int(frames[0]) if len(frames) else None,
+            rank=rank,
+            degrees_of_freedom=freedom,
+            temperature=temperature,
+            broken=broken,
+            series=series,
+            remarks=list(self._remarks),
+        )
+
+    def _rms(self, found: Deviations) -> FloatArray:
+        counts = np.array([[np.count_nonzero(self._table.units == unit)] for unit in range(len(UNITS))])
+        result: FloatArray = np.sqrt(found.squares / np.maximum(counts, 1))
+        return result
+
+    def _by_unit(self, part: Part, bound: FloatArray, rounding: FloatArray) -> list[UnitResult]:
+        found, n_frames = part.found, len(part.frames)
+        result = []
+        rms = self._rms(found)
+        for unit, name in enumerate(UNITS):
+            mine = self._table.units == unit
+            n = int(mine.sum())
+            if not n:
+                continue
+            rates = np.isfinite(found.rate_squares[unit])
+            rate_rms = float(np.sqrt(found.rate_squares[unit][rates].mean() / n)) if rates.any() else None
+            result.append(
+                UnitResult(
+                    unit=name,
+                    n_rows=n,
+                    largest=float(found.largest[mine].max()),
+                    rms=float(np.sqrt(found.squares[unit].sum() / (n * n_frames))),
+                    mean=float(found.sums[unit].sum() / (n * n_frames)),
+                    bound=float(bound[mine].max()),
+                    rounding_rms=float(np.sqrt(np.mean(rounding[mine] ** 2))),
+                    largest_mean=float(np.abs(found.total[mine]).max() / n_frames),
+                    drift=fitted(part.times, rms[unit]),
+                    rate_largest=float(np.nanmax(found.rate_worst[unit])) if rates.any() else None,
+                    rate_rms=rate_rms,
+                )
+            )
+        return result
+
+    def _row(self, row: int, part: Part, allowed: FloatArray) -> RowResult:
+        found, held = part.found, self._table.set
+        unit = int(self._table.units[row])
+        item, k = held.locate(row)
+        at = np.flatnonzero((found.worst_row[unit] == row) & (found.worst[unit] >= found.largest[row]))
+        atoms = item.atoms[k]
+        return RowResult(
+            row=row,
+            name=f"{item.family} {self._labels.row(atoms)}",
+            atoms=[int(a) for a in atoms],
+            unit=UNITS[unit],
+            target=float(item.target_at(float(part.times[0]))[k]),
+            largest=float(found.largest[row]),
+            mean=float(found.total[row] / len(part.frames)),
+            allowed=float(allowed[row]),
+            frame=int(part.frames[at[0]]) if len(at) else None,
+        )
+
+    def _temperature(self, part: Part) -> tuple[int | None, int | None, dict[str, float] | None]:
+        rank = self._rank
+        if rank is None:
+            return None, None, None
+        masses = self._masses if self._masses is not None else self._unit_masses
+        moving = int(np.count_nonzero(masses > 0))
+        freedom = 3 * moving - rank
+        twice = part.twice_kinetic
+        has = np.isfinite(twice)
+        if self._masses is None or not has.any():
+            return rank, max(freedom - (self._removed or 0), 0), None
+        removed = self._removed
+        if removed is None:
+            centre = np.einsum("ij,ij->i", part.momentum[has], part.momentum[has]) / self._masses.sum()
+            still = float(centre.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
+            removed = 3 if still and freedom > 3 else 0
+            what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
+            self._remarks.append(f"the centre of mass is {what}")
+        freedom -= removed
+        if freedom <= 0:
+            self._remarks.append("no temperature: the constraints leave no degree of freedom")
+            return rank, 0, None
+        kelvin = twice / (BOLTZMANN * freedom)
+        line = fitted(part.times, kelvin)
+        temperature = {
+            "mean": float(np.nanmean(kelvin)),
+            "deviation": float(np.nanstd(kelvin)),
+            "frames": float(has.sum()),
+            "slope": line.slope if line else float("nan"),
+            "slope_error": line.error if line else float("nan"),
+        }
+        return rank, freedom, temperature
+
+    def _verdict(
+        self, status: str, row: RowResult, units: list[UnitResult], n_rows: int, frames: IntArray, n_frames: int
+    ) -> str:
+        most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
+        if status == "kept":
+            return f"kept to the precision of the file: largest deviation {most}"
+        if status == "tolerated":
+            return f"kept to the tolerance of {self._tolerance:g}: largest deviation {most}"
+        where = f" in frame {row.frame}" if row.frame is not None else ""
+        seen = f"; {len(frames)} of {n_frames} frames, from frame {frames[0]}" if len(frames) else ""
+        return (
+            f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): "
+            f"{row.name}{where}; {n_rows} of {len(self._table.units)} rows{seen}"
+        )
+
+
+def _flat(values: Any) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
+
+
+def _format(reader: Any) -> str:
+    name = getattr(reader, "format", "")
+    return str(name if isinstance(name, str) else name[0]).upper()

@@ -1,0 +1,155 @@
+"""What a check of a trajectory found: plain data for tables, plots and files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Straight line through one number a frame."""
+
+    slope: float
+    error: float
+    change: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the slope exceeds three times its standard error."""
+        return abs(self.slope) > 3 * self.error
+
+
+def fitted(times: FloatArray, values: FloatArray) -> Drift | None:
+    """Least squares of values against times; None for fewer than three times."""
+    good = np.isfinite(values) & np.isfinite(times)
+    t, y = times[good], values[good]
+    if len(t) < 3 or not np.ptp(t) > 0:
+        return None
+    d = t - t.mean()
+    slope = float(d @ y / (d @ d))
+    rest = y - y.mean() - slope * d
+    error = math.sqrt(float(rest @ rest) / (len(t) - 2) / float(d @ d))
+    return Drift(slope, error, slope * float(np.ptp(t)))
+
+
+@dataclass(frozen=True)
+class UnitResult:
+    """Rows of one natural unit.
+
+    Attributes
+    ----------
+    unit : str
+    n_rows : int
+    largest, rms, mean : float
+        Over all rows and frames: largest absolute deviation, root mean square, mean.
+    bound : float
+        What rounding in the file makes of a row that is kept, at most.
+    rounding_rms : float
+        The root mean square of rounding alone.
+    largest_mean : float
+        Largest absolute mean of a row over the frames: rounding averages out of it.
+    drift : Drift or None
+        Of the root mean square, an ps.
+    rate_largest, rate_rms : float or None
+        Of A v, where velocities are stored.
+    """
+
+    unit: str
+    n_rows: int
+    largest: float
+    rms: float
+    mean: float
+    bound: float
+    rounding_rms: float
+    largest_mean: float
+    drift: Drift | None
+    rate_largest: float | None = None
+    rate_rms: float | None = None
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """One of the worst rows."""
+
+    row: int
+    name: str
+    atoms: list[int]
+    unit: str
+    target: float
+    largest: float
+    mean: float
+    allowed: float
+    frame: int | None
+
+
+@dataclass(frozen=True)
+class Break:
+    """Where a trajectory cannot be read any further."""
+
+    frame: int
+    reason: str
+
+
+@dataclass
+class CheckResult:
+    """All that a check found.
+
+    Attributes
+    ----------
+    status : {'kept', 'tolerated', 'violated'}
+        Kept to the precision of the file; kept to the tolerance given; neither.
+    verdict : str
+        The same in a sentence.
+    frames, times : list
+        Frames looked at, and their times in ps.
+    units : list of UnitResult
+    worst : list of RowResult
+        Rows by how far they exceed what is allowed.
+    series : dict
+        Numbers by frame: largest and root mean square deviation for each unit, temperature.
+    rank, degrees_of_freedom : int or None
+        None where the rank could not be found; see `remarks`.
+    temperature : dict or None
+        Mean, standard deviation and drift in K; None without velocities or masses.
+    broken : Break or None
+        Where the file ends too early.
+    """
+
+    trajectory: str
+    topology: str
+    n_atoms: int
+    n_rows: int
+    n_constrained: int
+    status: str
+    verdict: str
+    precision: str
+    tolerance: float
+    targets: str
+    frames: list[int]
+    times: list[float]
+    n_frames_in_file: int
+    units: list[UnitResult]
+    worst: list[RowResult]
+    violated_rows: int
+    violated_frames: int
+    first_violated_frame: int | None
+    rank: int | None
+    degrees_of_freedom: int | None
+    temperature: dict[str, float] | None
+    broken: Break | None
+    series: dict[str, list[float]]
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def violated(self) -> bool:
+        return self.status == "violated"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data; NaN where a number does not exist."""
+        return asdict(self)

@@ -1,0 +1,246 @@
+"""All rows of a set in one frame after another: compiled for lengths, by the constraint objects for the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import NonFiniteError
+from kcons.solvers.frames import coordinate_grid, length_rates, lengths, padded
+from kcons.solvers.lattice import NO_LATTICE
+
+#: Natural units of rows, in this order.
+UNITS = ("Å", "rad")
+
+
+def unit_of(item: Constraint) -> int:
+    """Which of `UNITS` the coordinate of a constraint has; coordinates of one's own count as lengths."""
+    return int(item.family in ("Angle", "Dihedral") or item.period is not None)
+
+
+@dataclass
+class Deviations:
+    """What was found in some frames: by row, and by unit (see `UNITS`) in each frame.
+
+    Attributes
+    ----------
+    largest, total : ndarray, shape (n_rows,)
+        Largest absolute deviation, and the sum of deviations over the frames.
+    worst, worst_row, sums, squares : ndarray, shape (n_units, n_frames)
+        In each frame: the largest absolute deviation and its row, sum and sum of squares.
+    rate_worst, rate_row, rate_squares : ndarray, shape (n_units, n_frames)
+        The same of A v, NaN without velocities.
+    """
+
+    n_rows: int
+    n_frames: int
+    largest: FloatArray = field(init=False)
+    total: FloatArray = field(init=False)
+    worst: FloatArray = field(init=False)
+    worst_row: IntArray = field(init=False)
+    sums: FloatArray = field(init=False)
+    squares: FloatArray = field(init=False)
+    rate_worst: FloatArray = field(init=False)
+    rate_row: IntArray = field(init=False)
+    rate_squares: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.largest, self.total = np.zeros(self.n_rows), np.zeros(self.n_rows)
+        shape = (len(UNITS), self.n_frames)
+        self.worst, self.sums, self.squares = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self.rate_worst, self.rate_squares = np.full(shape, np.nan), np.full(shape, np.nan)
+        self.worst_row, self.rate_row = np.full(shape, -1, np.int64), np.full(shape, -1, np.int64)
+
+    def cut(self, n_frames: int) -> None:
+        """Leave out what was not reached."""
+        self.n_frames = n_frames
+        for name in ("worst", "sums", "squares", "rate_worst", "rate_squares", "worst_row", "rate_row"):
+            setattr(self, name, getattr(self, name)[:, :n_frames])
+
+    def with_next(self, other: Deviations) -> Deviations:
+        """Both, one after the other."""
+        both = Deviations(self.n_rows, 0)
+        both.n_frames = self.n_frames + other.n_frames
+        both.largest = np.maximum(self.largest, other.largest)
+        both.total = self.total + other.total
+        for name in ("worst", "sums", "squares", "rate_worst", "rate_squares", "worst_row", "rate_row"):
+            setattr(both, name, np.concatenate([getattr(self, name), getattr(other, name)], axis=1))
+        return both
+
+
+class RowTable:
+    """Rows of a set, laid out for reading many frames.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+        In angstrom, with all targets.
+    grid : float
+        Steps of the coordinates in the file, in angstrom, where these can be had back exactly; 0 otherwise.
+    """
+
+    def __init__(self, constraint_set: ConstraintSet, grid: float) -> None:
+        self.set = constraint_set
+        self.grid = grid
+        self.units: IntArray = np.concatenate(
+            [np.full(c.n_rows, unit_of(c), dtype=np.int64) for c in constraint_set.constraints] or [np.zeros(0, int)]
+        )
+        plain = [c.family == "Distance" and not c.moving for c in constraint_set.constraints]
+        ranges = [np.arange(a, b) for a, b in zip(constraint_set.starts[:-1], constraint_set.starts[1:], strict=True)]
+        none = np.zeros(0, dtype=np.int64)
+        self.length_rows: IntArray = np.concatenate(
+            [r for r, is_plain in zip(ranges, plain, strict=True) if is_plain] or [none]
+        )
+        self.other_rows: IntArray = np.concatenate(
+            [r for r, is_plain in zip(ranges, plain, strict=True) if not is_plain] or [none]
+        )
+        pairs = [c.atoms for c, is_plain in zip(constraint_set.constraints, plain, strict=True) if is_plain]
+        held = [c.target_at(0.0) for c, is_plain in zip(constraint_set.constraints, plain, strict=True) if is_plain]
+        self._places, self._targets = padded(
+            np.concatenate(pairs or [np.zeros((0, 2), np.int64)]), np.concatenate(held or [np.zeros(0)])
+        )
+        self._largest, self._total = np.zeros(len(self._targets)), np.zeros(len(self._targets))
+        self._others: ConstraintSet | None = None
+        if len(self.other_rows):
+            self._others, self._other_atoms = constraint_set.subset(self.other_rows)
+            self._other_units = self.units[self.other_rows]
+            self._holonomic = self._others.holonomic
+
+    # -- cell -----------------------------------------------------------------------------------
+
+    def cell_of(self, dimensions: NDArray[np.float32] | None) -> tuple[FloatArray, float]:
+        """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width."""
+        if dimensions is None:
+            return NO_LATTICE, np.inf
+        a, b, c, alpha, beta, gamma = (float(value) for value in dimensions)
+        if alpha == beta == gamma == 90.0 and min(a, b, c) > 0:
+            lattice = np.zeros((2, 3, 3))
+            for k, side in enumerate((a, b, c)):
+                lattice[0, k, k], lattice[1, k, k] = side, 1.0 / side
+            return lattice, (0.5 * min(a, b, c)) ** 2
+        matrix = cell_matrix(dimensions)
+        if matrix is None:
+            return NO_LATTICE, np.inf
+        inverse = np.linalg.inv(matrix)
+        half = 0.5 / float(np.linalg.norm(inverse, axis=0).max())
+        return np.ascontiguousarray(np.stack([matrix, inverse])), half * half
+
+    # -- one frame ------------------------------------------------------------------------------
+
+    def look(
+        self,
+        into: Deviations,
+        k: int,
+        x: NDArray[np.float32],
+        v: NDArray[np.float32] | None,
+        dimensions: NDArray[np.float32] | None,
+        time: float,
+    ) -> None:
+        """Put what is found in one frame into the k-th place.
+
+        Parameters
+        ----------
+        x, v : ndarray of float32, shape (3 n_atoms,)
+            Positions in angstrom and velocities in angstrom/ps.
+        dimensions : ndarray or None
+            Lengths and angles of the cell.
+        time : float
+            For targets that move.
+
+        Raises
+        ------
+        NonFiniteError
+            A coordinate of a held atom is NaN or infinite.
+        """
+        lattice, limit = self.cell_of(dimensions)
+        if len(self.length_rows):
+            sums, squares, worst, row = lengths(
+                x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total
+            )
+            if not squares < np.inf:
+                self._refuse(x)
+            into.sums[0, k], into.squares[0, k] = sums, squares
+            into.worst[0, k], into.worst_row[0, k] = worst, self.length_rows[row]
+            if v is not None:
+                n = len(self.length_rows)
+                squares, worst, row = length_rates(x, v, self._places, n, limit, lattice, self.grid)
+                into.rate_squares[0, k] = squares
+                into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
+        if self._others is not None:
+            self._look_at_others(into, k, x, v, lattice if limit < np.inf else None, time)
+
+    def collect(self, into: Deviations) -> None:
+        """Put what was found by row where it belongs, and begin anew."""
+        n = len(self.length_rows)
+        into.largest[self.length_rows] = self._largest[:n]
+        into.total[self.length_rows] = self._total[:n]
+        self._largest[:], self._total[:] = 0.0, 0.0
+
+    def _look_at_others(
+        self,
+        into: Deviations,
+        k: int,
+        x: NDArray[np.float32],
+        v: NDArray[np.float32] | None,
+        lattice: FloatArray | None,
+        time: float,
+    ) -> None:
+        others = cast(ConstraintSet, self._others)
+        others.lattice = lattice
+        here = coordinate_grid(x.reshape(-1, 3)[self._other_atoms], self.grid)
+        with np.errstate(all="ignore"):
+            off = others.value(here, time)
+        if not np.isfinite(off).all():
+            self._refuse(x)
+        size = np.abs(off)
+        into.largest[self.other_rows] = np.maximum(into.largest[self.other_rows], size)
+        into.total[self.other_rows] += off
+        for unit in range(len(UNITS)):
+            mine = self._other_units == unit
+            if mine.any():
+                into.sums[unit, k] += off[mine].sum()
+                into.squares[unit, k] += off[mine] @ off[mine]
+                best = int(np.argmax(np.where(mine, size, -1.0)))
+                if into.worst_row[unit, k] < 0 or size[best] > into.worst[unit, k]:
+                    into.worst[unit, k], into.worst_row[unit, k] = size[best], self.other_rows[best]
+        if v is None:
+            return
+        speeds = v.reshape(-1, 3)[self._other_atoms].astype(np.float64)
+        rates = np.abs(others.jacobian(here, time) @ speeds.ravel() - others.velocity_target(here, time))
+        for unit in range(len(UNITS)):
+            mine = self._other_units == unit
+            if mine.any():
+                best = int(np.argmax(np.where(mine, rates, -1.0)))
+                before = into.rate_squares[unit, k]
+                into.rate_squares[unit, k] = (0.0 if np.isnan(before) else before) + rates[mine] @ rates[mine]
+                if not into.rate_worst[unit, k] >= rates[best]:
+                    into.rate_worst[unit, k], into.rate_row[unit, k] = rates[best], self.other_rows[best]
+
+    def _refuse(self, x: NDArray[np.float32]) -> None:
+        points = x.reshape(-1, 3)
+        bad = self.set.touched[~np.isfinite(points[self.set.touched]).all(axis=1)]
+        if len(bad):
+            raise NonFiniteError(f"position of atom {bad[0]} is {points[bad[0]]}", item="position", atom=int(bad[0]))
+        raise NonFiniteError("a row is undefined: atoms coincide or are collinear", item="position")
+
+
+def cell_matrix(dimensions: Any) -> FloatArray | None:
+    """Cell vectors as rows, from lengths and angles; None without a cell."""
+    if dimensions is None or not np.all(np.asarray(dimensions)[:3] > 0):
+        return None
+    a, b, c, alpha, beta, gamma = (float(value) for value in dimensions)
+    # Exactly 90 degrees has no rounding.
+    cosines = [0.0 if angle == 90.0 else float(np.cos(np.radians(angle))) for angle in (alpha, beta, gamma)]
+    sine = 1.0 if gamma == 90.0 else float(np.sin(np.radians(gamma)))
+    x, y = c * cosines[1], c * (cosines[0] - cosines[1] * cosines[2]) / sine
+    rest = c * c - x * x - y * y
+    if not (rest > 0 and sine > 0):
+        return None
+    return np.array([[a, 0.0, 0.0], [b * cosines[2], b * sine, 0.0], [x, y, np.sqrt(rest)]])

@@ -1,0 +1,168 @@
+"""Lengths and angles from a parameter file.
+
+A TOML (or JSON) file lists lengths by elements or atom names; the first entry that fits a row gives its target::
+
+    unit = "angstrom"            # or "nm"
+
+    [[length]]
+    atoms = ["OW", "HW?"]        # names, with * and ?
+    residue = "SOL"              # optional
+    value = 1.0
+
+    [[length]]
+    elements = ["C", "H"]
+    value = 1.09
+
+    [[angle]]
+    elements = ["H", "O", "H"]   # the vertex in the middle
+    value = 104.52               # degrees
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcons.constraints import Constraint
+from kcons.errors import InputError
+from kcons.mdanalysis.names import AtomNames
+
+_WIDTH = {"length": 2, "angle": 3}
+_FAMILY = {"Distance": "length", "Angle": "angle"}
+_UNITS = {"angstrom": 1.0, "Å": 1.0, "A": 1.0, "nm": 10.0, "nanometer": 10.0}
+_KEYS = {"atoms", "elements", "residue", "value"}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One entry: what it fits, and the target in angstrom or radian."""
+
+    kind: str
+    by: str
+    patterns: tuple[str, ...]
+    residue: str
+    value: float
+
+    def fits(self, names: AtomNames, atoms: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which rows it fits, in either direction; `atoms` of shape (n_rows, width)."""
+        labels = names.names if self.by == "atoms" else names.elements
+        if self.by == "elements":
+            labels = np.char.capitalize(labels)
+        wanted = [p.capitalize() if self.by == "elements" else p for p in self.patterns]
+        forth = _all_match(labels, atoms, wanted)
+        back = _all_match(labels, atoms, wanted[::-1])
+        residues = _all_match(names.residues, atoms, [self.residue] * atoms.shape[1])
+        return (forth | back) & residues
+
+
+def _all_match(labels: NDArray[np.str_], atoms: NDArray[np.int64], patterns: Sequence[str]) -> NDArray[np.bool_]:
+    found = np.ones(len(atoms), dtype=bool)
+    for slot, pattern in enumerate(patterns):
+        if pattern == "*":
+            continue
+        distinct, place = np.unique(labels[atoms[:, slot]], return_inverse=True)
+        found &= np.array([fnmatchcase(str(label), pattern) for label in distinct], dtype=bool)[place]
+    return found
+
+
+class TargetFile:
+    """Targets that a file gives.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML, or JSON if it ends in .json.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or malformed, an entry with a wrong number of names, a value out of range.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise InputError(
+                f"there is no file {path} with targets; give 'topology', 'first', 'mean', or a TOML file of lengths",
+                item="targets",
+            )
+        try:
+            text = self.path.read_text(encoding="utf-8")
+            data = json.loads(text) if self.path.suffix.lower() == ".json" else tomllib.loads(text)
+        except (ValueError, OSError) as error:
+            raise InputError(f"{path}: no readable TOML or JSON ({error})", item="targets") from None
+        self.rules = self._rules(data)
+
+    def _rules(self, data: Any) -> list[Rule]:
+        if not isinstance(data, dict) or not set(data) <= {"unit", *_WIDTH}:
+            wrong = sorted(set(data) - {"unit", *_WIDTH}) if isinstance(data, dict) else ["a list"]
+            raise InputError(
+                f"{self.path}: {wrong[0]!r} is unknown; there are unit, [[length]] and [[angle]]", item="targets"
+            )
+        unit = data.get("unit", "angstrom")
+        if unit not in _UNITS:
+            raise InputError(f"{self.path}: unit {unit!r} is unknown; give 'angstrom' or 'nm'", item="unit")
+        rules = []
+        for kind in _WIDTH:
+            for number, entry in enumerate(data.get(kind, []), 1):
+                rules.append(self._rule(kind, f"{self.path}: [[{kind}]] number {number}", entry, _UNITS[unit]))
+        if not rules:
+            raise InputError(f"{self.path} has no [[length]] and no [[angle]]", item="targets")
+        return rules
+
+    def _rule(self, kind: str, where: str, entry: Any, scale: float) -> Rule:
+        if not isinstance(entry, dict) or not set(entry) <= _KEYS or "value" not in entry:
+            raise InputError(f"{where} needs value and atoms or elements, and knows residue besides", item="targets")
+        by = [key for key in ("atoms", "elements") if key in entry]
+        if len(by) != 1:
+            raise InputError(f"{where}: give either atoms or elements", item="targets")
+        patterns, width = entry[by[0]], _WIDTH[kind]
+        if not isinstance(patterns, list) or len(patterns) != width or not all(isinstance(p, str) for p in patterns):
+            raise InputError(f"{where}: {by[0]} must be {width} names, not {patterns!r}", item=by[0])
+        value = entry["value"]
+        top = 180.0 if kind == "angle" else math.inf
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < top:
+            what = "an angle between 0 and 180 degrees" if kind == "angle" else "a positive length"
+            raise InputError(f"{where}: value is {value!r}; give {what}", item="value")
+        target = math.radians(value) if kind == "angle" else float(value) * scale
+        return Rule(kind, by[0], tuple(patterns), str(entry.get("residue", "*")), target)
+
+    def apply(self, constraints: Sequence[Constraint], names: AtomNames) -> list[Constraint]:
+        """Constraints with the targets that the file gives; families other than distances and angles keep theirs.
+
+        Raises
+        ------
+        InputError
+            A row that no entry fits.
+        """
+        result = []
+        for item in constraints:
+            kind = _FAMILY.get(item.family)
+            if kind is None:
+                result.append(item)
+                continue
+            targets = np.full(item.n_rows, np.nan)
+            for rule in self.rules:
+                open_rows = np.flatnonzero(np.isnan(targets))
+                if rule.kind == kind and len(open_rows):
+                    targets[open_rows[rule.fits(names, item.atoms[open_rows])]] = rule.value
+            missing = np.flatnonzero(np.isnan(targets))
+            if len(missing):
+                atoms = item.atoms[missing[0]]
+                raise InputError(
+                    f"{self.path} has no {kind} for {names.row(atoms)} ({'-'.join(names.elements[atoms])}; "
+                    f"{len(missing)} rows in all); add a [[{kind}]] with atoms or elements that fit",
+                    item="targets",
+                    atoms=atoms.tolist(),
+                )
+            result.append(item.with_target(targets))
+        return result
