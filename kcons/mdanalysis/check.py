@@ -33,6 +33,8 @@ from kcons.solvers.frames import coordinate_grid, kinetic
 BOLTZMANN = 0.831446261815324
 #: Times a run that the largest coordinate is looked up.
 SAMPLES = 32
+#: Frames, at least, that a mean of a row is taken over, and one in how many frames at least.
+SUMMED, MOST_SKIPPED = 100, 8
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1
 #: Part of the kinetic energy that the centre of mass may have where its motion is removed.
@@ -197,10 +199,12 @@ class ConstraintCheck(AnalysisBase):
                 item="constraints",
                 atoms=[int(used[-1])],
             )
+        reason = ""
+        masses = np.zeros(0)
         try:
             masses = np.asarray(universe.atoms.masses, dtype=np.float64)
         except (NoDataError, AttributeError):
-            masses, reason = None, "the topology has no masses"
+            reason = "the topology has no masses"
         else:
             bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
             reason = f"{self._labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}" if len(bad) else ""
@@ -302,7 +306,7 @@ class ConstraintCheck(AnalysisBase):
         """Take the means that the first pass found as targets."""
         part: Part = self.results.part
         held = self._table.set
-        means = part.found.total / max(len(part.frames), 1)
+        means = part.found.total / max(part.found.n_summed, 1)
         moved = [
             item if item.moving or not item.holonomic else item.with_target(item.target_at(0.0) + means[a:b])
             for item, a, b in zip(held.constraints, held.starts[:-1], held.starts[1:], strict=True)
@@ -333,6 +337,8 @@ class ConstraintCheck(AnalysisBase):
         )
         done = 0
         every = max(n // SAMPLES, 1)
+        # Means need all frames; what is only told about rows does not.
+        sums = 1 if self._pass_of_means else min(max(n // SUMMED, 1), MOST_SKIPPED)
         verbose = getattr(self, "_verbose", False) if verbose is None else verbose
         turns = ProgressBar(range(n), verbose=verbose, **(progressbar_kwargs or {})) if verbose else range(n)
         trajectory = self._trajectory
@@ -344,7 +350,7 @@ class ConstraintCheck(AnalysisBase):
                 try:
                     ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
                     previous = frame
-                    self._look(part, k, ts, k % every == 0 or k == n - 1)
+                    self._look(part, k, ts, k % every == 0 or k == n - 1, k % sums == 0)
                 except (*READ_ERRORS, KconsError, FloatingPointError) as error:
                     part.broken = Break(frame, self._reason(error, frame))
                     break
@@ -365,12 +371,12 @@ class ConstraintCheck(AnalysisBase):
         lines = str(error).strip().splitlines()
         return lines[0].strip() if lines else "the file ends"
 
-    def _look(self, part: Part, k: int, ts: Any, sample: bool) -> None:
+    def _look(self, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
         x = _flat(ts.positions)
         v = _flat(ts.velocities) if ts.has_velocities else None
         time = float(ts.time)
         part.times[k] = time
-        self._table.look(part.found, k, x, v, ts.dimensions, time)
+        self._table.look(part.found, k, x, v, ts.dimensions, time, summed)
         if sample:
             part.reach = max(part.reach, float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
         if v is not None and self._masses is not None:
@@ -498,7 +504,7 @@ class ConstraintCheck(AnalysisBase):
                     mean=float(found.sums[unit].sum() / (n * n_frames)),
                     bound=float(bound[mine].max()),
                     rounding_rms=float(np.sqrt(np.mean(rounding[mine] ** 2))),
-                    largest_mean=float(np.abs(found.total[mine]).max() / n_frames),
+                    largest_mean=float(np.abs(found.total[mine]).max() / found.n_summed),
                     drift=fitted(part.times, rms[unit]),
                     rate_largest=float(np.nanmax(found.rate_worst[unit])) if rates.any() else None,
                     rate_rms=rate_rms,
@@ -519,7 +525,7 @@ class ConstraintCheck(AnalysisBase):
             unit=UNITS[unit],
             target=float(item.target_at(float(part.times[0]))[k]),
             largest=float(found.largest[row]),
-            mean=float(found.total[row] / len(part.frames)),
+            mean=float(found.total[row] / found.n_summed),
             allowed=float(allowed[row]),
             frame=int(part.frames[at[0]]) if len(at) else None,
         )

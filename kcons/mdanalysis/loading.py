@@ -194,7 +194,7 @@ def _dcd_end(path: str | Path, n_frames: int) -> int:
         file.seek(0)
         for _ in range(3):
             skip()
-        ends = []
+        ends: list[int] = []
         for _ in range(2):
             start = file.tell()
             if start >= size or n_frames <= len(ends):

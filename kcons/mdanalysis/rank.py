@@ -35,10 +35,9 @@ def rank_of(constraint_set: ConstraintSet, positions: FloatArray) -> int:
     rank, start = 0, 0
     while start < n:
         # As many whole clusters as fit, at least one.
-        end = ends[
-            max(np.searchsorted(ends, start + PIECE, side="right") - 1, np.searchsorted(ends, start, side="right"))
-        ]
+        fitting, next_one = np.searchsorted(ends, [start + PIECE, start], side="right")
+        end = int(ends[max(fitting - 1, next_one)])
         part, numbers = constraint_set.subset(np.sort(order[start:end]))
         rank += Motion(part, positions[numbers]).rank
-        start = int(end)
+        start = end
     return rank

@@ -32,7 +32,9 @@ class Deviations:
     Attributes
     ----------
     largest, total : ndarray, shape (n_rows,)
-        Largest absolute deviation, and the sum of deviations over the frames.
+        Largest absolute deviation; sum of the deviations over the frames that were summed.
+    n_summed : int
+        How many these are.
     worst, worst_row, sums, squares : ndarray, shape (n_units, n_frames)
         In each frame: the largest absolute deviation and its row, sum and sum of squares.
     rate_worst, rate_row, rate_squares : ndarray, shape (n_units, n_frames)
@@ -41,6 +43,7 @@ class Deviations:
 
     n_rows: int
     n_frames: int
+    n_summed: int = 0
     largest: FloatArray = field(init=False)
     total: FloatArray = field(init=False)
     worst: FloatArray = field(init=False)
@@ -70,6 +73,7 @@ class Deviations:
         both.n_frames = self.n_frames + other.n_frames
         both.largest = np.maximum(self.largest, other.largest)
         both.total = self.total + other.total
+        both.n_summed = self.n_summed + other.n_summed
         for name in ("worst", "sums", "squares", "rate_worst", "rate_squares", "worst_row", "rate_row"):
             setattr(both, name, np.concatenate([getattr(self, name), getattr(other, name)], axis=1))
         return both
@@ -89,24 +93,27 @@ class RowTable:
     def __init__(self, constraint_set: ConstraintSet, grid: float) -> None:
         self.set = constraint_set
         self.grid = grid
+        self._dimensions: tuple[float, ...] = ()
+        self._box = np.zeros((2, 3, 3))
+        self._cell: tuple[FloatArray, float] = NO_LATTICE, np.inf
         self.units: IntArray = np.concatenate(
             [np.full(c.n_rows, unit_of(c), dtype=np.int64) for c in constraint_set.constraints] or [np.zeros(0, int)]
         )
-        plain = [c.family == "Distance" and not c.moving for c in constraint_set.constraints]
-        ranges = [np.arange(a, b) for a, b in zip(constraint_set.starts[:-1], constraint_set.starts[1:], strict=True)]
         none = np.zeros(0, dtype=np.int64)
-        self.length_rows: IntArray = np.concatenate(
-            [r for r, is_plain in zip(ranges, plain, strict=True) if is_plain] or [none]
-        )
-        self.other_rows: IntArray = np.concatenate(
-            [r for r, is_plain in zip(ranges, plain, strict=True) if not is_plain] or [none]
-        )
-        pairs = [c.atoms for c, is_plain in zip(constraint_set.constraints, plain, strict=True) if is_plain]
-        held = [c.target_at(0.0) for c, is_plain in zip(constraint_set.constraints, plain, strict=True) if is_plain]
-        self._places, self._targets = padded(
-            np.concatenate(pairs or [np.zeros((0, 2), np.int64)]), np.concatenate(held or [np.zeros(0)])
-        )
-        self._largest, self._total = np.zeros(len(self._targets)), np.zeros(len(self._targets))
+        pairs, held, length_rows, other_rows = [np.zeros((0, 2), np.int64)], [np.zeros(0)], [none], [none]
+        for item, first, end in zip(
+            constraint_set.constraints, constraint_set.starts[:-1], constraint_set.starts[1:], strict=True
+        ):
+            if item.family == "Distance" and not item.moving:
+                length_rows.append(np.arange(first, end))
+                pairs.append(item.atoms)
+                held.append(item.target_at(0.0))
+            else:
+                other_rows.append(np.arange(first, end))
+        self.length_rows: IntArray = np.concatenate(length_rows)
+        self.other_rows: IntArray = np.concatenate(other_rows)
+        self._places, self._targets = padded(np.concatenate(pairs), np.concatenate(held))
+        self._largest, self._total = np.zeros(len(self._targets), np.float32), np.zeros(len(self._targets))
         self._others: ConstraintSet | None = None
         if len(self.other_rows):
             self._others, self._other_atoms = constraint_set.subset(self.other_rows)
@@ -119,13 +126,20 @@ class RowTable:
         """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width."""
         if dimensions is None:
             return NO_LATTICE, np.inf
-        a, b, c, alpha, beta, gamma = (float(value) for value in dimensions)
-        if alpha == beta == gamma == 90.0 and min(a, b, c) > 0:
-            lattice = np.zeros((2, 3, 3))
-            for k, side in enumerate((a, b, c)):
-                lattice[0, k, k], lattice[1, k, k] = side, 1.0 / side
-            return lattice, (0.5 * min(a, b, c)) ** 2
-        matrix = cell_matrix(dimensions)
+        values = tuple(dimensions.tolist())
+        if values != self._dimensions:
+            self._dimensions, self._cell = values, self._new_cell(values)
+        return self._cell
+
+    def _new_cell(self, values: tuple[float, ...]) -> tuple[FloatArray, float]:
+        a, b, c, *angles = values
+        shortest = min(a, b, c)
+        if angles == [90.0, 90.0, 90.0] and shortest > 0:
+            box = self._box
+            box[0, 0, 0], box[0, 1, 1], box[0, 2, 2] = a, b, c
+            box[1, 0, 0], box[1, 1, 1], box[1, 2, 2] = 1.0 / a, 1.0 / b, 1.0 / c
+            return box, (0.5 * shortest) ** 2
+        matrix = cell_matrix(values)
         if matrix is None:
             return NO_LATTICE, np.inf
         inverse = np.linalg.inv(matrix)
@@ -142,6 +156,7 @@ class RowTable:
         v: NDArray[np.float32] | None,
         dimensions: NDArray[np.float32] | None,
         time: float,
+        summed: bool = True,
     ) -> None:
         """Put what is found in one frame into the k-th place.
 
@@ -153,6 +168,8 @@ class RowTable:
             Lengths and angles of the cell.
         time : float
             For targets that move.
+        summed : bool
+            Whether this frame counts in the sums by row.
 
         Raises
         ------
@@ -160,9 +177,10 @@ class RowTable:
             A coordinate of a held atom is NaN or infinite.
         """
         lattice, limit = self.cell_of(dimensions)
+        into.n_summed += summed
         if len(self.length_rows):
             sums, squares, worst, row = lengths(
-                x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total
+                x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total, summed
             )
             if not squares < np.inf:
                 self._refuse(x)
@@ -174,7 +192,7 @@ class RowTable:
                 into.rate_squares[0, k] = squares
                 into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
         if self._others is not None:
-            self._look_at_others(into, k, x, v, lattice if limit < np.inf else None, time)
+            self._look_at_others(into, k, x, v, lattice if limit < np.inf else None, time, summed)
 
     def collect(self, into: Deviations) -> None:
         """Put what was found by row where it belongs, and begin anew."""
@@ -191,6 +209,7 @@ class RowTable:
         v: NDArray[np.float32] | None,
         lattice: FloatArray | None,
         time: float,
+        summed: bool,
     ) -> None:
         others = cast(ConstraintSet, self._others)
         others.lattice = lattice
@@ -201,7 +220,8 @@ class RowTable:
             self._refuse(x)
         size = np.abs(off)
         into.largest[self.other_rows] = np.maximum(into.largest[self.other_rows], size)
-        into.total[self.other_rows] += off
+        if summed:
+            into.total[self.other_rows] += off
         for unit in range(len(UNITS)):
             mine = self._other_units == unit
             if mine.any():

@@ -136,6 +136,20 @@ def _larger(typingctx, a, b):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def _enlarge(typingctx, table, k, value):  # type: ignore[no-untyped-def]
+    """Raise four numbers of a float32 array to those of a quad that are larger."""
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]], inbounds=True), ir.PointerType(_SINGLES))
+        new, old = builder.fptrunc(args[2], _SINGLES), builder.load(place, align=4)
+        builder.store(builder.select(builder.fcmp_ordered(">", new, old), new, old), place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(table, types.int64, quad_type), codegen
+
+
+@intrinsic
 def _all_below(typingctx, value, limit):  # type: ignore[no-untyped-def]
     """Whether all four numbers are below `limit`; False with a NaN."""
 
@@ -184,7 +198,7 @@ def _square(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def lengths(x, places, targets, limit, lattice, step, largest, total):  # type: ignore[no-untyped-def]
+def lengths(x, places, targets, limit, lattice, step, largest, total, summed):  # type: ignore[no-untyped-def]
     """Deviations of all lengths in one frame.
 
     Parameters
@@ -199,8 +213,12 @@ def lengths(x, places, targets, limit, lattice, step, largest, total):  # type: 
         Cell and its inverse.
     step : float
         Grid of the coordinates in the file, such as 0.01 A of XTC; 0 if there is none.
-    largest, total : ndarray, shape (rows,)
-        Changed in place: largest absolute deviation and sum of deviations, by row.
+    largest : ndarray of float32, shape (rows,)
+        Changed in place: largest absolute deviation, by row.
+    total : ndarray, shape (rows,)
+        Changed in place if `summed`: sum of deviations, by row.
+    summed : bool
+        Sums by row cost memory traffic, so that large systems leave most frames out.
 
     Returns
     -------
@@ -228,8 +246,9 @@ def lengths(x, places, targets, limit, lattice, step, largest, total):  # type: 
             most = _larger(size, most)
             sums = sums + off
             squares = squares + off * off
-            store_quad(largest, k, _larger(size, load_quad(largest, k)))
-            store_quad(total, k, load_quad(total, k) + off)
+            _enlarge(largest, k, size)
+            if summed:
+                store_quad(total, k, load_quad(total, k) + off)
         m = _largest(most)
         if m > worst:
             worst, begin_of_worst = m, begin
