@@ -27,9 +27,22 @@ __all__ = [
     "universe_of",
 ]
 """kcons on MDAnalysis: checks of trajectories, and writing them."""
+"""MDAnalysis: constraints from any topology it reads, conversions, checks of trajectories, and writing them.
+
+Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
+"""
 
 from kcons.mdanalysis.check import ConstraintCheck
 from kcons.mdanalysis.loading import load_trajectory, open_universe
 from kcons.mdanalysis.result import CheckResult
+from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
 
-__all__ = ["CheckResult", "ConstraintCheck", "load_trajectory", "open_universe"]
+__all__ = [
+    "CheckResult",
+    "ConstraintCheck",
+    "constraints_of",
+    "load_trajectory",
+    "open_universe",
+    "selected",
+    "snapshot_of",
+]
