@@ -28,7 +28,10 @@ WIDE = 150
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status: 0, 2 for an error that the user can mend, 130 when interrupted."""
+    """Run the command line.
+
+    The exit status: 0; 1 where `check` finds a violation; 2 for an error that the user can mend; 130 when interrupted.
+    """
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.version:
@@ -125,7 +128,35 @@ def _parser() -> argparse.ArgumentParser:
         description="What the engine will do for a scene, before any run.",
     )
     plan.set_defaults(run=_plan)
+    _add_check(commands)
     return parser
+
+
+def _add_check(commands: Any) -> None:
+    check = commands.add_parser(
+        "check",
+        help="how well a trajectory of any engine kept its constraints",
+        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift; told by "
+        "the precision of the file. Exit status 0: kept; 1: violated; 2: an error.",
+    )
+    check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
+    check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
+    check.add_argument("--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, ...")
+    check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
+    check.add_argument("--no-rigid-water", action="store_true", help="do not expect water to be rigid")
+    check.add_argument("--rigid-residues", nargs="+", default=(), metavar="NAME", help="residues that are held rigid")
+    check.add_argument("--rigid-bodies", nargs="+", default=(), metavar="SELECTION", help="atoms that are held rigid")
+    check.add_argument(
+        "--targets", default="first", help="first (frame, default), mean, topology (its coordinates), or a TOML file"
+    )
+    check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
+    check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
+    check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
+    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
+    check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
+    check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
+    check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
+    check.set_defaults(run=_check)
 
 
 def _numbers(text: str) -> list[float]:
@@ -343,6 +374,46 @@ def _console() -> Console:
     console = Console()
     # Into a file or a pipe there is no width to fit into.
     return console if console.is_terminal else Console(width=WIDE)
+
+
+# -- check ------------------------------------------------------------------------------------------
+
+
+def _check(chosen: argparse.Namespace) -> int:
+    try:
+        from kcons.mdanalysis.check_files import check_trajectory
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "MDAnalysis":
+            raise
+        raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
+    from kcons import check_report
+
+    folder: Path = chosen.out or Path(f"check-{chosen.trajectory.stem}")
+    result = check_trajectory(
+        chosen.trajectory,
+        chosen.topology,
+        chosen.constrain,
+        select=chosen.select,
+        rigid_water=not chosen.no_rigid_water,
+        rigid_residues=chosen.rigid_residues,
+        rigid_bodies=chosen.rigid_bodies,
+        targets=chosen.targets,
+        tolerance=chosen.tolerance,
+        precision=chosen.precision,
+        frames=chosen.frames,
+        workers=chosen.workers,
+        worst=chosen.worst,
+        rank=not chosen.no_rank,
+    )
+    console = _console()
+    tables = (check_report.unit_table(result), check_report.row_table(result))
+    console.print(check_report.summary(result), highlight=False, markup=False)
+    for table in tables:
+        console.print(table)
+    console.print(check_report.verdict(result), soft_wrap=True)
+    page = [check_report.summary(result), *map(_rendered, tables), result.verdict]
+    _say_written(check_report.write(result, folder, tables=page))
+    return int(result.violated)
 
 
 # -- plan and list ----------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnaly
 """
 
 from kcons.mdanalysis.check import ConstraintCheck
+from kcons.mdanalysis.check_files import check_trajectory
 from kcons.mdanalysis.loading import load_trajectory, open_universe
 from kcons.mdanalysis.result import CheckResult
 from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
@@ -40,6 +41,7 @@ from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
 __all__ = [
     "CheckResult",
     "ConstraintCheck",
+    "check_trajectory",
     "constraints_of",
     "load_trajectory",
     "open_universe",

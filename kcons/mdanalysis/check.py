@@ -163,11 +163,11 @@ class ConstraintCheck(AnalysisBase):
         self._masses = self._find_masses(universe, given)
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
-            given, self._target_text = tuple(file.apply(given, self._labels)), str(file.path)
+            given, self.target_text = tuple(file.apply(given, self._labels)), str(file.path)
             self._mode = "given"
         else:
             self._mode = str(targets)
-            self._target_text = {"first": "the first frame", "mean": "the mean of the frames"}.get(
+            self.target_text = {"first": "the first frame", "mean": "the mean of the frames"}.get(
                 self._mode, "as given"
             )
         self._given = given
@@ -462,7 +462,7 @@ class ConstraintCheck(AnalysisBase):
             verdict=self._verdict(status, worst[0], units, int(violated.sum()), frames, n_frames),
             precision=self._precision.describe(part.reach),
             tolerance=self._tolerance,
-            targets=self._target_text,
+            targets=self.target_text,
             frames=part.frames.tolist(),
             times=part.times.tolist(),
             n_frames_in_file=int(self._trajectory.n_frames),

@@ -1,0 +1,111 @@
+"""A check from files in one call: what `kcons check` does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kcons.errors import InputError
+from kcons.mdanalysis.check import ConstraintCheck
+from kcons.mdanalysis.loading import load_trajectory, open_universe, quiet
+from kcons.mdanalysis.precision import precision_of
+from kcons.mdanalysis.result import CheckResult
+from kcons.mdanalysis.targets import TargetFile
+from kcons.mdanalysis.universe import constraints_of
+
+
+def check_trajectory(
+    trajectory: str | Path,
+    topology: str | Path,
+    constrain: str | None = "hbonds",
+    *,
+    select: str = "all",
+    rigid_water: bool = True,
+    rigid_residues: Sequence[str] = (),
+    rigid_bodies: Iterable[Any] = (),
+    targets: str | Path = "first",
+    frames: str | None = None,
+    workers: int = 1,
+    backend: str = "multiprocessing",
+    **options: Any,
+) -> CheckResult:
+    """How well a trajectory kept its constraints.
+
+    Parameters
+    ----------
+    trajectory, topology : path
+        Files that MDAnalysis reads.
+    constrain, select, rigid_water, rigid_residues, rigid_bodies
+        What is held; see `kcons.mdanalysis.constraints_of`.
+    targets : {'first', 'mean', 'topology'} or path
+        'topology': the coordinates in the topology's file; else as for `ConstraintCheck`.
+    frames : str, optional
+        'A:B:STEP' as in a slice; all by default.
+    workers : int
+        Processes that read at the same time.
+    backend : {'multiprocessing', 'dask'}
+        Of MDAnalysis, where there are several workers.
+    **options
+        For `ConstraintCheck`.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read, selections that match nothing, unknown names, atom counts that differ.
+    """
+    chosen: dict[str, Any] = _slice(frames)
+    if workers < 1:
+        raise InputError(f"{workers} workers; give 1 or more", item="workers")
+    # Complain about the parameter file before anything long.
+    file = None if str(targets) in ("first", "mean", "topology") else TargetFile(targets)
+    names = (str(trajectory), str(topology))
+    held: dict[str, Any] = {
+        "select": select,
+        "rigid_water": rigid_water,
+        "rigid_residues": rigid_residues,
+        "rigid_bodies": tuple(rigid_bodies),
+    }
+    text = None
+    if str(targets) == "topology":
+        universe = open_universe(topology)
+        if not hasattr(universe, "trajectory"):
+            raise InputError(
+                f"{topology} has no coordinates to take lengths from; give --targets first, mean, or a TOML file",
+                item="targets",
+            )
+        with quiet():
+            reader = universe.trajectory
+            file_format = reader.format if isinstance(reader.format, str) else reader.format[0]
+            largest = float(np.abs(universe.atoms.positions).max(initial=0.0))
+            options["target_error"] = precision_of(topology, file_format).half_step(largest)
+        constraints = constraints_of(universe, constrain, **held)
+        load_trajectory(universe, trajectory, topology)
+        given, text = "given", f"coordinates of {topology}"
+    else:
+        universe = open_universe(topology, trajectory)
+        constraints = constraints_of(universe, constrain, **held)
+        given = str(targets)
+    check = ConstraintCheck(universe, constraints, targets=file or given, names=names, **options)
+    if text is not None:
+        check.target_text = text
+    # Sets are made anew at the first frame; this one need not stay in memory.
+    del constraints
+    parallel: dict[str, Any] = {"backend": backend, "n_workers": workers} if workers > 1 else {}
+    with quiet():
+        check.run(**chosen, **parallel)
+    return check.check
+
+
+def _slice(frames: str | None) -> dict[str, int | None]:
+    if frames is None:
+        return {}
+    try:
+        numbers = [int(word) if word.strip() else None for word in frames.split(":")]
+    except ValueError:
+        numbers = []
+    if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+        raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
+    return dict(zip(("start", "stop", "step"), numbers, strict=False))
