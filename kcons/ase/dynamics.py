@@ -22,6 +22,7 @@ from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
@@ -127,6 +128,11 @@ class ConstrainedDynamics(MolecularDynamics):
     def state(self) -> State:
         """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`."""
         return self._start(self._systems())
+
+    @property
+    def motion(self) -> Motion:
+        """The engine of everything that is held."""
+        return self._systems().motion
 
     @property
     def degrees_of_freedom(self) -> int:

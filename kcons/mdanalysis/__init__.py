@@ -37,14 +37,21 @@ from kcons.mdanalysis.check_files import check_trajectory
 from kcons.mdanalysis.loading import load_trajectory, open_universe
 from kcons.mdanalysis.result import CheckResult
 from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
+from kcons.mdanalysis.writing import ASE_UNITS, OPENMM_UNITS, OpenMMReporter, RunUnits, TrajectoryWriter, write_ase
 
 __all__ = [
+    "ASE_UNITS",
+    "OPENMM_UNITS",
     "CheckResult",
     "ConstraintCheck",
+    "OpenMMReporter",
+    "RunUnits",
+    "TrajectoryWriter",
     "check_trajectory",
     "constraints_of",
     "load_trajectory",
     "open_universe",
     "selected",
     "snapshot_of",
+    "write_ase",
 ]

@@ -1,0 +1,427 @@
+"""Runs written through MDAnalysis: DCD, XTC, TRR, H5MD, NetCDF and what else it writes.
+
+With velocities where the format has them, and with residuals and multipliers of the constraints: as observables in
+H5MD, and beside other formats in an XVG file that MDAnalysis reads as auxiliary data. Every frame is on disk before the
+next step, so that a run that is stopped keeps all of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+import MDAnalysis
+import numpy as np
+from MDAnalysis.lib.mdamath import triclinic_box
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.mdanalysis.loading import quiet
+from kcons.motion import Motion
+from kcons.steppers import State
+
+#: Rows up to which an XVG file has a column for each multiplier.
+MOST_COLUMNS = 64
+_H5MD_UNITS = {
+    "timeunit": "ps",
+    "lengthunit": "Angstrom",
+    "velocityunit": "Angstrom/ps",
+    "forceunit": "kJ/(mol*Angstrom)",
+}
+
+
+@dataclass(frozen=True)
+class RunUnits:
+    """What 1 is in a run, in the units of MDAnalysis.
+
+    Attributes
+    ----------
+    length : float
+        In angstrom.
+    time : float
+        In ps.
+    energy : float
+        In kJ/mol.
+    name : str
+        For headers.
+    """
+
+    length: float = 1.0
+    time: float = 1.0
+    energy: float = 1.0
+    name: str = "Å, ps, kJ/mol"
+
+    @property
+    def velocity(self) -> float:
+        return self.length / self.time
+
+    @property
+    def force(self) -> float:
+        return self.energy / self.length
+
+
+#: ASE: Å, Å √(u/eV), eV. OpenMM: nm, ps, kJ/mol.
+ASE_UNITS = RunUnits(1.0, 0.010180505717, 96.4853321233, "Å, Å √(u/eV), eV")
+OPENMM_UNITS = RunUnits(10.0, 1.0, 1.0, "nm, ps, kJ/mol")
+
+
+class TrajectoryWriter:
+    """One trajectory file, and what belongs to its constraints.
+
+    Parameters
+    ----------
+    path : path
+        The ending tells the format.
+    n_atoms : int
+    units : RunUnits
+        Of what is written; default Å, ps, kJ/mol.
+    motion : Motion, optional
+        The constraints of the run, in its units. Residuals are written, and multipliers where forces are given; both
+        in the units of the run, as `natural_units` says.
+    interval : float, optional
+        Time between frames in the run's unit; DCD stores this and no times.
+    velocities : bool, optional
+        Write velocities; by default where the format has them.
+    forces : bool
+        Write forces, where the format has them.
+    **options
+        For MDAnalysis' writer, such as ``precision=4`` of XTC.
+
+    Raises
+    ------
+    InputError
+        MDAnalysis does not write this format, or not several frames.
+    UnsupportedError
+        Velocities or forces are asked of a format without them; H5MD without h5py.
+
+    Examples
+    --------
+    ::
+
+        with TrajectoryWriter("run.h5md", len(x), motion=system.motion, interval=dt) as writer:
+            run(system, state, dt, 1000, observers=[writer])
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        n_atoms: int,
+        *,
+        units: RunUnits | None = None,
+        motion: Motion | None = None,
+        interval: float | None = None,
+        velocities: bool | None = None,
+        forces: bool = False,
+        **options: Any,
+    ) -> None:
+        self.path = Path(path)
+        self.units = units or RunUnits()
+        self.motion = motion
+        self.n_frames = 0
+        self.side_file: Path | None = None
+        self._side: TextIO | None = None
+        self._format = self.path.suffix[1:].upper()
+        if not self.path.parent.is_dir():
+            raise InputError(f"there is no folder {self.path.parent} to write {self.path.name} into", item="path")
+        able = self._format in ("TRR", "H5MD", "NC", "NCDF", "TRZ")
+        for asked, what in ((velocities, "velocities"), (forces, "forces")):
+            if asked and not able:
+                raise UnsupportedError(f"{self._format} has no {what}; write TRR or H5MD")
+        self._with_velocities = able if velocities is None else velocities
+        self._with_forces = forces
+        self._universe = MDAnalysis.Universe.empty(
+            n_atoms, trajectory=True, velocities=self._with_velocities, forces=forces
+        )
+        if self._format == "H5MD":
+            options = {**_H5MD_UNITS, **options, "velocities": self._with_velocities, "forces": forces}
+        if interval is not None:
+            self._universe.trajectory.ts.dt = abs(interval) * self.units.time
+            if self._format == "DCD":
+                options.setdefault("dt", abs(interval) * self.units.time)
+        try:
+            with quiet():
+                self._writer = MDAnalysis.Writer(str(self.path), n_atoms, multiframe=True, **options)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"MDAnalysis writes no trajectory {self.path.name} ({error}); use .dcd, .xtc, .trr, .nc or .h5md",
+                item="path",
+            ) from None
+        except RuntimeError as error:
+            raise UnsupportedError(f"{self.path.name}: {error}") from None
+
+    # -- writing --------------------------------------------------------------------------------
+
+    def __call__(self, state: State) -> None:
+        """Write a state; for `kcons.steppers.run(..., observers=[writer])`."""
+        lattice = None if self.motion is None else self.motion.lattice
+        self.write(
+            state.positions,
+            state.velocities,
+            time=state.time,
+            cell=None if lattice is None else lattice[0],
+            forces=state.forces,
+            step=state.step,
+        )
+
+    def write(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike | None = None,
+        *,
+        time: float = 0.0,
+        cell: ArrayLike | None = None,
+        forces: ArrayLike | None = None,
+        step: int | None = None,
+    ) -> None:
+        """Write one frame, in the units of the run.
+
+        Parameters
+        ----------
+        positions, velocities, forces : array_like, shape (n_atoms, 3)
+            `forces` are the applied ones.
+        time : float
+        cell : array_like, shape (3, 3), optional
+            Cell vectors as rows.
+        step : int, optional
+
+        Raises
+        ------
+        InputError
+            A wrong shape; the writer is closed.
+        NonFiniteError
+            A NaN or infinity; nothing was written.
+        """
+        if self._writer is None:
+            raise InputError(f"{self.path} is closed", item="path")
+        x = self._array(positions, "positions")
+        v = None if velocities is None else self._array(velocities, "velocities")
+        f = None if forces is None else self._array(forces, "forces")
+        extras = self._extras(x, v, f, time)
+        ts = self._universe.trajectory.ts
+        ts.positions = x * self.units.length
+        if self._with_velocities:
+            ts.velocities = (np.zeros_like(x) if v is None else v) * self.units.velocity
+        if self._with_forces:
+            ts.forces = (np.zeros_like(x) if f is None else f) * self.units.force
+        ts.time, ts.frame = time * self.units.time, self.n_frames
+        ts.data["step"] = self.n_frames if step is None else step
+        ts.dimensions = None if cell is None else _dimensions(np.asarray(cell, dtype=np.float64) * self.units.length)
+        if self._format == "H5MD":
+            ts.data.update(extras)
+        with quiet():
+            self._writer.write(self._universe.atoms)
+        if self._format == "H5MD":
+            self._label_observables(extras)
+        elif extras:
+            self._write_side(ts.time, extras)
+        self._flush()
+        self.n_frames += 1
+
+    def _array(self, values: ArrayLike, name: str) -> FloatArray:
+        array = np.asarray(values, dtype=np.float64)
+        n = len(self._universe.atoms)
+        if array.shape != (n, 3):
+            raise InputError(f"{name} must have shape ({n}, 3), not {array.shape}", item=name)
+        if not np.isfinite(array).all():
+            atom = int(np.argmin(np.isfinite(array).all(axis=1)))
+            raise NonFiniteError(f"{name} of atom {atom}: {array[atom]}; nothing was written", item=name, atom=atom)
+        return array
+
+    def _extras(self, x: FloatArray, v: FloatArray | None, f: FloatArray | None, time: float) -> dict[str, FloatArray]:
+        """What belongs to the constraints, in the units of the run."""
+        if self.motion is None:
+            return {}
+        held = self.motion.constraint_set
+        extras = {"residuals": held.value(x, time)}
+        if v is not None:
+            extras["velocity_residuals"] = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
+            if f is not None:
+                extras["multipliers"] = self.motion.multipliers(x, v, f, time)
+        return extras
+
+    def _label_observables(self, extras: dict[str, FloatArray]) -> None:
+        group = self._writer.h5md_file
+        for name in extras:
+            place = f"observables/trajectory/{name}"
+            if place in group and "run_units" not in group[place].attrs:
+                group[place].attrs["run_units"] = self.units.name
+
+    def _write_side(self, time: float, extras: dict[str, FloatArray]) -> None:
+        multipliers = extras.get("multipliers")
+        if multipliers is not None and len(multipliers) > MOST_COLUMNS:
+            multipliers = None
+        if self._side is None:
+            self.side_file = self.path.with_suffix(".xvg")
+            self._side = self.side_file.open("w", encoding="utf-8")
+            columns = ["largest residual", "rms residual", "largest velocity residual"]
+            held = None if self.motion is None else self.motion.constraint_set
+            if multipliers is not None and held is not None:
+                columns += [f"multiplier {held.row_name(k)}" for k in range(len(multipliers))]
+            self._width = len(columns)
+            print(f"# constraints of {self.path.name}, in {self.units.name}; time in ps", file=self._side)
+            for k, column in enumerate(columns):
+                print(f'@ s{k} legend "{column}"', file=self._side)
+        sigma, rates = extras["residuals"], extras.get("velocity_residuals")
+        numbers = [
+            float(np.abs(sigma).max(initial=0.0)),
+            float(np.sqrt(np.mean(sigma**2))) if len(sigma) else 0.0,
+            float("nan") if rates is None else float(np.abs(rates).max(initial=0.0)),
+            *([] if multipliers is None else multipliers.tolist()),
+        ]
+        # A state whose forces are not known yet has no multipliers; columns stay the same.
+        numbers = (numbers + [float("nan")] * self._width)[: self._width]
+        print(f"{time:.9g}", *(f"{number:.9g}" for number in numbers), file=self._side)
+
+    def _flush(self) -> None:
+        """Bring everything to the file."""
+        if self._side is not None:
+            self._side.flush()
+        file = getattr(self._writer, "h5md_file", None)
+        if file is not None:
+            file.flush()
+        elif self._format in ("NC", "NCDF"):
+            self._writer.trjfile.flush()
+        else:
+            _flush_c_streams()
+
+    # -- end ------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Close the files; more than once does no harm."""
+        if self._writer is not None:
+            if self.n_frames or self._format != "H5MD":
+                self._writer.close()
+            self._writer = None
+        if self._side is not None:
+            self._side.close()
+            self._side = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _dimensions(matrix: FloatArray) -> Any:
+    if matrix.shape == (3,):
+        matrix = np.diag(matrix)
+    return triclinic_box(*matrix)
+
+
+def _flush_c_streams() -> None:
+    """Flush what libraries in C have buffered; their files do not say how."""
+    library = ctypes.cdll.msvcrt if sys.platform == "win32" else ctypes.CDLL(None)
+    library.fflush(None)
+
+
+# -- hosts ------------------------------------------------------------------------------------------
+
+
+def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any) -> TrajectoryWriter:
+    """Write a run of ASE through MDAnalysis from now on.
+
+    Parameters
+    ----------
+    dynamics : ase.md.md.MolecularDynamics
+        Of kcons or of ASE; constraints are those that it or its atoms hold through kcons.
+    path : path
+    interval : int
+        Steps between frames.
+    **options
+        For `TrajectoryWriter`.
+
+    Returns
+    -------
+    TrajectoryWriter
+        Attached to the dynamics; close it at the end.
+    """
+    atoms = dynamics.atoms
+    if interval < 1:
+        raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
+
+    def engine() -> Motion | None:
+        found = getattr(dynamics, "motion", None)
+        for item in atoms.constraints if found is None else ():
+            found = found or (item.engine(atoms) if hasattr(item, "engine") else None)
+        return found if isinstance(found, Motion) else None
+
+    with_forces = {"forces": False, **options}["forces"]
+    writer = TrajectoryWriter(
+        path, len(atoms), **{"units": ASE_UNITS, "motion": engine(), "interval": interval * dynamics.dt, **options}
+    )
+
+    def report() -> None:
+        cell = atoms.cell.array if atoms.pbc.any() and atoms.cell.rank == 3 else None
+        forces = None
+        if writer.motion is not None or with_forces:
+            forces = atoms.get_forces(apply_constraint=False)
+        writer.write(
+            atoms.positions,
+            atoms.get_velocities(),
+            time=float(dynamics.get_time()),
+            cell=cell,
+            forces=forces,
+            step=dynamics.nsteps,
+        )
+
+    dynamics.attach(report, interval=interval)
+    return writer
+
+
+class OpenMMReporter:
+    """A reporter of OpenMM that writes through MDAnalysis; append it to `simulation.reporters`.
+
+    Parameters
+    ----------
+    path : path
+    interval : int
+        Steps between frames.
+    motion : Motion, optional
+        Constraints in OpenMM's units; residuals are written.
+    **options
+        For `TrajectoryWriter`; ``forces=True`` for forces, and multipliers with them.
+    """
+
+    def __init__(self, path: str | Path, interval: int, *, motion: Motion | None = None, **options: Any) -> None:
+        if interval < 1:
+            raise InputError(f"the interval is {interval}; give 1 or more steps", item="interval")
+        self.path, self.interval, self.motion = Path(path), int(interval), motion
+        self._options = options
+        self._forces = bool(options.get("forces"))
+        self.writer: TrajectoryWriter | None = None
+
+    def describeNextReport(self, simulation: Any) -> tuple[int, bool, bool, bool, bool, bool]:
+        """What OpenMM asks reporters for: steps to go, and which data."""
+        steps = self.interval - simulation.currentStep % self.interval
+        return steps, True, True, self._forces, False, False
+
+    def report(self, simulation: Any, state: Any) -> None:
+        """Write a frame."""
+        from openmm import unit
+
+        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
+        f = None
+        if self._forces:
+            f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        periodic = simulation.system.usesPeriodicBoundaryConditions()
+        cell = state.getPeriodicBoxVectors(asNumpy=True).value_in_unit(unit.nanometer) if periodic else None
+        if self.writer is None:
+            dt = simulation.integrator.getStepSize().value_in_unit(unit.picosecond)
+            options = {"units": OPENMM_UNITS, "motion": self.motion, "interval": self.interval * dt, **self._options}
+            self.writer = TrajectoryWriter(self.path, len(x), **options)
+        time = state.getTime().value_in_unit(unit.picosecond)
+        self.writer.write(x, v, time=time, cell=cell, forces=f, step=simulation.currentStep)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.writer is not None:
+            self.writer.close()
