@@ -499,7 +499,7 @@ class ConstraintCheck(AnalysisBase):
                 UnitResult(
                     unit=name,
                     n_rows=n,
-                    largest=float(found.largest[mine].max()),
+                    largest=float(found.worst[unit].max()),
                     rms=float(np.sqrt(found.squares[unit].sum() / (n * n_frames))),
                     mean=float(found.sums[unit].sum() / (n * n_frames)),
                     bound=float(bound[mine].max()),
@@ -516,7 +516,10 @@ class ConstraintCheck(AnalysisBase):
         found, held = part.found, self._table.set
         unit = int(self._table.units[row])
         item, k = held.locate(row)
-        at = np.flatnonzero((found.worst_row[unit] == row) & (found.worst[unit] >= found.largest[row]))
+        # By row, single precision is kept; by frame, double.
+        mine = np.flatnonzero(found.worst_row[unit] == row)
+        at = mine[np.float32(found.worst[unit][mine]) >= np.float32(found.largest[row])]
+        largest = found.worst[unit][at[0]] if len(at) else found.largest[row]
         atoms = item.atoms[k]
         return RowResult(
             row=row,
@@ -524,7 +527,7 @@ class ConstraintCheck(AnalysisBase):
             atoms=[int(a) for a in atoms],
             unit=UNITS[unit],
             target=float(item.target_at(float(part.times[0]))[k]),
-            largest=float(found.largest[row]),
+            largest=float(largest),
             mean=float(found.total[row] / found.n_summed),
             allowed=float(allowed[row]),
             frame=int(part.frames[at[0]]) if len(at) else None,

@@ -1,0 +1,296 @@
+"""Deviations against computations that share nothing with kcons; verdicts, targets, backends, temperature."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+mda = pytest.importorskip("MDAnalysis")
+
+import water_files as files
+
+from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
+from kcons.errors import InputError
+from kcons.mdanalysis import ConstraintCheck, load_trajectory
+
+N, SIDE = 40, 12.0
+
+
+def checked(path, constraints, n=N, masses=True, run=None, **options):
+    made = files.universe(n, masses)
+    load_trajectory(made, path)
+    return ConstraintCheck(made, constraints, **options).run(**(run or {})).check
+
+
+@pytest.fixture(scope="module")
+def positions():
+    x = files.water(N, 23)
+    # One bond too long in one frame, and one that drifts.
+    x[7, 3 * 11 + 2] += 0.05
+    x[:, 3 * 5 + 1] += np.linspace(0, 0.2, 23)[:, None] * np.array([1.0, 0, 0])
+    return x % SIDE
+
+
+@pytest.fixture(scope="module")
+def water(tmp_path_factory, positions):
+    folder = tmp_path_factory.mktemp("water")
+    return {
+        "dcd": files.write(folder / "w.dcd", positions),
+        "xtc": files.write(folder / "w.xtc", positions),
+        "trr": files.write(folder / "w.trr", positions),
+    }
+
+
+@pytest.mark.parametrize("ending,tolerance", [("dcd", 1e-7), ("xtc", 1e-6)])
+def test_deviations_equal_those_from_the_bytes_of_the_file(water, ending, tolerance):
+    result = checked(water[ending], Distance(files.pairs(N), files.targets(N)), worst=3 * N)
+    x = files.dcd_frames(water["dcd"]) / 10 if ending == "dcd" else files.xtc_frames(water["xtc"])
+    off = files.deviations(x, files.pairs(N), files.targets(N) / 10, SIDE / 10)  # nm
+    assert off.shape == (23, 3 * N)
+    np.testing.assert_allclose(np.array(result.series["largest Å"]) / 10, np.abs(off).max(axis=1), atol=tolerance)
+    rms = np.sqrt((off**2).mean(axis=1))
+    np.testing.assert_allclose(np.array(result.series["rms Å"]) / 10, rms, atol=tolerance)
+    rows = {row.row: row for row in result.worst}
+    assert len(rows) == 3 * N
+    for k in range(3 * N):
+        assert rows[k].largest / 10 == pytest.approx(np.abs(off[:, k]).max(), abs=tolerance)
+        assert rows[k].mean / 10 == pytest.approx(off[:, k].mean(), abs=tolerance)
+    assert result.units[0].mean / 10 == pytest.approx(off.mean(), abs=tolerance)
+
+
+def test_xtc_is_told_to_far_better_than_single_precision_would_allow(tmp_path):
+    """Far from the origin MDAnalysis' coordinates are off by 1e-4; those of the file are not."""
+    x = files.water(N, 4) + 1000.0
+    path = files.write(tmp_path / "far.xtc", x, side=None)
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), worst=3 * N)
+    raw = np.rint(files.xtc_frames(path) * 1000) / 100
+    d = raw[:, files.pairs(N)[:, 0]] - raw[:, files.pairs(N)[:, 1]]
+    off = np.sqrt((d**2).sum(axis=2)) - files.targets(N)
+    np.testing.assert_allclose(result.series["largest Å"], np.abs(off).max(axis=1), atol=1e-9)
+
+
+def test_minimum_images_of_a_triclinic_cell(tmp_path):
+    dimensions = [14.0, 12.0, 13.0, 75.0, 80.0, 65.0]
+    cell = mda.lib.mdamath.triclinic_vectors(dimensions).astype(np.float64)
+    whole = files.water(N, 3, side=1e9) % 1e9
+    whole = files.water(N, 3)
+    rng = np.random.default_rng(4)
+    x = np.concatenate([whole[:, k::3, None] for k in range(3)], axis=2)
+    d = x - x[:, :, :1]
+    x = x[:, :, :1] + d - SIDE * np.rint(d / SIDE)
+    x = x + rng.integers(-1, 2, size=(3, N, 3, 1, 3)).reshape(3, N, 3, 3) @ cell
+    made = files.universe(N)
+    path = tmp_path / "t.dcd"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with mda.Writer(str(path), 3 * N) as writer:
+            for frame in x.reshape(3, 3 * N, 3):
+                made.atoms.positions = frame
+                made.dimensions = dimensions
+                writer.write(made.atoms)
+    result = checked(path, Distance(files.pairs(N), files.targets(N)))
+    assert result.status in ("kept", "tolerated")
+    assert result.units[0].largest < 2e-5
+
+
+def test_verdict_names_row_frame_and_amount(water):
+    result = checked(water["dcd"], Distance(files.pairs(N), files.targets(N)))
+    off = np.abs(files.deviations(files.dcd_frames(water["dcd"]), files.pairs(N), files.targets(N), SIDE))
+    frame, row = np.unravel_index(off.argmax(), off.shape)
+    assert result.status == "violated" and result.violated
+    assert row in (15, 17), "of the atom that drifts"
+    assert result.worst[0].row == row and result.worst[0].frame == frame
+    assert result.worst[0].largest == pytest.approx(off.max(), abs=1e-9)
+    allowed = result.worst[0].allowed
+    assert result.violated_rows == np.count_nonzero((off > allowed).any(axis=0)) == 4
+    assert result.violated_frames == np.count_nonzero((off > allowed).any(axis=1))
+    assert result.first_violated_frame == np.argmax((off > allowed).any(axis=1))
+    assert f"in frame {frame}; 4 of 120 rows" in result.verdict and "SOL6:" in result.verdict
+    line = result.units[0].drift
+    assert line is not None and line.significant and line.slope > 0
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "pdb", "gro"])
+def test_kept_to_the_precision_of_each_format(tmp_path, ending):
+    x = files.water(N, 1 if ending == "gro" else 6, seed=3)
+    if ending == "gro":
+        path = files.topology(tmp_path / "k.gro", N, x[0])
+    else:
+        path = files.write(tmp_path / f"k.{ending}", x, **({"multiframe": True} if ending == "pdb" else {}))
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), tolerance=0.0)
+    assert result.status == "kept", result.verdict
+    unit = result.units[0]
+    assert 0.6 * unit.rounding_rms < unit.rms < 1.5 * unit.rounding_rms or ending in ("dcd", "trr")
+    assert unit.largest <= unit.bound
+    steps = {"xtc": "0.01 Å (0.001 nm)", "pdb": "0.001 Å", "gro": "0.01 Å", "dcd": "single", "trr": "single"}
+    assert steps[ending] in result.precision
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr"])
+def test_a_violation_beyond_the_precision_is_found(tmp_path, ending):
+    x = files.water(N, 6, seed=3)
+    x[3, 4] += {"dcd": 3e-4, "xtc": 0.05, "trr": 3e-4}[ending]
+    path = files.write(tmp_path / f"v.{ending}", x % SIDE)
+    result = checked(path, Distance(files.pairs(N), files.targets(N)))
+    assert result.status == "violated" and result.worst[0].frame == 3 and 4 in result.worst[0].atoms
+
+
+def test_finer_xtc_has_a_smaller_bound(tmp_path):
+    x = files.water(N, 3)
+    path = files.write(tmp_path / "fine.xtc", x, precision=5)
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), tolerance=0.0)
+    assert result.status == "kept"
+    assert result.units[0].bound == pytest.approx(2 * np.sqrt(3) * 0.5e-4)
+
+
+def test_tolerance_of_the_engine_is_told_apart(tmp_path):
+    x = files.water(N, 3)
+    path = files.write(tmp_path / "t.dcd", x)
+    wrong = files.targets(N) * (1 + 5e-5)
+    assert checked(path, Distance(files.pairs(N), wrong)).status == "tolerated"
+    assert checked(path, Distance(files.pairs(N), wrong), tolerance=1e-6).status == "violated"
+
+
+def test_targets_of_the_first_frame_and_of_the_mean(water, positions):
+    x = files.dcd_frames(water["dcd"])
+    lengths = files.deviations(x, files.pairs(N), 0.0, SIDE)
+    for targets, held in (("first", lengths[0]), ("mean", lengths.mean(axis=0))):
+        result = checked(water["dcd"], Distance(files.pairs(N), files.targets(N)), targets=targets, worst=3 * N)
+        np.testing.assert_allclose(result.series["largest Å"], np.abs(lengths - held).max(axis=1), atol=1e-6)
+        for row in result.worst:
+            assert row.target == pytest.approx(held[row.row], abs=1e-9)
+
+
+def test_open_targets_come_from_the_first_frame_looked_at(water):
+    x = files.dcd_frames(water["dcd"])
+    lengths = files.deviations(x, files.pairs(N), 0.0, SIDE)
+    result = checked(water["dcd"], Distance(files.pairs(N)), run={"start": 4, "stop": 20, "step": 3})
+    assert result.frames == list(range(4, 20, 3))
+    np.testing.assert_allclose(result.times, [2.0 * k for k in result.frames], rtol=1e-5)
+    np.testing.assert_allclose(result.series["largest Å"], np.abs(lengths[4:20:3] - lengths[4]).max(axis=1), atol=1e-6)
+
+
+def test_rows_of_all_kinds(water):
+    """Angles, dihedrals, collective and linear rows, against plain formulas."""
+    x = files.dcd_frames(water["dcd"])
+
+    def near(d):
+        return d - SIDE * np.rint(d / SIDE)
+
+    u, w = near(x[:, 1::3] - x[:, ::3]), near(x[:, 2::3] - x[:, ::3])
+    cosine = (u * w).sum(axis=2) / np.linalg.norm(u, axis=2) / np.linalg.norm(w, axis=2)
+    angles = np.arccos(cosine)
+    o = 3 * np.arange(N)
+    rows = [
+        Angle(np.stack([o + 1, o, o + 2], axis=1), ANGLE := files.ANGLE),
+        LinearRelation([[0, 1, 2]], [[-1.0, 0.5, 0.5]]),
+        Distance(files.pairs(N), files.targets(N)),
+        Dihedral([[1, 0, 3, 4]]),
+        CenterOfMass([0, 1, 2]),
+    ]
+    result = checked(water["dcd"], rows, worst=500)
+    found = {row.row: row for row in result.worst}
+    for k in range(N):
+        assert found[k].largest == pytest.approx(np.abs(angles[:, k] - ANGLE).max(), abs=2e-6)
+        assert found[k].unit == "rad"
+    middle = 0.5 * (u[:, 0] + w[:, 0])
+    for axis in range(3):
+        expected = np.abs(middle[:, axis] - middle[0, axis]).max()
+        assert found[N + axis].largest == pytest.approx(expected, abs=2e-6)
+    kinds = {unit.unit: unit.n_rows for unit in result.units}
+    assert kinds == {"Å": 3 * N + 6, "rad": N + 1}
+    assert set(result.series) >= {"largest Å", "largest rad", "rms Å", "rms rad"}
+
+
+@pytest.mark.parametrize("backend", ["multiprocessing", "dask"])
+def test_backends_agree(water, backend):
+    if backend == "dask":
+        pytest.importorskip("dask")
+    rows = [Distance(files.pairs(N), files.targets(N)), Angle([[1, 0, 2]])]
+    serial = checked(water["xtc"], rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the backends themselves
+        parallel = checked(water["xtc"], rows, run={"backend": backend, "n_workers": 2, "n_parts": 3})
+    assert serial.verdict == parallel.verdict and serial.frames == parallel.frames
+    np.testing.assert_array_equal(serial.series["largest Å"], parallel.series["largest Å"])
+    assert [row.largest for row in serial.worst] == [row.largest for row in parallel.worst]
+    assert serial.times == parallel.times
+
+
+def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
+    """Velocities drawn for rigid water: the mean over many molecules is the temperature, by 6 a molecule."""
+    from kcons.constraint_set import ConstraintSet
+    from kcons.motion import Motion
+
+    n, frames = 300, 8
+    x = files.water(n, frames, side=40.0, seed=5)
+    masses = np.tile([15.999, 1.008, 1.008], n)
+    rng = np.random.default_rng(6)
+    v = np.zeros_like(x)
+    for k in range(frames):
+        held = ConstraintSet(Distance(files.pairs(n), files.targets(n)), x[k], masses, cell=[40.0] * 3)
+        drawn = rng.normal(size=(3 * n, 3)) * np.sqrt(0.831446 * 300 / masses)[:, None]
+        v[k] = Motion(held, x[k]).project_velocities(x[k], drawn)
+        v[k] -= masses @ v[k] / masses.sum()
+    path = files.write(tmp_path / "t.trr", x, side=40.0, velocities=v)
+    result = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
+    assert result.rank == 3 * n
+    assert result.degrees_of_freedom == 6 * n - 3
+    expected = np.einsum("i,kij->k", masses, v**2) / (0.831446261815324 * (6 * n - 3))
+    np.testing.assert_allclose(result.series["temperature K"], expected, rtol=1e-6)
+    assert result.temperature is not None
+    assert abs(result.temperature["mean"] - 300) < 4 * 300 * np.sqrt(2 / (6 * n * frames))
+    # Tangent velocities leave A v at rounding; radial ones do not.
+    assert result.units[0].rate_largest is not None and result.units[0].rate_largest < 1e-4
+    v[2, 1] += 0.5
+    path = files.write(tmp_path / "r.trr", x, side=40.0, velocities=v)
+    moved = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
+    assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
+
+
+def test_a_moving_centre_of_mass_counts(tmp_path):
+    x = files.water(N, 3)
+    rng = np.random.default_rng(1)
+    v = rng.normal(size=x.shape) + 3.0
+    path = files.write(tmp_path / "m.trr", x, velocities=v)
+    rows = Distance(files.pairs(N), files.targets(N))
+    assert checked(path, rows).degrees_of_freedom == 6 * N
+    assert checked(path, rows, removed=3).degrees_of_freedom == 6 * N - 3
+
+
+def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
+    x = files.water(N, 3)
+    path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), masses=False)
+    assert result.rank == 3 * N and result.temperature is None
+    assert any("no masses" in remark and "guess_TopologyAttrs" in remark for remark in result.remarks)
+    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*guess_TopologyAttrs"):
+        checked(path, CenterOfMass([0, 1, 2]), masses=False)
+
+
+def test_transformed_coordinates_are_taken_as_they_are(water):
+    from MDAnalysis.transformations import translate
+
+    made = files.universe(N)
+    load_trajectory(made, water["xtc"])
+    made.trajectory.add_transformations(translate([0.0031, 0.0, 0.0]))
+    check = ConstraintCheck(made, Distance(files.pairs(N), files.targets(N))).run().check
+    plain = checked(water["xtc"], Distance(files.pairs(N), files.targets(N)))
+    np.testing.assert_allclose(check.series["rms Å"], plain.series["rms Å"], atol=2e-5)
+    assert any("transformations" in remark for remark in check.remarks)
+
+
+def test_bad_options(water):
+    rows = Distance(files.pairs(N), files.targets(N))
+    for options, match in (
+        ({"tolerance": -1.0}, "tolerance"),
+        ({"precision": 0.0}, "precision"),
+        ({"targets": "nowhere.toml"}, "nowhere.toml"),
+        ({"run": {"start": 30}}, "no frames"),
+    ):
+        with pytest.raises(InputError, match=match):
+            checked(water["dcd"], rows, **options)
+    with pytest.raises(InputError, match="no constraints"):
+        checked(water["dcd"], [])
+    with pytest.raises(InputError, match="no atom 120"):
+        checked(water["dcd"], Distance([[0, 120]], 1.0))

@@ -1,0 +1,107 @@
+"""Files of rigid water, made by hand, and readers that share nothing with kcons."""
+
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+mda = pytest.importorskip("MDAnalysis")
+
+OH, ANGLE = 0.9572, np.radians(104.52)
+HH = 2 * OH * np.sin(ANGLE / 2)
+
+
+def water(n: int, frames: int, side: float = 12.0, seed: int = 0) -> np.ndarray:
+    """Rigid water that tumbles through a cell, atoms wrapped one by one, shape (frames, 3 n, 3)."""
+    rng = np.random.default_rng(seed)
+    half = ANGLE / 2
+    shape = OH * np.array([[0.0, 0, 0], [np.sin(half), np.cos(half), 0], [-np.sin(half), np.cos(half), 0]])
+    x = np.zeros((frames, n, 3, 3))
+    centres = rng.random((n, 1, 3)) * side
+    for k in range(frames):
+        turns, _ = np.linalg.qr(rng.normal(size=(n, 3, 3)))
+        centres = centres + 0.3 * rng.normal(size=centres.shape)
+        x[k] = centres + shape @ turns
+    return x.reshape(frames, 3 * n, 3) % side
+
+
+def pairs(n: int) -> np.ndarray:
+    o = 3 * np.arange(n)
+    return np.stack([o, o + 1, o, o + 2, o + 1, o + 2], axis=1).reshape(-1, 2)
+
+
+def targets(n: int) -> np.ndarray:
+    return np.tile([OH, OH, HH], n)
+
+
+def universe(n: int, masses: bool = True):
+    made = mda.Universe.empty(
+        3 * n, n_residues=n, atom_resindex=np.repeat(np.arange(n), 3), residue_segindex=np.zeros(n, int), trajectory=True
+    )
+    made.add_TopologyAttr("names", ["OW", "HW1", "HW2"] * n)
+    made.add_TopologyAttr("elements", ["O", "H", "H"] * n)
+    made.add_TopologyAttr("resnames", ["SOL"] * n)
+    made.add_TopologyAttr("resids", np.arange(1, n + 1))
+    if masses:
+        made.add_TopologyAttr("masses", [15.999, 1.008, 1.008] * n)
+    return made
+
+
+def write(path: Path, x: np.ndarray, side: float | None = 12.0, velocities: np.ndarray | None = None, **options) -> Path:
+    """A trajectory of MDAnalysis' own writers, 2 ps between frames."""
+    n = x.shape[1]
+    made = mda.Universe.empty(n, trajectory=True, velocities=velocities is not None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with mda.Writer(str(path), n, **options) as writer:
+            for k, positions in enumerate(x):
+                ts = made.trajectory.ts
+                ts.positions = positions
+                if velocities is not None:
+                    ts.velocities = velocities[k]
+                ts.dimensions = None if side is None else [side, side, side, 90, 90, 90]
+                ts.time, ts.frame, ts.dt = 2.0 * k, k, 2.0
+                writer.write(made.atoms)
+    return path
+
+
+def topology(path: Path, n: int, positions: np.ndarray, side: float = 12.0) -> Path:
+    """A PDB or GRO file of the same atoms."""
+    made = universe(n)
+    made.atoms.positions = positions
+    made.dimensions = [side, side, side, 90, 90, 90]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made.atoms.write(str(path))
+    return path
+
+
+def dcd_frames(path: Path) -> np.ndarray:
+    """Positions in angstrom, straight from the bytes."""
+    data = path.read_bytes()
+    place, records = 0, []
+    while place < len(data):
+        (length,) = struct.unpack_from("<i", data, place)
+        records.append(data[place + 4 : place + 4 + length])
+        assert struct.unpack_from("<i", data, place + 4 + length)[0] == length
+        place += length + 8
+    (n,) = struct.unpack("<i", records[2])
+    columns = [np.frombuffer(r, "<f4").astype(np.float64) for r in records[3:] if len(r) == 4 * n]
+    return np.stack(columns).reshape(-1, 3, n).transpose(0, 2, 1)
+
+
+def xtc_frames(path: Path) -> np.ndarray:
+    """Positions in nm, by the library of GROMACS alone; they are multiples of 0.001 nm."""
+    from MDAnalysis.lib.formats.libmdaxdr import XTCFile
+
+    with XTCFile(str(path)) as file:
+        return np.stack([np.rint(frame.x.astype(np.float64) * 1000) / 1000 for frame in file])
+
+
+def deviations(x: np.ndarray, table: np.ndarray, held: np.ndarray, side: float) -> np.ndarray:
+    """|r_i - r_j| - target with nearest images, shape (frames, rows)."""
+    d = x[:, table[:, 0]] - x[:, table[:, 1]]
+    d -= side * np.rint(d / side)
+    return np.sqrt((d**2).sum(axis=2)) - held
