@@ -75,7 +75,7 @@ def unit_table(result: CheckResult) -> Table:
 
 
 def row_table(result: CheckResult) -> Table:
-    """The worst rows, by how far they exceed what is allowed."""
+    """The worst rows."""
     shown = Table(title="worst rows", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
     shown.add_column("row", justify="right")
     shown.add_column("what")

@@ -20,7 +20,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
-from kcons.mdanalysis.loading import READ_ERRORS, last_offset, leftover, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, intact_frames, last_offset, leftover, quiet
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.precision import FilePrecision, precision_of
 from kcons.mdanalysis.rank import rank_of
@@ -187,6 +187,7 @@ class ConstraintCheck(AnalysisBase):
             self._remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
         self._grid = self._precision.step if self._precision.exact else 0.0
         self._pass_of_means = False
+        self._intact = reader.n_frames
 
     def _find_masses(self, universe: Any, given: Sequence[Constraint]) -> FloatArray | None:
         """Masses, or None where they cannot be used; says why."""
@@ -240,6 +241,7 @@ class ConstraintCheck(AnalysisBase):
             Constraints that cannot be, at the first frame.
         """
         chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
+        self._intact = intact_frames(self._path, self._format, self._trajectory.n_frames)
         self._bind(self._first(chosen))
         self._pass_of_means = self._mode == "mean"
         if self._pass_of_means:
@@ -269,6 +271,7 @@ class ConstraintCheck(AnalysisBase):
         try:
             with quiet():
                 ts = self._trajectory[frame]
+                time = float(ts.time)
         except READ_ERRORS as error:
             raise InputError(
                 f"{self._names[0]}: frame {frame}, the first to be checked, cannot be read ({error}); "
@@ -282,10 +285,10 @@ class ConstraintCheck(AnalysisBase):
         masses = self._unit_masses if self._masses is None else self._masses
         self._from_file = np.concatenate([np.full(item.n_rows, item.target is None) for item in given])
         cell = cell_matrix(ts.dimensions)
-        held = ConstraintSet(given, x, masses, cell=cell, time=float(ts.time))
+        held = ConstraintSet(given, x, masses, cell=cell, time=time)
         with np.errstate(all="ignore"):
-            reach = np.asarray(abs(held.jacobian(x, float(ts.time))).sum(axis=1)).ravel()
-            squares = np.asarray(held.jacobian(x, float(ts.time)).power(2).sum(axis=1)).ravel()
+            reach = np.asarray(abs(held.jacobian(x, time)).sum(axis=1)).ravel()
+            squares = np.asarray(held.jacobian(x, time).power(2).sum(axis=1)).ravel()
         is_length = np.concatenate([np.full(c.n_rows, c.family == "Distance") for c in held.constraints])
         # A step h of each coordinate: the error of a row, at most and in the mean square.
         self._reach = np.where(is_length, 2 * np.sqrt(3.0), SECOND_ORDER * reach)
@@ -348,6 +351,8 @@ class ConstraintCheck(AnalysisBase):
             for k in turns:
                 frame = int(numbers[k])
                 try:
+                    if frame >= self._intact:
+                        raise OSError("its records are damaged")
                     ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
                     previous = frame
                     self._look(part, k, ts, k % every == 0 or k == n - 1, k % sums == 0)
@@ -431,7 +436,7 @@ class ConstraintCheck(AnalysisBase):
         of_target = np.where(self._from_file & (self._mode != "mean"), half, self._target_error)
         rounding = self._spread * np.sqrt(half**2 + of_target**2)
         units = self._by_unit(part, bound, rounding)
-        order = np.argsort(-(found.largest / np.maximum(allowed, np.finfo(float).tiny)), kind="stable")
+        order = np.lexsort((-found.largest, ~violated))
         worst = [self._row(int(row), part, allowed) for row in order[: self._n_worst]]
         in_frame = np.zeros(n_frames, dtype=bool)
         for unit in range(len(UNITS)):

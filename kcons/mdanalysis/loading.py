@@ -180,36 +180,65 @@ def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, la
     return ""
 
 
-def _dcd_end(path: str | Path, n_frames: int) -> int:
-    """End of the last whole frame; records are framed by their lengths."""
-    size = os.path.getsize(path)
-    with open(path, "rb") as file:
-        head = file.read(8)
-        order = "<" if struct.unpack("<i", head[:4])[0] in (84, 164) else ">"
+def intact_frames(path: str | Path, file_format: str, n_frames: int) -> int:
+    """Frames of a DCD file up to the first whose records are not where they must be; all frames of other formats.
 
-        def skip() -> None:
-            length = struct.unpack(order + "i", file.read(4))[0]
+    The reader does not look: it takes what it finds for coordinates.
+    """
+    if file_format != "DCD" or not os.path.isfile(path):
+        return n_frames
+    try:
+        order, ends, opening = _dcd_records(path, n_frames)
+    except struct.error:
+        return n_frames
+    if len(ends) < 2:
+        return n_frames
+    size = ends[1] - ends[0]
+    with open(path, "rb") as file:
+        for k in range(1, n_frames):
+            file.seek(ends[0] + (k - 1) * size)
+            word = file.read(4)
+            if len(word) < 4 or struct.unpack(order + "i", word)[0] != opening:
+                return k
+    return n_frames
+
+
+def _dcd_end(path: str | Path, n_frames: int) -> int:
+    """End of the last whole frame."""
+    _, ends, _ = _dcd_records(path, n_frames)
+    if not ends:
+        return os.path.getsize(path)
+    # With fixed atoms, frames after the first are shorter.
+    later = ends[1] - ends[0] if len(ends) > 1 else 0
+    return ends[0] + (n_frames - 1) * later
+
+
+def _dcd_records(path: str | Path, n_frames: int) -> tuple[str, list[int], int]:
+    """Order of bytes, ends of the first two frames, and the word that the second begins with.
+
+    Records are framed by their lengths.
+    """
+    size = os.path.getsize(path)
+    ends: list[int] = []
+    opening = 0
+    with open(path, "rb") as file:
+        order = "<" if struct.unpack("<i", file.read(4))[0] in (84, 164) else ">"
+
+        def skip() -> int:
+            length = int(struct.unpack(order + "i", file.read(4))[0])
             file.seek(length + 4, os.SEEK_CUR)
+            return length
 
         file.seek(0)
         for _ in range(3):
             skip()
-        ends: list[int] = []
-        for _ in range(2):
-            start = file.tell()
-            if start >= size or n_frames <= len(ends):
-                break
-            # A unit cell of six doubles may come first; then x, y, z and perhaps a fourth dimension.
-            first = struct.unpack(order + "i", file.read(4))[0]
-            file.seek(-4, os.SEEK_CUR)
-            for _ in range(4 if first == 48 else 3):
+        while len(ends) < min(n_frames, 2) and file.tell() < size:
+            # A unit cell of six doubles may come first; then x, y, z.
+            opening = skip()
+            for _ in range(3 if opening == 48 else 2):
                 skip()
             ends.append(file.tell())
-    if not ends:
-        return size
-    # With fixed atoms, frames after the first are shorter.
-    later = ends[1] - ends[0] if len(ends) > 1 else 0
-    return ends[0] + (n_frames - 1) * later
+    return order, ends, opening
 
 
 def _xtc_frame_size(path: str | Path, offset: int) -> int:

@@ -110,7 +110,7 @@ class CheckResult:
         Frames looked at, and their times in ps.
     units : list of UnitResult
     worst : list of RowResult
-        Rows by how far they exceed what is allowed.
+        Violated rows first, then by their largest deviation.
     series : dict
         Numbers by frame: largest and root mean square deviation for each unit, temperature.
     rank, degrees_of_freedom : int or None

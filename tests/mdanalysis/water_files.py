@@ -27,6 +27,13 @@ def water(n: int, frames: int, side: float = 12.0, seed: int = 0) -> np.ndarray:
     return x.reshape(frames, 3 * n, 3) % side
 
 
+def whole(x: np.ndarray, side: float = 12.0) -> np.ndarray:
+    """Molecules made whole."""
+    y = x.reshape(len(x), -1, 3, 3)
+    d = y - y[:, :, :1]
+    return (y - side * np.rint(d / side)).reshape(x.shape)
+
+
 def pairs(n: int) -> np.ndarray:
     o = 3 * np.arange(n)
     return np.stack([o, o + 1, o, o + 2, o + 1, o + 2], axis=1).reshape(-1, 2)
@@ -38,7 +45,11 @@ def targets(n: int) -> np.ndarray:
 
 def universe(n: int, masses: bool = True):
     made = mda.Universe.empty(
-        3 * n, n_residues=n, atom_resindex=np.repeat(np.arange(n), 3), residue_segindex=np.zeros(n, int), trajectory=True
+        3 * n,
+        n_residues=n,
+        atom_resindex=np.repeat(np.arange(n), 3),
+        residue_segindex=np.zeros(n, int),
+        trajectory=True,
     )
     made.add_TopologyAttr("names", ["OW", "HW1", "HW2"] * n)
     made.add_TopologyAttr("elements", ["O", "H", "H"] * n)
@@ -49,10 +60,14 @@ def universe(n: int, masses: bool = True):
     return made
 
 
-def write(path: Path, x: np.ndarray, side: float | None = 12.0, velocities: np.ndarray | None = None, **options) -> Path:
+def write(
+    path: Path, x: np.ndarray, side: float | None = 12.0, velocities: np.ndarray | None = None, **options
+) -> Path:
     """A trajectory of MDAnalysis' own writers, 2 ps between frames."""
     n = x.shape[1]
     made = mda.Universe.empty(n, trajectory=True, velocities=velocities is not None)
+    if path.suffix == ".dcd":
+        options.setdefault("dt", 2.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with mda.Writer(str(path), n, **options) as writer:
