@@ -125,6 +125,7 @@ class TrajectoryWriter:
         self.n_frames = 0
         self.side_file: Path | None = None
         self._side: TextIO | None = None
+        self._expects_forces = False
         self._format = self.path.suffix[1:].upper()
         if not self.path.parent.is_dir():
             raise InputError(f"there is no folder {self.path.parent} to write {self.path.name} into", item="path")
@@ -139,6 +140,8 @@ class TrajectoryWriter:
         )
         if self._format == "H5MD":
             options = {**_H5MD_UNITS, **options, "velocities": self._with_velocities, "forces": forces}
+        elif self._format in ("NC", "NCDF"):
+            options = {"velocities": self._with_velocities, "forces": forces, **options}
         if interval is not None:
             self._universe.trajectory.ts.dt = abs(interval) * self.units.time
             if self._format == "DCD":
@@ -159,6 +162,7 @@ class TrajectoryWriter:
     def __call__(self, state: State) -> None:
         """Write a state; for `kcons.steppers.run(..., observers=[writer])`."""
         lattice = None if self.motion is None else self.motion.lattice
+        self._expects_forces = True  # at the latest after the first step
         self.write(
             state.positions,
             state.velocities,
@@ -242,6 +246,8 @@ class TrajectoryWriter:
             extras["velocity_residuals"] = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
             if f is not None:
                 extras["multipliers"] = self.motion.multipliers(x, v, f, time)
+            elif self._expects_forces:
+                extras["multipliers"] = np.full(held.n_rows, np.nan)
         return extras
 
     def _label_observables(self, extras: dict[str, FloatArray]) -> None:

@@ -1,0 +1,235 @@
+"""Files that runs write: read back by MDAnalysis alone, units, extras, runs that are killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import water_files as files
+from water_files import mda
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.mdanalysis import ASE_UNITS, ConstraintCheck, OpenMMReporter, TrajectoryWriter, load_trajectory, write_ase
+from kcons.motion import Motion
+from kcons.steppers import System, run
+
+N = 8
+MASSES = np.tile([15.999, 1.008, 1.008], N)
+
+
+def system():
+    x = files.whole(files.water(N, 1))[0]
+    motion = Motion(ConstraintSet(Distance(files.pairs(N), files.targets(N)), x, MASSES, cell=[12.0] * 3), x)
+
+    def force(positions, time):
+        return -20.0 * (positions - x) + 3.0
+
+    made = System(motion, force)
+    v = np.random.default_rng(2).normal(size=x.shape) * 5
+    return made, made.initial_state(x, motion.project_velocities(x, v)), motion
+
+
+def read(path):
+    made = files.universe(N)
+    load_trajectory(made, path)
+    return made
+
+
+@pytest.mark.parametrize("ending", ["dcd", "xtc", "trr", "nc", "h5md"])
+def test_core_runs(tmp_path, ending):
+    if ending == "h5md":
+        pytest.importorskip("h5py")
+    made, state, motion = system()
+    path = tmp_path / f"r.{ending}"
+    states = []
+    with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.02) as writer:
+        run(made, state, 0.002, 50, observers=[writer, states.append], every=10)
+    universe = read(path)
+    assert universe.trajectory.n_frames == len(states) == 6
+    accuracy = 6e-3 if ending == "xtc" else 2e-6
+    for ts, s in zip(universe.trajectory, states, strict=True):
+        np.testing.assert_allclose(ts.positions, s.positions, atol=accuracy)
+        assert ts.time == pytest.approx(s.time, abs=1e-5)
+        np.testing.assert_allclose(ts.dimensions, [12, 12, 12, 90, 90, 90], rtol=1e-6)
+        assert ts.has_velocities == (ending in ("trr", "nc", "h5md"))
+        if ts.has_velocities:
+            np.testing.assert_allclose(ts.velocities, s.velocities, atol=1e-4)
+    check = ConstraintCheck(universe, Distance(files.pairs(N), files.targets(N)), tolerance=0.0).run().check
+    assert check.status == "kept", check.verdict
+
+
+def test_observables_of_h5md(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    made, state, motion = system()
+    path = tmp_path / "r.h5md"
+    states = []
+    with TrajectoryWriter(path, 3 * N, motion=motion, forces=True) as writer:
+        run(made, state, 0.002, 10, observers=[writer, states.append], every=5)
+    assert writer.side_file is None
+    last = read(path).trajectory[-1]
+    s = states[-1]
+    expected = motion.multipliers(s.positions, s.velocities, s.forces, s.time)
+    np.testing.assert_allclose(last.data["multipliers"], expected, rtol=1e-6, atol=1e-6)
+    assert np.abs(expected).max() > 1.0
+    assert np.abs(last.data["residuals"]).max() < 1e-12
+    with h5py.File(path) as file:
+        assert file["observables/trajectory/multipliers"].attrs["run_units"] == "Å, ps, kJ/mol"
+
+
+def test_side_file_is_auxiliary_data(tmp_path):
+    made, state, motion = system()
+    path = tmp_path / "r.dcd"
+    with TrajectoryWriter(path, 3 * N, motion=motion, interval=0.01) as writer:
+        after = run(made, state, 0.002, 20, observers=[writer], every=5)
+    assert writer.side_file == tmp_path / "r.xvg"
+    universe = read(path)
+    universe.trajectory.add_auxiliary({"constraints": 0}, str(writer.side_file))
+    assert universe.trajectory.n_frames == 5
+    aux = mda.auxiliary.XVG.XVGReader(str(writer.side_file))
+    rows = np.array([step._data.copy() for step in aux])
+    np.testing.assert_allclose(rows[:, 0], [0, 0.01, 0.02, 0.03, 0.04], atol=1e-9)
+    assert rows.shape[1] == 4 + 3 * N and np.nanmax(rows[:, 1]) < 1e-12
+    expected = motion.multipliers(after.positions, after.velocities, after.forces, after.time)
+    np.testing.assert_allclose(rows[-1, 4:], expected, rtol=1e-6, atol=1e-6)
+    assert "multiplier #0 Distance(0, 1)" in writer.side_file.read_text()
+
+
+KILLED = """
+import os, sys
+sys.path[:0] = {paths!r}
+import test_writing as t
+from kcons.steppers import run
+made, state, motion = t.system()
+writer = t.TrajectoryWriter(sys.argv[1], 3 * t.N, motion=motion, interval=0.002)
+run(made, state, 0.002, 4, observers=[writer])
+print("written", flush=True)
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_run_that_is_killed_keeps_its_frames(tmp_path):
+    """All formats in one process each time would be slow; those that buffer differently."""
+    endings = ["dcd", "xtc", "trr", "nc"]
+    try:
+        import h5py  # noqa: F401
+
+        endings.append("h5md")
+    except ImportError:
+        pass
+    code = KILLED.format(paths=[os.path.dirname(__file__)])
+    code = code.replace("writer =", "writers = [").replace("interval=0.002)", "interval=0.002) for e in sys.argv[2:]]")
+    code = code.replace("sys.argv[1],", 'sys.argv[1] + "/k" + e + "." + e,').replace("[writer]", "writers")
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path), *endings], capture_output=True, text=True, check=False
+    )
+    assert "written" in done.stdout and done.returncode == -signal.SIGKILL, done.stderr
+    for ending in endings:
+        universe = read(tmp_path / f"k{ending}.{ending}")
+        assert universe.trajectory.n_frames == 5, ending
+        rows = Distance(files.pairs(N), files.targets(N))
+        check = ConstraintCheck(universe, rows, tolerance=0.0, rank=False).run().check
+        assert check.status == "kept" and check.broken is None and len(check.frames) == 5, (ending, check.broken)
+        assert len((tmp_path / "kdcd.xvg").read_text().split("\n")) > 5
+
+
+def test_ase_dynamics(tmp_path):
+    ase = pytest.importorskip("ase")
+    from ase.calculators.tip3p import TIP3P
+    from ase.md.verlet import VelocityVerlet
+
+    from kcons.ase import ConstrainedDynamics, Constraints
+
+    x = files.whole(files.water(2, 1, side=12.0, seed=3))[0]
+    rows = Distance(files.pairs(2), files.targets(2))
+    for ours in (True, False):
+        atoms = ase.Atoms("OHHOHH", positions=x, cell=[12.0] * 3, pbc=True)
+        atoms.set_constraint(Constraints(rows))
+        atoms.calc = TIP3P(rc=4.5)
+        dynamics = (ConstrainedDynamics if ours else VelocityVerlet)(atoms, 1.0 * ase.units.fs)
+        path = tmp_path / f"a{ours}.trr"
+        with write_ase(dynamics, path, interval=4, forces=True) as writer:
+            dynamics.run(8)
+        assert writer.n_frames == 3 and writer.motion is not None
+        made = files.universe(2)
+        load_trajectory(made, path)
+        last = made.trajectory[-1]
+        assert last.time == pytest.approx(8e-3, rel=1e-5)
+        np.testing.assert_allclose(last.positions, atoms.positions, atol=1e-5)
+        np.testing.assert_allclose(last.velocities, atoms.get_velocities() * 1000 * ase.units.fs, rtol=1e-5, atol=1e-6)
+        per_mole = ase.units.kJ / ase.units.mol
+        np.testing.assert_allclose(
+            last.forces, atoms.get_forces(apply_constraint=False) / per_mole, rtol=1e-5, atol=1e-4
+        )
+        multipliers = np.loadtxt(tmp_path / f"a{ours}.xvg", comments=("#", "@"))[-1, 4:]
+        assert len(multipliers) == 6 and np.isfinite(multipliers).all()
+    assert pytest.approx(1 / (1000 * ase.units.fs), rel=1e-8) == ASE_UNITS.time
+
+
+def test_openmm_simulations(tmp_path):
+    openmm = pytest.importorskip("openmm")
+    from openmm import app, unit
+
+    x = files.whole(files.water(2, 1, seed=3))[0] / 10
+    force_system = openmm.System()
+    topology = app.Topology()
+    chain = topology.addChain()
+    for k in range(2):
+        residue = topology.addResidue("HOH", chain)
+        for name, mass in (("O", 15.999), ("H1", 1.008), ("H2", 1.008)):
+            topology.addAtom(name, app.Element.getBySymbol(name[0]), residue)
+            force_system.addParticle(mass)
+        for (i, j), length in zip(files.pairs(1) + 3 * k, files.targets(1) / 10, strict=True):
+            force_system.addConstraint(int(i), int(j), float(length))
+    integrator = openmm.VerletIntegrator(0.001)
+    integrator.setConstraintTolerance(1e-8)
+    simulation = app.Simulation(topology, force_system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(x)
+    simulation.context.setVelocitiesToTemperature(300, 1)
+    masses = np.tile([15.999, 1.008, 1.008], 2)
+    motion = Motion(ConstraintSet(Distance(files.pairs(2), files.targets(2) / 10), x, masses), x)
+    path = tmp_path / "o.trr"
+    reporter = OpenMMReporter(path, 5, motion=motion)
+    simulation.reporters.append(reporter)
+    simulation.step(20)
+    reporter.close()
+    made = files.universe(2)
+    load_trajectory(made, path)
+    assert [round(ts.time, 6) for ts in made.trajectory] == [0.005, 0.01, 0.015, 0.02]
+    state = simulation.context.getState(positions=True, velocities=True)
+    last = made.trajectory[-1]
+    np.testing.assert_allclose(last.positions / 10, state.getPositions(asNumpy=True)._value, atol=1e-6)
+    speeds = state.getVelocities(asNumpy=True).value_in_unit(unit.angstrom / unit.picosecond)
+    np.testing.assert_allclose(last.velocities, speeds, rtol=1e-5, atol=1e-5)
+    residuals = np.loadtxt(tmp_path / "o.xvg", comments=("#", "@"))[:, 1]
+    assert residuals.max() < 1e-8 and len(residuals) == 4
+
+
+def test_bad_input(tmp_path):
+    x = np.zeros((3 * N, 3))
+    for path, match in ((tmp_path / "r.psf", r"r\.psf.*use \.dcd"), (tmp_path / "no" / "r.dcd", "no folder")):
+        with pytest.raises(InputError, match=match):
+            TrajectoryWriter(path, 3 * N)
+    with pytest.raises(UnsupportedError, match="XTC has no velocities; write TRR"):
+        TrajectoryWriter(tmp_path / "r.xtc", 3 * N, velocities=True)
+    writer = TrajectoryWriter(tmp_path / "r.dcd", 3 * N)
+    with pytest.raises(InputError, match="positions must have shape"):
+        writer.write(x[:-1])
+    bad = x.copy()
+    bad[4, 2] = np.inf
+    with pytest.raises(NonFiniteError, match=r"positions of atom 4.*nothing was written"):
+        writer.write(bad)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer.write(x)
+    assert writer.n_frames == 1
+    writer.close()
+    writer.close()
+    with pytest.raises(InputError, match="is closed"):
+        writer.write(x)
+    with pytest.raises(InputError, match="interval is 0"):
+        OpenMMReporter(tmp_path / "o.dcd", 0)
