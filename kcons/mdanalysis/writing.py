@@ -253,7 +253,7 @@ class TrajectoryWriter:
     def _label_observables(self, extras: dict[str, FloatArray]) -> None:
         group = self._writer.h5md_file
         for name in extras:
-            place = f"observables/trajectory/{name}"
+            place = f"observables/{name}"
             if place in group and "run_units" not in group[place].attrs:
                 group[place].attrs["run_units"] = self.units.name
 

@@ -77,6 +77,6 @@ def test_errors_take_one_line(folder, capsys, name, more, words):
 
 def test_plot_of_one_frame_and_of_nothing_wrong(folder, tmp_path):
     result = check_trajectory(folder / "good.xtc", folder / "t.gro", "none", frames="2:3", rank=False)
-    assert set(result.series["largest Å"]) == {0.0}
+    assert max(result.series["largest Å"]) < 1e-12
     check_report.plot(result, tmp_path / "p.png")
     assert (tmp_path / "p.png").stat().st_size > 5000

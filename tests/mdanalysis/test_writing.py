@@ -78,7 +78,7 @@ def test_observables_of_h5md(tmp_path):
     assert np.abs(expected).max() > 1.0
     assert np.abs(last.data["residuals"]).max() < 1e-12
     with h5py.File(path) as file:
-        assert file["observables/trajectory/multipliers"].attrs["run_units"] == "Å, ps, kJ/mol"
+        assert file["observables/multipliers"].attrs["run_units"] == "Å, ps, kJ/mol"
 
 
 def test_side_file_is_auxiliary_data(tmp_path):
