@@ -165,8 +165,8 @@ def main() -> None:
         alone, one = best["reader"], best["check"]
         print(
             f"{ending}: {frames} frames of {3 * molecules} atoms; reader {alone['cpu']:.2f} s, "
-            f"check {one['cpu']:.2f} s of CPU time ({ratio:.0%} of the reader's speed) + {one['setup']:.2f} s; peak {one['peak']:.0f} MB; "
-            f"two workers {gain:.2f} times as fast; {one['status']}"
+            f"check {one['cpu']:.2f} s of CPU time ({ratio:.0%} of the reader's speed) + {one['setup']:.2f} s; "
+            f"peak {one['peak']:.0f} MB; two workers {gain:.2f} times as fast; {one['status']}"
         )
     if chosen.out:
         machine = {"python": platform.python_version(), "mdanalysis": mda.__version__, "kcons": __version__}

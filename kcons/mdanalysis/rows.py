@@ -13,7 +13,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.solvers.frames import coordinate_grid, length_rates, lengths, padded
+from kcons.solvers.frames import LANES, coordinate_grid, length_rates, lengths, padded, triangles
 from kcons.solvers.lattice import NO_LATTICE
 
 #: Natural units of rows, in this order.
@@ -112,7 +112,19 @@ class RowTable:
                 other_rows.append(np.arange(first, end))
         self.length_rows: IntArray = np.concatenate(length_rows)
         self.other_rows: IntArray = np.concatenate(other_rows)
-        self._places, self._targets = padded(np.concatenate(pairs), np.concatenate(held))
+        self._pairs, wanted = np.concatenate(pairs), np.concatenate(held)
+        self._all_places: NDArray[np.uint32] | None = None
+        # Rigid water first: three sides at once, for less than two. What is left goes one by one.
+        sides = _triangles(self._pairs)
+        single = np.ones(len(self._pairs), dtype=bool)
+        single[sides.ravel()] = False
+        self._triangle_rows = self.length_rows[sides]
+        corners = np.stack([self._pairs[sides[0], 0], self._pairs[sides[0], 1], self._pairs[sides[1], 1]])
+        self._corners = np.ascontiguousarray(3 * corners, dtype=np.uint32)
+        self._triangle_targets = np.ascontiguousarray(wanted[sides])
+        self._triangle_largest, self._triangle_total = np.zeros(sides.shape, np.float32), np.zeros(sides.shape)
+        self._single_rows = self.length_rows[single]
+        self._places, self._targets = padded(self._pairs[single], wanted[single])
         self._largest, self._total = np.zeros(len(self._targets), np.float32), np.zeros(len(self._targets))
         self._others: ConstraintSet | None = None
         if len(self.other_rows):
@@ -179,16 +191,36 @@ class RowTable:
         lattice, limit = self.cell_of(dimensions)
         into.n_summed += summed
         if len(self.length_rows):
-            sums, squares, worst, row = lengths(
-                x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total, summed
-            )
+            sums, squares, worst, row = 0.0, 0.0, -1.0, -1
+            if self._triangle_rows.size:
+                sums, squares, worst, side, triangle = triangles(
+                    x,
+                    self._corners,
+                    self._triangle_targets,
+                    limit,
+                    lattice,
+                    self.grid,
+                    self._triangle_largest,
+                    self._triangle_total,
+                    summed,
+                )
+                row = self._triangle_rows[side, triangle]
+            if len(self._single_rows):
+                more, more_squares, largest, k_worst = lengths(
+                    x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total, summed
+                )
+                sums, squares = sums + more, squares + more_squares
+                if largest > worst:
+                    worst, row = largest, self._single_rows[min(k_worst, len(self._single_rows) - 1)]
             if not squares < np.inf:
                 self._refuse(x)
             into.sums[0, k], into.squares[0, k] = sums, squares
-            into.worst[0, k], into.worst_row[0, k] = worst, self.length_rows[row]
+            into.worst[0, k], into.worst_row[0, k] = worst, row
             if v is not None:
+                if self._all_places is None:
+                    self._all_places, _ = padded(self._pairs, 0.0)
                 n = len(self.length_rows)
-                squares, worst, row = length_rates(x, v, self._places, n, limit, lattice, self.grid)
+                squares, worst, row = length_rates(x, v, self._all_places, n, limit, lattice, self.grid)
                 into.rate_squares[0, k] = squares
                 into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
         if self._others is not None:
@@ -196,10 +228,14 @@ class RowTable:
 
     def collect(self, into: Deviations) -> None:
         """Put what was found by row where it belongs, and begin anew."""
-        n = len(self.length_rows)
-        into.largest[self.length_rows] = self._largest[:n]
-        into.total[self.length_rows] = self._total[:n]
-        self._largest[:], self._total[:] = 0.0, 0.0
+        n = len(self._single_rows)
+        into.largest[self._single_rows], into.total[self._single_rows] = self._largest[:n], self._total[:n]
+        into.largest[self._triangle_rows], into.total[self._triangle_rows] = (
+            self._triangle_largest,
+            self._triangle_total,
+        )
+        for array in (self._largest, self._total, self._triangle_largest, self._triangle_total):
+            array[...] = 0.0
 
     def _look_at_others(
         self,
@@ -249,6 +285,21 @@ class RowTable:
         if len(bad):
             raise NonFiniteError(f"position of atom {bad[0]} is {points[bad[0]]}", item="position", atom=int(bad[0]))
         raise NonFiniteError("a row is undefined: atoms coincide or are collinear", item="position")
+
+
+def _triangles(pairs: IntArray) -> IntArray:
+    """Rows that follow each other as (a, b), (a, c), (b, c): shape (3, n), n a multiple of four."""
+    if len(pairs) < 3:
+        return np.zeros((3, 0), dtype=np.int64)
+    one, two, three = pairs[:-2], pairs[1:-1], pairs[2:]
+    fits = (one[:, 0] == two[:, 0]) & (one[:, 1] == three[:, 0]) & (two[:, 1] == three[:, 1])
+    chosen, free = [], 0
+    for k in np.flatnonzero(fits).tolist():
+        if k >= free:
+            chosen.append(k)
+            free = k + 3
+    first = np.array(chosen[: len(chosen) // LANES * LANES], dtype=np.int64)
+    return np.stack([first, first + 1, first + 2])
 
 
 def cell_matrix(dimensions: Any) -> FloatArray | None:

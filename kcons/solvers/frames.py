@@ -294,3 +294,78 @@ def coordinate_grid(x: Any, step: float) -> Any:
     """Coordinates of a frame in double precision, as the file holds them."""
     exact = np.asarray(x, dtype=np.float64)
     return np.rint(exact * (1.0 / step)) * step if step > 0 else exact
+
+
+@nb.njit(inline="always")
+def _images(square, x, first, second, k, limit, lattice, step):  # type: ignore[no-untyped-def]
+    """Squared distances of four pairs by their shortest images."""
+    if _all_below(square, limit):
+        return square
+    return quad(
+        _square(x, first[k], second[k], limit, lattice, step),
+        _square(x, first[k + 1], second[k + 1], limit, lattice, step),
+        _square(x, first[k + 2], second[k + 2], limit, lattice, step),
+        _square(x, first[k + 3], second[k + 3], limit, lattice, step),
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def triangles(x, corners, targets, limit, lattice, step, largest, total, summed):  # type: ignore[no-untyped-def]
+    """`lengths` of triangles, such as rigid water: each corner is loaded once.
+
+    Parameters
+    ----------
+    corners : ndarray of uint32, shape (3, n)
+        Offsets of the corners a, b, c; n is a multiple of four.
+    targets, largest, total : ndarray, shape (3, n)
+        Of the sides ab, ac, bc.
+
+    Returns
+    -------
+    sum, sum of squares, largest absolute deviation, side, triangle
+    """
+    a, b, c = corners[0], corners[1], corners[2]
+    zero = quad(0.0, 0.0, 0.0, 0.0)
+    n = targets.shape[1]
+    sums, squares, worst = zero, zero, -1.0
+    begin_of_worst = 0
+    for begin in range(0, n, BLOCK):
+        most = zero
+        for k in range(begin, min(n, begin + BLOCK), 4):
+            if step > 0.0:
+                ab = _squares_on_grid(x, a, b, k, step)
+                ac = _squares_on_grid(x, a, c, k, step)
+                bc = _squares_on_grid(x, b, c, k, step)
+            else:
+                ab, ac, bc = _squares(x, a, b, k, step), _squares(x, a, c, k, step), _squares(x, b, c, k, step)
+            if not _all_below(_larger(_larger(ab, ac), bc), limit):
+                ab = _images(ab, x, a, b, k, limit, lattice, step)
+                ac = _images(ac, x, a, c, k, limit, lattice, step)
+                bc = _images(bc, x, b, c, k, limit, lattice, step)
+            off_ab = _root(ab) - load_quad(targets[0], k)
+            off_ac = _root(ac) - load_quad(targets[1], k)
+            off_bc = _root(bc) - load_quad(targets[2], k)
+            size_ab, size_ac, size_bc = _size(off_ab), _size(off_ac), _size(off_bc)
+            most = _larger(_larger(size_ab, size_ac), _larger(size_bc, most))
+            sums = sums + (off_ab + off_ac) + off_bc
+            squares = squares + off_ab * off_ab
+            squares = squares + off_ac * off_ac
+            squares = squares + off_bc * off_bc
+            _enlarge(largest[0], k, size_ab)
+            _enlarge(largest[1], k, size_ac)
+            _enlarge(largest[2], k, size_bc)
+            if summed:
+                store_quad(total[0], k, load_quad(total[0], k) + off_ab)
+                store_quad(total[1], k, load_quad(total[1], k) + off_ac)
+                store_quad(total[2], k, load_quad(total[2], k) + off_bc)
+        m = _largest(most)
+        if m > worst:
+            worst, begin_of_worst = m, begin
+    side, triangle, most_of_row = 0, begin_of_worst, -1.0
+    for k in range(begin_of_worst, min(n, begin_of_worst + BLOCK)):
+        for s in range(3):
+            i, j = corners[1 if s == 2 else 0, k], corners[1 if s == 0 else 2, k]
+            size = abs(np.sqrt(_square(x, i, j, limit, lattice, step)) - targets[s, k])
+            if size > most_of_row:
+                most_of_row, side, triangle = size, s, k
+    return _sum(sums), _sum(squares), worst, side, triangle

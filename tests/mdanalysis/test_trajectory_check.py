@@ -200,6 +200,25 @@ def test_rows_of_all_kinds(water):
     assert set(result.series) >= {"largest Å", "largest rad", "rms Å", "rms rad"}
 
 
+@pytest.mark.parametrize("n", [1, 3, 4, 6])
+def test_triangles_and_single_rows_say_the_same(water, n):
+    """Sides of triangles are measured together, four molecules at a time; what is left goes one by one."""
+    table, held = files.pairs(N), files.targets(N)
+    mixed = np.concatenate([table[: 3 * n], table[3 * n :: 3], table[3 * n + 1 :: 3]])
+    wanted = np.concatenate([held[: 3 * n], held[3 * n :: 3], held[3 * n + 1 :: 3]])
+    for ending in ("dcd", "xtc"):
+        together = checked(water[ending], Distance(mixed, wanted), worst=999)
+        apart = checked(
+            water[ending], [Distance(pair, length) for pair, length in zip(mixed, wanted, strict=True)][::-1], worst=999
+        )
+        assert {(r.name, r.largest, r.frame) for r in together.worst} == {
+            (r.name, r.largest, r.frame) for r in apart.worst
+        }
+        np.testing.assert_allclose(together.series["rms Å"], apart.series["rms Å"], rtol=1e-12)
+        means = {r.name: r.mean for r in apart.worst}
+        assert all(r.mean == pytest.approx(means[r.name], abs=1e-13) for r in together.worst)
+
+
 @pytest.mark.parametrize("backend", ["multiprocessing", "dask"])
 def test_backends_agree(water, backend):
     if backend == "dask":
