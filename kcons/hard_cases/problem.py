@@ -1,0 +1,188 @@
+"""A small mechanical problem in one form for all programs, and the numbers that judge a run of it.
+
+Units are consistent ones: they are taken as Angstrom, amu and eV by ASE and as nm, dalton and kJ/mol by OpenMM, so
+that all programs compute with the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons import projection
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Angle, Constraint, Distance, FixedAtoms
+
+Array = NDArray[np.float64]
+Pairs = Sequence[tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Atoms, what is held, and forces.
+
+    Attributes
+    ----------
+    positions, masses : array_like, shapes (n_atoms, 3) and (n_atoms,)
+    pairs, lengths
+        Distances that are held; without lengths, at what they are.
+    triples, angles
+        Angles that are held, in radian.
+    fixed : sequence of int
+        Atoms that do not move.
+    velocities : array_like, shape (n_atoms, 3), optional
+    push : array_like, shape (n_atoms, 3), optional
+        Constant forces.
+    springs : sequence of (i, j, k, rest length)
+        Harmonic bonds.
+    tether : float
+        Constant of springs that hold each atom near `anchors`.
+    anchors : array_like, shape (n_atoms, 3), optional
+        By default the positions.
+    cell : array_like, shape (3, 3), optional
+        Periodic lattice vectors.
+    others : sequence of Constraint
+        Rows that only kcons knows.
+    """
+
+    positions: ArrayLike
+    masses: ArrayLike
+    pairs: Pairs = ()
+    lengths: ArrayLike | None = None
+    triples: Sequence[tuple[int, int, int]] = ()
+    angles: ArrayLike | None = None
+    fixed: Sequence[int] = ()
+    velocities: ArrayLike | None = None
+    push: ArrayLike | None = None
+    springs: Sequence[tuple[int, int, float, float]] = ()
+    tether: float = 0.0
+    anchors: ArrayLike | None = None
+    cell: ArrayLike | None = None
+    others: Sequence[Constraint] = ()
+
+    @property
+    def x(self) -> Array:
+        return np.array(self.positions, dtype=float)
+
+    @property
+    def v(self) -> Array:
+        return np.zeros_like(self.x) if self.velocities is None else np.array(self.velocities, dtype=float)
+
+    @property
+    def m(self) -> Array:
+        return np.array(self.masses, dtype=float)
+
+    @property
+    def n_atoms(self) -> int:
+        return len(self.x)
+
+    @property
+    def held_lengths(self) -> Array:
+        """Lengths of `pairs`, shape (n_pairs,)."""
+        if self.lengths is not None:
+            return np.array(np.broadcast_to(np.asarray(self.lengths, dtype=float), (len(self.pairs),)))
+        return distances(self.x, self.pairs, self.cell)
+
+    @property
+    def held_angles(self) -> Array:
+        """Values of `triples` in radian, shape (n_triples,)."""
+        if self.angles is not None:
+            return np.array(np.broadcast_to(np.asarray(self.angles, dtype=float), (len(self.triples),)))
+        return bends(self.x, self.triples)
+
+    def but(self, **changes: Any) -> Problem:
+        """A copy with other attributes."""
+        return replace(self, **changes)
+
+    def rows(self) -> list[Constraint]:
+        """The constraints of kcons."""
+        found: list[Constraint] = [FixedAtoms(list(self.fixed))] if len(self.fixed) else []
+        if len(self.pairs):
+            found.append(Distance(list(self.pairs), None if self.lengths is None else self.held_lengths))
+        if len(self.triples):
+            found.append(Angle(list(self.triples), None if self.angles is None else self.held_angles))
+        return [*found, *self.others]
+
+    @property
+    def has_forces(self) -> bool:
+        return self.push is not None or bool(self.springs) or self.tether != 0
+
+    def forces(self, x: Array, time: float = 0.0) -> Array:
+        """Applied forces, shape (n_atoms, 3)."""
+        f = np.zeros_like(x) if self.push is None else np.array(self.push, dtype=float)
+        for i, j, k, rest in self.springs:
+            d = x[i] - x[j]
+            r = np.linalg.norm(d)
+            pull = k * (rest - r) / r * d
+            f[i] += pull
+            f[j] -= pull
+        if self.tether:
+            f -= self.tether * (x - self._anchors)
+        return f
+
+    def potential(self, x: Array, time: float = 0.0) -> float:
+        """Potential energy."""
+        energy = 0.0 if self.push is None else -float(np.sum(np.asarray(self.push) * x))
+        for i, j, k, rest in self.springs:
+            energy += 0.5 * k * float(np.linalg.norm(x[i] - x[j]) - rest) ** 2
+        if self.tether:
+            energy += 0.5 * self.tether * float(np.sum((x - self._anchors) ** 2))
+        return energy
+
+    @property
+    def _anchors(self) -> Array:
+        return self.x if self.anchors is None else np.asarray(self.anchors, dtype=float)
+
+    # -- judges -----------------------------------------------------------------------------------
+
+    def residual(self, x: Array) -> float:
+        """Largest relative error of a held length, or error of a held angle in radian; NaN if anything is."""
+        if not np.all(np.isfinite(x)):
+            return float("nan")
+        worst = 0.0
+        if len(self.pairs):
+            lengths = self.held_lengths
+            worst = float(np.max(np.abs(distances(x, self.pairs, self.cell) - lengths) / lengths))
+        if len(self.triples):
+            worst = max(worst, float(np.max(np.abs(bends(x, self.triples) - self.held_angles))))
+        return worst
+
+    def kinetic(self, v: Array) -> float:
+        """Kinetic energy of the atoms that are not fixed."""
+        moving = np.setdiff1d(np.arange(self.n_atoms), np.asarray(self.fixed, dtype=int))
+        return 0.5 * float(np.sum(self.m[moving, None] * v[moving] ** 2))
+
+    def oracle(self) -> ConstraintSet:
+        """The rows for the dense theory of `kcons.projection`; none of the solvers knows of it."""
+        return ConstraintSet(self.rows(), self.x, self.m)
+
+    def tangent(self, v: ArrayLike) -> Array:
+        """Velocities projected in the mass metric, densely."""
+        return projection.project_velocities(self.oracle().jacobian(self.x).toarray(), self.m, np.asarray(v))
+
+    def acceleration(self, x: Array, v: Array) -> Array:
+        """Accelerations of the dense theory (notes, eq. 105)."""
+        held = self.oracle()
+        rows = held.jacobian(x).toarray()
+        return projection.acceleration(rows, self.m, self.forces(x), held.acceleration_target(x, v))
+
+
+def distances(x: Array, pairs: Pairs, cell: ArrayLike | None = None) -> Array:
+    """Distances of pairs, by minimum images in a cell."""
+    pairs = np.asarray(pairs, dtype=int).reshape(-1, 2)
+    d = x[pairs[:, 0]] - x[pairs[:, 1]]
+    if cell is not None:
+        lattice = np.asarray(cell, dtype=float)
+        d = d - np.round(d @ np.linalg.inv(lattice)) @ lattice
+    return np.sqrt(np.sum(d * d, axis=1))
+
+
+def bends(x: Array, triples: Sequence[tuple[int, int, int]]) -> Array:
+    """Angles at the middle atoms, radian."""
+    i, j, k = np.asarray(triples, dtype=int).reshape(-1, 3).T
+    u, w = x[i] - x[j], x[k] - x[j]
+    return np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))
