@@ -18,7 +18,7 @@ from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
-from kcons.second_order import RANK_TOLERANCE, BoolArray, LocalRows, extent_of
+from kcons.second_order import RANK_TOLERANCE, UNSOLVABLE, BoolArray, LocalRows, extent_of
 
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6
@@ -292,14 +292,28 @@ def _rebuilt(block: LocalRows, bodies: list[FlatBody]) -> LocalRows:
 
 
 def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> None:
-    """The new rows must be regular, and the replaced ones must follow from them."""
+    """The new rows must be regular, and the replaced ones must follow from them, to second order.
+
+    First order is not enough: flat plates hinged in a ring can fold as long as each is held alone, while the
+    distances between them resist the fold at second order.
+    """
     new = _rebuilt(block, bodies)
     unit, _ = new.unit_jacobian(block.x)
-    _, s, vt = np.linalg.svd(unit, full_matrices=True)
+    u, s, vt = np.linalg.svd(unit, full_matrices=True)
     rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
     old, _ = block.unit_jacobian(block.x)
     if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
         raise _unresolved(block, generic)
+    rng = np.random.default_rng(20060921)
+    for _ in range(3):
+        v = rng.standard_normal(len(vt) - rank) @ vt[rank:]
+        a = -((u[:, :rank].T @ new.unit_curvature(block.x, v)) / s[:rank]) @ vt[:rank]
+        bent = block.unit_curvature(block.x, v)
+        miss = old @ a + bent
+        # Rigid motion has no curvature but rounding.
+        size = np.linalg.norm(bent) + 1e-5 * (v @ v) / extent_of(block.x)
+        if np.linalg.norm(miss) > UNSOLVABLE * size:
+            raise _unresolved(block, generic)
 
 
 def with_flat_bodies(

@@ -27,7 +27,7 @@ RANK_TOLERANCE = 1e-6
 DISPLACEMENT = 1e-2
 #: Part of the curvature outside the range of A that is more than rounding (or than the differences of a
 #: user's gradient).
-_UNSOLVABLE = 1e-4
+UNSOLVABLE = 1e-4
 #: Families whose rows a linear or planar group makes superfluous.
 _CONVERTIBLE = frozenset({"Distance", "Angle", "Dihedral"})
 
@@ -62,7 +62,7 @@ def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], 
         outside = np.where(lost, np.einsum("brk,br->bk", u, b), 0.0)
         # Rigid translations have no curvature but rounding.
         size = np.linalg.norm(b, axis=1) + 1e-9 * np.einsum("bn,bn->b", v, v) / extent
-        result |= np.linalg.norm(outside, axis=1) > _UNSOLVABLE * size
+        result |= np.linalg.norm(outside, axis=1) > UNSOLVABLE * size
     return result
 
 
@@ -123,14 +123,19 @@ class LocalRows:
         rows = np.arange(self.part.n_rows) if rows is None else rows
         if len(rows) < 2:
             return False
-        unit, norms = self.unit_jacobian(x)
+        unit, _ = self.unit_jacobian(x)
 
         def curvature(v: FloatArray) -> FloatArray:
-            field = np.where(self.pinned[:, None], 0.0, v.reshape(-1, 3))
-            bent = [c.curvature(self.part.gather(c, x), field[c.atoms], self.time) for c in self.part.constraints]
-            return (np.concatenate(bent) / np.where(norms > 0, norms, 1.0))[None, rows]
+            return self.unit_curvature(x, v)[None, rows]
 
         return bool(unsolvable(unit[None, rows], curvature, np.array([extent_of(x)]))[0])
+
+    def unit_curvature(self, x: FloatArray, v: FloatArray) -> FloatArray:
+        """v^T (d2sigma/dx2) v of the rows that `unit_jacobian` scales, shape (n_rows,)."""
+        _, norms = self.unit_jacobian(x)
+        field = np.where(self.pinned[:, None], 0.0, v.reshape(-1, 3))
+        bent = [c.curvature(self.part.gather(c, x), field[c.atoms], self.time) for c in self.part.constraints]
+        return np.asarray(np.concatenate(bent) / np.where(norms > 0, norms, 1.0))
 
     def stressed(self, x: FloatArray) -> IntArray:
         """Rows (block numbering) that take part in a dependence omega^T A = 0."""

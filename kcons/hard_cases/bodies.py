@@ -28,7 +28,7 @@ def tumble(program: Program, shape: Array, masses: Array, pairs: Pairs, freedom:
     The error may be ten times that of RATTLE for a body held without surplus rows.
     """
     x = truths.rotated(shape)
-    dt, steps = 0.005, 100 if quick else 1000
+    dt, steps = 0.005, program.length(quick, 100, 1000)
     problem = Problem(x, masses, pairs, velocities=truths.spinning(x, masses, OMEGA))
     residual = _Worst(problem)
     end = program.run(problem, dt, steps, residual)
@@ -82,7 +82,7 @@ def duplicate_rows(program: Program, quick: bool) -> Outcome:
     x = np.array([[0.0, 0, 0], [1.2, 0, 0]])
     v = np.array([[0, 0.5, 0], [0, -0.2, 0.3]])
     pull = np.array([[0.3, -0.2, 0.1], [0.1, 0.4, -0.2]])
-    steps = 1000 if quick else 10_000
+    steps = program.length(quick, 1000, 10_000)
     once = Problem(x, [1.0, 2.5], [(0, 1)], velocities=v, push=pull, tether=0.5, anchors=0 * x)
     runs: list[list[Array]] = []
     for problem in (once, once.but(pairs=[(0, 1), (1, 0)])):
@@ -132,7 +132,7 @@ def diamond(program: Program, quick: bool) -> Outcome:
     """Two triangles hinged on one side, flat at the start: nothing is singular, but the fold opens both ways."""
     x = truths.rotated(_DIAMOND)
     v = np.random.default_rng(3).standard_normal((4, 3))
-    return move(program, Problem(x, np.full(4, 45.0), every(4)[:5], velocities=v), 0.005, 100 if quick else 1000)
+    return move(program, Problem(x, np.full(4, 45.0), every(4)[:5], velocities=v), 0.005, program.length(quick, 100, 1000))
 
 
 _DIAMOND = np.array([[0, 0, 0], [2.7, 0, 0], [1.35, 2.338, 0], [1.35, -2.338, 0]])
@@ -154,7 +154,7 @@ def collinear(program: Program, quick: bool) -> Outcome:
     masses = np.array([16.0, 12.0, 16.0])
     axis = (x[2] - x[0]) / np.linalg.norm(x[2] - x[0])
     omega = np.cross(axis, OMEGA)
-    dt, steps = 0.005, 100 if quick else 2000
+    dt, steps = 0.005, program.length(quick, 100, 2000)
     problem = Problem(x, masses, TRIANGLE, velocities=truths.spinning(x, masses, omega))
     residual = _Worst(problem)
     bent = _Bent()
@@ -193,7 +193,7 @@ def two_bonds(program: Program, quick: bool) -> Outcome:
     x = truths.rotated([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]])
     v = 0.3 * np.random.default_rng(1).standard_normal((3, 3))
     problem = Problem(x, [16.0, 12, 16], [(0, 1), (1, 2)], velocities=v)
-    return move(program, problem, 0.005, 100 if quick else 1000)
+    return move(program, problem, 0.005, program.length(quick, 100, 1000))
 
 
 def _bent_triatomic(degrees: float) -> Array:
@@ -216,14 +216,14 @@ def nearly_collinear(program: Program, quick: bool) -> Outcome:
     masses = np.array([16.0, 12.0, 16.0])
     axis = (x[0] - x[2]) / np.linalg.norm(x[0] - x[2])
     v = truths.spinning(x, masses, np.cross(axis, [0.3, -0.5, 0.9]))
-    steps = 500 if quick else 10_000
+    steps = program.length(quick, 500, 10_000)
     residual, energy = _energy_run(program, Problem(x, masses, TRIANGLE, velocities=v), 1e-3, steps)
     return outcome(("energy", energy, 1e-8), ("residual", residual, 1e-11), remark=f"{steps} steps")
 
 
 @case("H07", "Bonds and angle held at 179.9 degrees; angle at 180", "energy 1e-10, angle 1e-9 degrees over 1e4 steps")
 def angle_towards_180(program: Program, quick: bool) -> Outcome:
-    return _held_angle(program, 179.9, 500 if quick else 10_000, 1e-10)
+    return _held_angle(program, 179.9, program.length(quick, 500, 10_000), 1e-10)
 
 
 def _held_angle(program: Program, degrees: float, steps: int, energy_limit: float) -> Outcome:
@@ -262,7 +262,7 @@ def straight_angle(program: Program, quick: bool) -> Outcome:
 @case("X07", "Angle held at 165, 170, 175, 179 and 179.99 degrees", "energy 1e-9, angle 1e-9 degrees")
 def angles(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
-    steps = 100 if quick else 2000
+    steps = program.length(quick, 100, 2000)
     for degrees in (165.0, 170.0, 175.0, 179.0, 179.99):
         result = _held_angle(program, degrees, steps, 1e-9)
         found += [(f"at {degrees:g}: {check.name}", check.value, check.limit) for check in result.checks]

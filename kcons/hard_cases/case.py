@@ -193,6 +193,8 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "") -> Cell:
         if warned and case.kind == "warn-or-raise":
             return Cell("refused", True, f"{failed[0]}{tail}", checks)
         return Cell("silently wrong", False, f"{failed[0]}{tail}", checks)
+    if warned and not found.checks and case.kind != "bound":
+        return Cell("refused", True, notes)
     if not found.checks:
         return Cell("silently wrong", False, f"accepted without a word{tail}", checks)
     worst = max(found.checks, key=lambda check: check.value / check.limit if check.limit > 0 else 0.0)

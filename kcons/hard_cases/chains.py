@@ -45,8 +45,8 @@ def _mass_ratio(program: Program, ratio: float, quick: bool) -> Outcome:
         energies.append(frame.energy)
         centres.append(masses @ frame.x / masses.sum())
 
-    steps = 500 if quick else 10_000
-    program.run(problem, 0.01, steps, watch, every=10)
+    steps = program.length(quick, 500, 10_000)
+    program.run(problem, 0.01, steps, watch, every=5)
     return outcome(
         ("residual", residual.value, 1e-10),
         ("centre of mass", np.abs(np.array(centres) - centres[0]).max(), 1e-12),
@@ -140,12 +140,12 @@ def long_chain(program: Program, quick: bool) -> Outcome:
 @case("X23", "Near-straight chains (179 and 180 degrees) of 100 bonds", "residual 1e-10; momentum and energy of free flight")
 def near_straight(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
-    steps = 20 if quick else 500
+    steps = program.length(quick, 20, 500)
     for degrees in (179.0, 180.0):
         x = truths.rotated(zigzag(101, degrees))
         masses = np.full(101, 12.0)
         problem = Problem(x, masses, bonds(101))
-        problem = problem.but(velocities=problem.tangent(0.3 * np.random.default_rng(4).standard_normal(x.shape)))
+        problem = problem.but(velocities=problem.tangent(0.1 * np.random.default_rng(4).standard_normal(x.shape)))
         residual = worst_residual(problem)
         energies: list[float] = []
         program.run(
@@ -162,4 +162,4 @@ def puckered_ring(program: Program, quick: bool) -> Outcome:
     x = truths.rotated(np.stack([np.cos(angle), np.sin(angle), 0.35 * (-1.0) ** np.arange(6)], axis=1))
     v = 0.4 * np.random.default_rng(5).standard_normal((6, 3))
     pairs = [*bonds(6), (0, 5)]
-    return move(program, Problem(x, np.full(6, 14.0), pairs, velocities=v), 0.005, 100 if quick else 1000)
+    return move(program, Problem(x, np.full(6, 14.0), pairs, velocities=v), 0.005, program.length(quick, 100, 1000))

@@ -52,6 +52,12 @@ class Program:
     """
 
     name = ""
+    #: How long runs may be, as a part of what a case asks for.
+    pace = 1.0
+
+    def length(self, quick: bool, short: int, full: int) -> int:
+        """Steps to run: `short` for a quick look, else `full`; fewer for slow programs."""
+        return max(10, round(self.pace * (short if quick else full)))
 
     def run(
         self,
@@ -163,6 +169,7 @@ class PlainAse(Program):
     """ASE: FixBondLengths, FixInternals where angles are held, FixAtoms; VelocityVerlet."""
 
     name = "ASE"
+    pace = 0.1
 
     def atoms(self, problem: Problem, *, project: bool = False) -> Any:
         """Atoms with a calculator and all that is held."""
@@ -176,10 +183,14 @@ class PlainAse(Program):
             pbc=problem.cell is not None,
         )
         atoms.calc = _calculator(problem)
+        if project:
+            # As a person does who attaches constraints to a structure that is off them.
+            atoms.set_velocities(problem.v)
         self.hold(atoms, problem)
-        atoms.set_velocities(problem.v)
         if project:
             self.put(atoms)
+        else:
+            atoms.set_velocities(problem.v)
         return atoms
 
     def hold(self, atoms: Any, problem: Problem) -> None:
@@ -248,12 +259,13 @@ class PlainAse(Program):
 
 
 class KconsInAse(PlainAse):
-    """The constraint object of kcons under ASE's own VelocityVerlet."""
+    """The constraint object of kcons on ASE's atoms, run by `ConstrainedDynamics`."""
 
     name = "kcons in ASE"
+    pace = 1.0
 
-    def __init__(self, own_dynamics: bool = False) -> None:
-        #: Whether to run by `ConstrainedDynamics` instead of ASE's VelocityVerlet.
+    def __init__(self, own_dynamics: bool = True) -> None:
+        #: False for ASE's VelocityVerlet.
         self.own_dynamics = own_dynamics
 
     def dynamics(self, atoms: Any, dt: float) -> Any:

@@ -34,7 +34,7 @@ def flat_body(program: Program, shape: Array, masses: Array, pairs: Pairs, quick
         finite = np.all(np.isfinite(frame.x))
         buckled.append(np.linalg.svd(frame.x - frame.x.mean(axis=0))[1][2] if finite else np.nan)
 
-    steps = 100 if quick else 2000
+    steps = program.length(quick, 100, 2000)
     program.run(problem, 0.01, steps, watch)
     return outcome(
         *[(check.name, check.value, check.limit) for check in tumbled.checks],
@@ -104,7 +104,7 @@ def benzene_bonds(program: Program, quick: bool) -> Outcome:
     x = truths.rotated(np.vstack([ring(6, 1.39), ring(6, 2.48)]))
     pairs = [*SIDES, *[(k, k + 6) for k in range(6)]]
     v = 0.2 * np.random.default_rng(2).standard_normal((12, 3))
-    return move(program, Problem(x, masses, pairs, velocities=v), 0.005, 100 if quick else 400)
+    return move(program, Problem(x, masses, pairs, velocities=v), 0.005, program.length(quick, 100, 400))
 
 
 def sheet(columns: int, lines: int, bond: float = 1.42) -> tuple[Array, list[tuple[int, int]]]:
@@ -165,8 +165,8 @@ def _flexible(program: Program, shape: Array, pairs: Pairs, quick: bool, remark:
         energies.append(frame.energy)
         turns.append(np.cross(frame.x, masses[:, None] * frame.v).sum(axis=0))
 
-    steps = 100 if quick else 1000
-    program.run(problem, 0.005, steps, watch)
+    steps = program.length(quick, 100, 1000)
+    program.run(problem, 0.005, steps, watch, project=True)
     turned = np.abs(np.array(turns) - turns[1]).max() / np.abs(turns[1]).max()
     off = np.max(np.abs(np.array(energies[1:]) / energies[1] - 1))
     return outcome(
