@@ -129,6 +129,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     plan.set_defaults(run=_plan)
     _add_check(commands)
+
+    hard = commands.add_parser(
+        "hardcases",
+        help="what kcons, ASE and OpenMM do where constraints are difficult",
+        description="Run the hard cases side by side; table, picture, page and JSON of the verdicts.",
+    )
+    hard.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
+    hard.add_argument("--out", type=Path, default=Path("hardcases"), help="folder (default ./hardcases); goes on there")
+    hard.add_argument("--only", type=_names, help="numbers of cases, comma separated, such as H14,H16")
+    hard.add_argument("--list", action="store_true", help="list the cases, and leave")
+    hard.set_defaults(run=_hard_cases)
     return parser
 
 
@@ -414,6 +425,26 @@ def _check(chosen: argparse.Namespace) -> int:
     page = [check_report.summary(result), *map(_rendered, tables), result.verdict]
     _say_written(check_report.write(result, folder, tables=page))
     return int(result.violated)
+# -- hard cases -------------------------------------------------------------------------------------
+
+
+def _hard_cases(chosen: argparse.Namespace) -> int:
+    from kcons import hard_cases
+    from kcons.hard_cases import pages
+    from kcons.progress import Bars
+
+    cases = hard_cases.chosen(chosen.only)
+    if chosen.list:
+        for case in cases.values():
+            print(f"{case.number}  {case.title}: {case.limit}")
+        return 0
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    kept = chosen.out / "hard_cases.json"
+    with Bars() as watcher:
+        result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
+    _print(pages.table(result), pages.summary(result), _console())
+    _say_written([kept, *pages.write(result, chosen.out)])
+    return 0
 
 
 # -- plan and list ----------------------------------------------------------------------------------

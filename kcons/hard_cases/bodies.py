@@ -22,7 +22,9 @@ def every(n: int) -> list[tuple[int, int]]:
     return list(combinations(range(n), 2))
 
 
-def tumble(program: Program, shape: Array, masses: Array, pairs: Pairs, freedom: int = 6, quick: bool = True) -> Outcome:
+def tumble(
+    program: Program, shape: Array, masses: Array, pairs: Pairs, freedom: int = 6, quick: bool = True
+) -> Outcome:
     """Free flight of a rigid body against Euler's equations, its residual, and how many degrees of freedom are counted.
 
     The error may be ten times that of RATTLE for a body held without surplus rows.
@@ -132,7 +134,9 @@ def diamond(program: Program, quick: bool) -> Outcome:
     """Two triangles hinged on one side, flat at the start: nothing is singular, but the fold opens both ways."""
     x = truths.rotated(_DIAMOND)
     v = np.random.default_rng(3).standard_normal((4, 3))
-    return move(program, Problem(x, np.full(4, 45.0), every(4)[:5], velocities=v), 0.005, program.length(quick, 100, 1000))
+    return move(
+        program, Problem(x, np.full(4, 45.0), every(4)[:5], velocities=v), 0.005, program.length(quick, 100, 1000)
+    )
 
 
 _DIAMOND = np.array([[0, 0, 0], [2.7, 0, 0], [1.35, 2.338, 0], [1.35, -2.338, 0]])
@@ -148,7 +152,12 @@ def braced_diamond(program: Program, quick: bool) -> Outcome:
 # -- straight and nearly straight ---------------------------------------------------------------------
 
 
-@case("H05", "CO2 by 3 distances, collinear", "free flight to 10 x the error of RATTLE; 5 dof; or refused", "warn-or-raise")
+@case(
+    "H05",
+    "CO2 by 3 distances, collinear",
+    "free flight to 10 x the error of RATTLE; 5 dof; or refused",
+    "warn-or-raise",
+)
 def collinear(program: Program, quick: bool) -> Outcome:
     x = truths.rotated([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0]])
     masses = np.array([16.0, 12.0, 16.0])

@@ -55,7 +55,9 @@ def _mass_ratio(program: Program, ratio: float, quick: bool) -> Outcome:
     )
 
 
-@case("H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; centre of mass 1e-12 over 1e4 steps; |J a| 1e-14")
+@case(
+    "H08", "Chain of 20, masses 1 and 1e12 in turn", "residual 1e-10; centre of mass 1e-12 over 1e4 steps; |J a| 1e-14"
+)
 def mass_ratio_12(program: Program, quick: bool) -> Outcome:
     found = _mass_ratio(program, 1e12, quick)
     if not isinstance(program, Core):
@@ -91,7 +93,11 @@ def _register_ratios() -> None:
 _register_ratios()
 
 
-@case("H16", "Chains of 1e5 bonds, random and straight", "residual 1e-12 (or what positions of 5e4 can store), 0.5 s a solve, < 1 GB")
+@case(
+    "H16",
+    "Chains of 1e5 bonds, random and straight",
+    "residual 1e-12 (or what positions of 5e4 can store), 0.5 s a solve, < 1 GB",
+)
 def long_chain(program: Program, quick: bool) -> Outcome:
     n = (10_000 if quick else 100_000) + 1
     if program.name == "ASE":
@@ -137,7 +143,11 @@ def long_chain(program: Program, quick: bool) -> Outcome:
     return outcome(*found, remark=f"{n - 1} bonds")
 
 
-@case("X23", "Near-straight chains (179 and 180 degrees) of 100 bonds", "residual 1e-10; momentum and energy of free flight")
+@case(
+    "X23",
+    "Near-straight chains (179 and 180 degrees) of 100 bonds",
+    "residual 1e-10; momentum and energy of free flight",
+)
 def near_straight(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     steps = program.length(quick, 20, 500)
@@ -149,7 +159,10 @@ def near_straight(program: Program, quick: bool) -> Outcome:
         residual = worst_residual(problem)
         energies: list[float] = []
         program.run(
-            problem, 0.005, steps, lambda frame, r=residual, e=energies: (r(frame), e.append(frame.energy))  # type: ignore[misc]
+            problem,
+            0.005,
+            steps,
+            lambda frame, r=residual, e=energies: (r(frame), e.append(frame.energy)),  # type: ignore[misc]
         )
         off = np.max(np.abs(np.array(energies[1:]) / energies[1] - 1))
         found += [(f"{degrees:g}: residual", residual.value, 1e-10), (f"{degrees:g}: energy", off, 1e-3)]

@@ -25,7 +25,9 @@ def moving_chain(n: int = 5, **changes: Any) -> Problem:
     """A chain that turns."""
     x = truths.rotated(zigzag(n))
     masses = np.linspace(1, 3, n)
-    return Problem(x, masses, bonds(n), velocities=truths.spinning(x, masses, np.array([0.1, 0.2, -0.1]))).but(**changes)
+    return Problem(x, masses, bonds(n), velocities=truths.spinning(x, masses, np.array([0.1, 0.2, -0.1]))).but(
+        **changes
+    )
 
 
 @case("H02", "One bond with two targets, 1.0 and 1.001", "refused when it is set up, naming both", "raise")
@@ -74,11 +76,22 @@ def not_finite(program: Program, quick: bool) -> Outcome:
         lengths = np.ones(3)
         return base.but(**{name: values}, lengths=lengths)
 
-    words = {"positions": "positions", "velocities": "velocities", "targets": "targets", "push": "forces", "cell": "cell"}
+    words = {
+        "positions": "positions",
+        "velocities": "velocities",
+        "targets": "targets",
+        "push": "forces",
+        "cell": "cell",
+    }
     return each_refused({word: lambda name=name: _off(program, spoiled(name)) for name, word in words.items()})  # type: ignore[misc]
 
 
-@case("H20", "More rows than coordinates: four atoms, 12 independent rows, and they move", "refused; at rest allowed", "raise")
+@case(
+    "H20",
+    "More rows than coordinates: four atoms, 12 independent rows, and they move",
+    "refused; at rest allowed",
+    "raise",
+)
 def no_freedom(program: Program, quick: bool) -> Outcome:
     x = np.array([[0.0, 0, 0], [1, 0, 0], [1.2, 1, 0], [0, 1.1, 0]])
     in_plane = [LinearCombination([a], [axis], None) for a in range(4) for axis in ([1.0, 0, 0], [0, 1.0, 0])]
@@ -140,7 +153,9 @@ class _Raw(Problem):
         return np.array(self.masses)
 
 
-@case("H29", "Bond of an atom with itself, to no atom, to atom -1, of length 0 and -1", "refused, naming the row", "raise")
+@case(
+    "H29", "Bond of an atom with itself, to no atom, to atom -1, of length 0 and -1", "refused, naming the row", "raise"
+)
 def bad_indices(program: Program, quick: bool) -> Outcome:
     base = moving_chain(4)
 
@@ -160,7 +175,12 @@ def bad_indices(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case("X62", "A non-finite force far into a run", "refused in the step where it appears; the last good state stays", "raise")
+@case(
+    "X62",
+    "A non-finite force far into a run",
+    "refused in the step where it appears; the last good state stays",
+    "raise",
+)
 def late_force(program: Program, quick: bool) -> Outcome:
     class Late(Problem):
         calls = 0
@@ -203,5 +223,3 @@ def late_force(program: Program, quick: bool) -> Outcome:
 def base_residual(x: Any) -> float:
     """Of the chain of four."""
     return moving_chain(4).residual(x)
-
-

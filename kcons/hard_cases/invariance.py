@@ -48,7 +48,9 @@ def reversal(program: Program, quick: bool) -> Outcome:
     problem = problem.but(velocities=problem.tangent([[0, 0.5, 0.1], [0.3, -0.2, 0.3]]))
     steps = program.length(quick, 1000, 10_000)
     if program.name == "OpenMM":
-        raise CannotExpressError("the velocities of VerletIntegrator belong to half steps: turning them round is not the reverse")
+        raise CannotExpressError(
+            "the velocities of VerletIntegrator belong to half steps: turning them round is not the reverse"
+        )
     end = program.run(problem, 0.01, steps)
     back = program.run(problem.but(positions=end.x, velocities=-end.v), 0.01, steps)
     off = max(np.abs(back.x - x).max(), np.abs(back.v + problem.v).max())
@@ -64,9 +66,7 @@ def order_and_frame(program: Program, quick: bool) -> Outcome:
     links = np.array([(0, 4), (1, 6), (2, 8), (3, 7)])
 
     def springs(numbers: Array) -> list[tuple[int, int, float, float]]:
-        return [
-            (int(numbers[i]), int(numbers[j]), 0.5, 0.9 * float(np.linalg.norm(x[i] - x[j]))) for i, j in links
-        ]
+        return [(int(numbers[i]), int(numbers[j]), 0.5, 0.9 * float(np.linalg.norm(x[i] - x[j]))) for i, j in links]
 
     plain = Problem(x, masses, [tuple(p) for p in pairs], springs=springs(np.arange(9)))
     v = plain.tangent(0.1 * rng.standard_normal((9, 3)))

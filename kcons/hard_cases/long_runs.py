@@ -56,7 +56,11 @@ def long_pendulum(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case("H15", "Accelerations alone, no projection", "not what is done by default: residual 1e-12 at t = 200 for dt 0.005 to 0.04")
+@case(
+    "H15",
+    "Accelerations alone, no projection",
+    "not what is done by default: residual 1e-12 at t = 200 for dt 0.005 to 0.04",
+)
 def no_projection(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     problem = pendulum(2.0)

@@ -288,7 +288,9 @@ def _calculator(problem: Problem) -> Any:
     class Forces(Calculator):
         implemented_properties = ["energy", "forces"]
 
-        def calculate(self, atoms: Any = None, properties: Any = ("energy",), system_changes: Any = all_changes) -> None:
+        def calculate(
+            self, atoms: Any = None, properties: Any = ("energy",), system_changes: Any = all_changes
+        ) -> None:
             super().calculate(atoms, properties, system_changes)
             x = self.atoms.get_positions()
             self.results = {"energy": problem.potential(x), "forces": problem.forces(x)}

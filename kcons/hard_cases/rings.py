@@ -58,7 +58,12 @@ META = [(min(i, (i + 2) % 6), max(i, (i + 2) % 6)) for i in range(6)]
 PARA = [(i, i + 3) for i in range(3)]
 
 
-@case("X10", "Planar hexagon by 9 distances (sides and para)", "right, or refused: a mechanism at a dead centre", "warn-or-raise")
+@case(
+    "X10",
+    "Planar hexagon by 9 distances (sides and para)",
+    "right, or refused: a mechanism at a dead centre",
+    "warn-or-raise",
+)
 def hexagon_9(program: Program, quick: bool) -> Outcome:
     return _flexible(program, ring(6), SIDES + PARA, quick, "a mechanism, flat at the start")
 
@@ -121,7 +126,12 @@ def sheet(columns: int, lines: int, bond: float = 1.42) -> tuple[Array, list[tup
     return x, near
 
 
-@case("X17", "Flat honeycomb by its bonds", "residual 1e-10; angular momentum 1e-10; energy 1e-5; or refused", "warn-or-raise")
+@case(
+    "X17",
+    "Flat honeycomb by its bonds",
+    "residual 1e-10; angular momentum 1e-10; energy 1e-5; or refused",
+    "warn-or-raise",
+)
 def honeycomb(program: Program, quick: bool) -> Outcome:
     shape, pairs = sheet(6, 6)
     return _flexible(program, shape, pairs, quick, f"{len(pairs)} bonds")
@@ -154,7 +164,9 @@ def _flexible(program: Program, shape: Array, pairs: Pairs, quick: bool, remark:
     x = truths.rotated(shape)
     masses = np.full(len(x), 12.0)
     problem = Problem(x, masses, pairs)
-    v = problem.tangent(0.02 * np.random.default_rng(7).standard_normal(x.shape) + truths.spinning(x, masses, 0.05 * OMEGA))
+    v = problem.tangent(
+        0.02 * np.random.default_rng(7).standard_normal(x.shape) + truths.spinning(x, masses, 0.05 * OMEGA)
+    )
     problem = problem.but(velocities=v)
     residual = worst_residual(problem)
     energies: list[float] = []

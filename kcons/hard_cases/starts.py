@@ -34,7 +34,11 @@ def _tangent_checks(problem: Problem, first: Frame) -> list[tuple[str, float, fl
     ]
 
 
-@case("H10", "Rigid water stretched by 20 %", "residual 1e-12; centre 1e-14; mass-weighted way 0.2771281292; unique velocities")
+@case(
+    "H10",
+    "Rigid water stretched by 20 %",
+    "residual 1e-12; centre 1e-14; mass-weighted way 0.2771281292; unique velocities",
+)
 def stretched_water(program: Program, quick: bool) -> Outcome:
     masses = np.array([16.0, 1.0, 1.0])
     proper = truths.rotated([[0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]])
@@ -76,7 +80,11 @@ def _scaled(program: Program, factor: float) -> Outcome:
 
 
 def _register_scaled() -> None:
-    for number, factor, words in (("X30", 1.2, "20 % off"), ("X31", 2.0, "a factor 2 off"), ("X32", 0.5, "a factor 0.5 off")):
+    for number, factor, words in (
+        ("X30", 1.2, "20 % off"),
+        ("X31", 2.0, "a factor 2 off"),
+        ("X32", 0.5, "a factor 0.5 off"),
+    ):
 
         def run(program: Program, quick: bool, factor: float = factor) -> Outcome:
             return _scaled(program, factor)
@@ -100,7 +108,11 @@ def unasked(program: Program, quick: bool) -> Outcome:
     )
 
 
-@case("H11", "Velocities that violate the constraints, projected", "|J v| 1e-12; energy lost as 1/2 (J v) (J M^-1 J)^-1 (J v)")
+@case(
+    "H11",
+    "Velocities that violate the constraints, projected",
+    "|J v| 1e-12; energy lost as 1/2 (J v) (J M^-1 J)^-1 (J v)",
+)
 def bad_velocities(program: Program, quick: bool) -> Outcome:
     x = truths.rotated(zigzag(6))
     rng = np.random.default_rng(1)
@@ -155,7 +167,11 @@ def far_away(program: Program, quick: bool) -> Outcome:
 TRICLINIC = np.array([[6.0, 0.0, 0.0], [1.5, 5.5, 0.0], [-1.0, 1.2, 6.5]])
 
 
-@case("H13", "Atoms wrapped into the cell at every step, orthorhombic and triclinic", "as unwrapped to 1e-11 over 1e4 steps")
+@case(
+    "H13",
+    "Atoms wrapped into the cell at every step, orthorhombic and triclinic",
+    "as unwrapped to 1e-11 over 1e4 steps",
+)
 def wrapping(program: Program, quick: bool) -> Outcome:
     rng = np.random.default_rng(2)
     x = np.vstack([truths.rotated(WATER) + np.array([0.1, 0.2, 5.3]), truths.rotated(zigzag(5), 1) + 3.0])
@@ -185,7 +201,9 @@ def wrapping(program: Program, quick: bool) -> Outcome:
 @case("X35", "Bond longer than half the periodic cell", "refused: the image is ambiguous", "raise")
 def long_in_cell(program: Program, quick: bool) -> Outcome:
     x = np.array([[0.2, 0.1, 0.1], [3.2, 0.1, 0.1]])
-    problem = Problem(x, [1.0, 2.0], [(0, 1)], [3.0], cell=np.diag([5.0, 5.0, 5.0]), velocities=[[0, 0.1, 0], [0, -0.05, 0]])
+    problem = Problem(
+        x, [1.0, 2.0], [(0, 1)], [3.0], cell=np.diag([5.0, 5.0, 5.0]), velocities=[[0, 0.1, 0], [0, -0.05, 0]]
+    )
     end = program.run(problem, 0.01, 10)
     apart = abs(float(np.linalg.norm(end.x[0] - end.x[1])) - 3.0)
     return outcome(("length off by", apart, 1e-10), remark="without a word about which image is meant")
@@ -206,7 +224,13 @@ def nothing_held(program: Program, quick: bool) -> Outcome:
             w = w - 0.01 * y / masses[:, None]
         if program.name == "OpenMM":
             y = _leapfrog(problem, 0.02, 1000)
-        found.append((f"{n} atoms: difference", np.abs(end.x - y).max() / np.abs(y).max(), 1e-14 if isinstance(program, Core) else 1e-12))
+        found.append(
+            (
+                f"{n} atoms: difference",
+                np.abs(end.x - y).max() / np.abs(y).max(),
+                1e-14 if isinstance(program, Core) else 1e-12,
+            )
+        )
     return outcome(*found, remark="" if isinstance(program, Core) else "hosts round in another order: 1e-12")
 
 

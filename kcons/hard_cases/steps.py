@@ -60,7 +60,9 @@ def rotor_without_solution(program: Program, quick: bool) -> Outcome:
 _NO_DIRECTION = "it projects along the bonds as they are, not along those of a reference"
 
 
-@case("X41", "Bond turned by 90 degrees within a step", "refused", "raise", openmm=_NO_DIRECTION, in_openmm=_NO_DIRECTION)
+@case(
+    "X41", "Bond turned by 90 degrees within a step", "refused", "raise", openmm=_NO_DIRECTION, in_openmm=_NO_DIRECTION
+)
 def right_angle(program: Program, quick: bool) -> Outcome:
     """The correction is along the old bond, at right angles to the new one."""
     old = Problem([[0.0, 0, 0], [1, 0, 0]], [1.0, 1.0], [(0, 1)], [1.0])
@@ -162,7 +164,11 @@ def _stiff() -> tuple[Problem, float]:
     return problem.but(velocities=v), math.sqrt(k * (1 / masses[1] + 1 / masses[2]))
 
 
-@case("H41", "Spring of 1e6 beside a rigid bond", "energy bounded at half the limit of stability, 1e4 steps; residual 1e-10")
+@case(
+    "H41",
+    "Spring of 1e6 beside a rigid bond",
+    "energy bounded at half the limit of stability, 1e4 steps; residual 1e-10",
+)
 def stiff_and_rigid(program: Program, quick: bool) -> Outcome:
     problem, omega = _stiff()
     energies: list[float] = []
@@ -170,7 +176,9 @@ def stiff_and_rigid(program: Program, quick: bool) -> Outcome:
     steps = program.length(quick, 1000, 10_000)
     program.run(problem, 1.0 / omega, steps, lambda frame: (residual(frame), energies.append(frame.energy)))
     e = np.array(energies[1:])
-    return outcome(("energy", np.max(np.abs(e / e[0] - 1)), 0.5), ("residual", residual.value, 1e-10), remark=f"{steps} steps")
+    return outcome(
+        ("energy", np.max(np.abs(e / e[0] - 1)), 0.5), ("residual", residual.value, 1e-10), remark=f"{steps} steps"
+    )
 
 
 @case("X43", "The same above the limit of stability", "refused", "raise")
@@ -187,8 +195,14 @@ def zero_and_back(program: Program, quick: bool) -> Outcome:
     problem = problem.but(velocities=problem.tangent(0.3 * np.random.default_rng(2).standard_normal((6, 3))))
     still = program.run(problem, 0.0, 1)
     forth = program.run(problem, 0.02, 1)
-    back = program.run(problem.but(positions=forth.x, velocities=forth.v, lengths=problem.held_lengths, anchors=0 * x), -0.02, 1)
+    back = program.run(
+        problem.but(positions=forth.x, velocities=forth.v, lengths=problem.held_lengths, anchors=0 * x), -0.02, 1
+    )
     return outcome(
-        ("moved by a step of zero", np.abs(still.x - x).max() + np.abs(still.v - problem.v).max(), 1e-15 * (not isinstance(program, Core))),
+        (
+            "moved by a step of zero",
+            np.abs(still.x - x).max() + np.abs(still.v - problem.v).max(),
+            1e-15 * (not isinstance(program, Core)),
+        ),
         ("step back misses by", max(np.abs(back.x - x).max(), np.abs(back.v - problem.v).max()), 1e-12),
     )

@@ -23,7 +23,15 @@ def _system(problem: Problem, force: object = None) -> System:
     return System(system.motion, force) if force is not None else system  # type: ignore[arg-type]
 
 
-@case("H22", "Isokinetic with no kinetic energy, and with 2K that underflows", "refused", "raise", peers=NONE, in_ase=ONE, in_openmm=ONE)
+@case(
+    "H22",
+    "Isokinetic with no kinetic energy, and with 2K that underflows",
+    "refused",
+    "raise",
+    peers=NONE,
+    in_ase=ONE,
+    in_openmm=ONE,
+)
 def no_kinetic_energy(program: Program, quick: bool) -> Outcome:
     problem = Problem([[0.0, 0, 0], [1, 0, 0]], [1.0, 2.0], [(0, 1)], tether=1.0, anchors=np.ones((2, 3)))
     system = _system(problem)
@@ -36,7 +44,9 @@ def no_kinetic_energy(program: Program, quick: bool) -> Outcome:
     return each_refused({"v = 0": lambda: run(0.0), "v = 1e-160": lambda: run(1e-160)})
 
 
-@case("H23", "Isokinetic with one degree of freedom", "refused: g - 1 = 0", "raise", peers=NONE, in_ase=ONE, in_openmm=ONE)
+@case(
+    "H23", "Isokinetic with one degree of freedom", "refused: g - 1 = 0", "raise", peers=NONE, in_ase=ONE, in_openmm=ONE
+)
 def one_freedom(program: Program, quick: bool) -> Outcome:
     x = np.array([[1.0, 0, 0]])
     rows = [Plane([0], [0, 0, 1.0]), Sphere([0], [0, 0, 0], 1.0)]
@@ -46,7 +56,14 @@ def one_freedom(program: Program, quick: bool) -> Outcome:
     return outcome(("kinetic energy", system.kinetic_energy(after.velocities), 0))
 
 
-@case("H24", "Isokinetic under forces of 1e6 and 1e12", "2K to 1e-15; v turns into the force", peers=NONE, in_ase=ONE, in_openmm=ONE)
+@case(
+    "H24",
+    "Isokinetic under forces of 1e6 and 1e12",
+    "2K to 1e-15; v turns into the force",
+    peers=NONE,
+    in_ase=ONE,
+    in_openmm=ONE,
+)
 def huge_forces(program: Program, quick: bool) -> Outcome:
     x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     v = np.array([[0.3, -0.2, 0.1], [0.1, -0.4, 0.3]])
@@ -92,7 +109,15 @@ def conserved_momentum(program: Program, quick: bool) -> Outcome:
     return outcome()
 
 
-@case("H40", "Minimum image with a cutoff above half the box", "refused", "raise", ase="its neighbour lists count all images", in_ase="no potentials of its own", in_openmm="OpenMM's own forces")
+@case(
+    "H40",
+    "Minimum image with a cutoff above half the box",
+    "refused",
+    "raise",
+    ase="its neighbour lists count all images",
+    in_ase="no potentials of its own",
+    in_openmm="OpenMM's own forces",
+)
 def long_cutoff(program: Program, quick: bool) -> Outcome:
     if isinstance(program, Core):
         from kcons.scenes.lennard_jones import LennardJones
@@ -114,4 +139,3 @@ def long_cutoff(program: Program, quick: bool) -> Outcome:
     system.addForce(force)
     openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
     return outcome()
-

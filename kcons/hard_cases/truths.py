@@ -149,9 +149,7 @@ def dense_rattle(problem: Problem, dt: float, steps: int) -> Array:
             y = y - (direction @ change).reshape(-1, 3)
         v = v + (y - x - dt * v) / dt
         x = y
-        v = projection.project_velocities(
-            held.jacobian(x).toarray(), m, v + 0.5 * dt * problem.forces(x) / m[:, None]
-        )
+        v = projection.project_velocities(held.jacobian(x).toarray(), m, v + 0.5 * dt * problem.forces(x) / m[:, None])
     return x
 
 
