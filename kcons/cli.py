@@ -140,6 +140,16 @@ def _parser() -> argparse.ArgumentParser:
     hard.add_argument("--only", type=_names, help="numbers of cases, comma separated, such as H14,H16")
     hard.add_argument("--list", action="store_true", help="list the cases, and leave")
     hard.set_defaults(run=_hard_cases)
+
+    stability = commands.add_parser(
+        "stability",
+        help="largest stable steps, drift of the energy, reversibility, random molecules",
+        description="How far each method can be pushed on small scenes, and what it does beyond.",
+    )
+    stability.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
+    stability.add_argument("--out", type=Path, default=Path("stability"), help="folder (default ./stability)")
+    stability.add_argument("--only", type=_names, help="of steps, drift, reversal, fuzz; comma separated")
+    stability.set_defaults(run=_stability)
     return parser
 
 
@@ -443,6 +453,20 @@ def _hard_cases(chosen: argparse.Namespace) -> int:
     with Bars() as watcher:
         result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
     _print(pages.table(result), pages.summary(result), _console())
+    _say_written([kept, *pages.write(result, chosen.out)])
+    return 0
+
+
+def _stability(chosen: argparse.Namespace) -> int:
+    from kcons import stability
+    from kcons.progress import Bars
+    from kcons.stability import pages
+
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    kept = chosen.out / "stability.json"
+    with Bars() as watcher:
+        result = stability.digest(stability.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher))
+    print(pages.text(result))
     _say_written([kept, *pages.write(result, chosen.out)])
     return 0
 

@@ -9,7 +9,7 @@ import numpy as np
 from kcons.hard_cases import truths
 from kcons.hard_cases.case import Outcome, case, outcome
 from kcons.hard_cases.problem import Array, Pairs, Problem
-from kcons.hard_cases.programs import Frame, Program
+from kcons.hard_cases.programs import Frame, Program, together
 
 OMEGA = np.array([0.9, -0.5, 0.7])
 TRIANGLE = [(0, 1), (0, 2), (1, 2)]
@@ -167,13 +167,13 @@ def collinear(program: Program, quick: bool) -> Outcome:
     problem = Problem(x, masses, TRIANGLE, velocities=truths.spinning(x, masses, omega))
     residual = _Worst(problem)
     bent = _Bent()
-    end = program.run(problem, dt, steps, lambda frame: (residual(frame), bent(frame)))
+    end = program.run(problem, dt, steps, together(residual, bent))
     true = truths.linear_flight(x, problem.v, masses, dt * steps)
     size = float(np.linalg.norm(omega))
     plain = 1.16 * steps * (np.arcsin(size * dt) - size * dt)
     # Bent by a force on the middle atom.
     pushed = problem.but(velocities=None, push=np.array([-0.5, 1.0, -0.5])[:, None] * 3 * np.cross(axis, omega))
-    program.run(pushed, dt, steps, lambda frame: (residual(frame), bent(frame)))
+    program.run(pushed, dt, steps, together(residual, bent))
     freedom = program.degrees_of_freedom(problem)
     return outcome(
         ("bent by", bent.value, 1e-10),
@@ -214,7 +214,7 @@ def _energy_run(program: Program, problem: Problem, dt: float, steps: int) -> tu
     """Largest residual and relative deviation of the energy."""
     residual = _Worst(problem)
     energies: list[float] = []
-    program.run(problem, dt, steps, lambda frame: (residual(frame), energies.append(frame.energy)))
+    program.run(problem, dt, steps, together(residual, lambda frame: energies.append(frame.energy)))
     # The first energy of a leapfrog is that of velocities half a step earlier.
     return residual.value, float(np.max(np.abs(np.array(energies[1:]) / energies[1] - 1)))
 
@@ -251,7 +251,7 @@ def _held_angle(program: Program, degrees: float, steps: int, energy_limit: floa
         opened.append(abs(np.degrees(angle) - degrees))
 
     energies: list[float] = []
-    program.run(problem, 1e-3, steps, lambda frame: (watch(frame), energies.append(frame.energy)))
+    program.run(problem, 1e-3, steps, together(watch, lambda frame: energies.append(frame.energy)))
     off = float(np.max(np.abs(np.array(energies[1:]) / energies[1] - 1)))
     return outcome(
         ("angle off by (degrees)", np.max(opened), 1e-9), ("energy", off, energy_limit), remark=f"{steps} steps"

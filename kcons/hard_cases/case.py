@@ -190,8 +190,8 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "") -> Cell:
         return Cell("crash/NaN", False, f"{broken[0].name} is {broken[0].value}{tail}", checks)
     failed = [check for check in found.checks if not check.passed]
     if failed:
-        if warned and case.kind == "warn-or-raise":
-            return Cell("refused", True, f"{failed[0]}{tail}", checks)
+        if warned and case.kind != "raise":
+            return Cell("refused", case.kind == "warn-or-raise", f"warned: {warned}; {failed[0]}", checks)
         return Cell("silently wrong", False, f"{failed[0]}{tail}", checks)
     if warned and not found.checks and case.kind != "bound":
         return Cell("refused", True, notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from kcons.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.hard_cases.case import CannotExpressError, Outcome, case, outcome
 from kcons.hard_cases.chains import bonds, zigzag
 from kcons.hard_cases.long_runs import pendulum
-from kcons.hard_cases.problem import Array, Problem
+from kcons.hard_cases.problem import Array, Numbers, Problem
 from kcons.hard_cases.programs import Core, PlainAse, PlainOpenMM, Program
 from kcons.hard_cases.steps import each_refused
 
@@ -65,7 +66,7 @@ def order_and_frame(program: Program, quick: bool) -> Outcome:
     pairs = np.array([*TRIANGLE, *[(k, k + 1) for k in range(3, 8)], (3, 5), (5, 7)])
     links = np.array([(0, 4), (1, 6), (2, 8), (3, 7)])
 
-    def springs(numbers: Array) -> list[tuple[int, int, float, float]]:
+    def springs(numbers: Numbers) -> list[tuple[int, int, float, float]]:
         return [(int(numbers[i]), int(numbers[j]), 0.5, 0.9 * float(np.linalg.norm(x[i] - x[j]))) for i, j in links]
 
     plain = Problem(x, masses, [tuple(p) for p in pairs], springs=springs(np.arange(9)))
@@ -94,54 +95,55 @@ def restart(program: Program, quick: bool) -> Outcome:
     x = truths.rotated(zigzag(8))
     problem = Problem(x, np.linspace(1, 12, 8), bonds(8), np.ones(7), tether=0.3, anchors=0 * x)
     problem = problem.but(velocities=problem.tangent(0.1 * np.random.default_rng(0).standard_normal((8, 3))))
+    half = program.length(quick, 200, 500)
     if isinstance(program, Core):
-        ends = _restart_core(program, problem)
+        ends = _restart_core(program, problem, half)
     elif isinstance(program, PlainAse):
-        ends = _restart_ase(program, problem)
+        ends = _restart_ase(program, problem, half)
     elif isinstance(program, PlainOpenMM):
-        ends = _restart_openmm(program, problem)
+        ends = _restart_openmm(program, problem, half)
     else:
         raise CannotExpressError("no way to save a state")
-    return outcome(("difference", np.abs(ends[0] - ends[1]).max(), 0))
+    return outcome(("difference", np.abs(ends[0] - ends[1]).max(), 0), remark=f"{2 * half} steps")
 
 
-def _restart_core(program: Core, problem: Problem) -> tuple[Array, Array]:
+def _restart_core(program: Core, problem: Problem, half: int) -> tuple[Array, Array]:
     from kcons.steppers import State, run
 
     system = program.system(problem)
     start = system.initial_state(problem.x, problem.v, project=True)
-    whole = run(system, start, 0.01, 1000)
+    whole = run(system, start, 0.01, 2 * half)
     file = io.BytesIO()
-    run(system, start, 0.01, 500).save(file)
+    run(system, start, 0.01, half).save(file)
     file.seek(0)
     state = State.load(file)
     fresh = program.system(problem.but(positions=state.positions, lengths=problem.held_lengths, anchors=0 * problem.x))
-    again = run(fresh, state, 0.01, 500)
+    again = run(fresh, state, 0.01, half)
     return whole.positions, again.positions
 
 
-def _restart_ase(program: PlainAse, problem: Problem) -> tuple[Array, Array]:
+def _restart_ase(program: PlainAse, problem: Problem, half: int) -> tuple[Array, Array]:
     from ase.io import read, write
 
     from kcons.hard_cases.programs import _calculator
 
     atoms = program.atoms(problem, project=True)
     dynamics = program.dynamics(atoms, 0.01)
-    dynamics.run(500)
+    dynamics.run(half)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "half.traj"
         write(path, atoms)
-        other = read(path)
-    dynamics.run(500)
+        other: Any = read(path)
+    dynamics.run(half)
     other.calc = _calculator(problem)
     if program.name == "ASE":
         # FixBondLengths does not keep its lengths in files.
         program.hold(other, problem.but(lengths=problem.held_lengths))
-    program.dynamics(other, 0.01).run(500)
+    program.dynamics(other, 0.01).run(half)
     return atoms.get_positions(), other.get_positions()
 
 
-def _restart_openmm(program: PlainOpenMM, problem: Problem) -> tuple[Array, Array]:
+def _restart_openmm(program: PlainOpenMM, problem: Problem, half: int) -> tuple[Array, Array]:
     from openmm import unit
 
     ends = []
@@ -151,10 +153,10 @@ def _restart_openmm(program: PlainOpenMM, problem: Problem) -> tuple[Array, Arra
         context = program.context(system, integrator)
         if not resumed:
             program.start(problem, context, part, 0.01, True)
-            integrator.step(500)
+            integrator.step(half)
             saved = context.createCheckpoint()
         else:
             context.loadCheckpoint(saved)
-        integrator.step(500)
+        integrator.step(half)
         ends.append(context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer))
     return ends[0], ends[1]

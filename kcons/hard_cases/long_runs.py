@@ -12,11 +12,11 @@ from kcons.hard_cases.programs import Core, Frame, Program
 
 #: Steps of the pendulum for each program: quick and full.
 STEPS = {
-    "kcons": (50_000, 10_000_000),
-    "kcons in ASE": (5_000, 500_000),
-    "kcons in OpenMM": (5_000, 500_000),
-    "ASE": (1_000, 50_000),
-    "OpenMM": (5_000, 500_000),
+    "kcons": (30_000, 10_000_000),
+    "kcons in ASE": (3_000, 300_000),
+    "kcons in OpenMM": (2_000, 200_000),
+    "ASE": (500, 20_000),
+    "OpenMM": (2_000, 500_000),
 }
 
 
@@ -64,7 +64,7 @@ def long_pendulum(program: Program, quick: bool) -> Outcome:
 def no_projection(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     problem = pendulum(2.0)
-    horizon = 20.0 if quick else 200.0
+    horizon = program.pace * (20.0 if quick else 200.0)
     for dt in (0.005, 0.04):
         residual = worst_residual(problem)
         program.run(problem, dt, round(horizon / dt), residual, every=20)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,8 @@ from kcons.constraints import Angle, Constraint, Distance, FixedAtoms
 
 Array = NDArray[np.float64]
 Pairs = Sequence[tuple[int, int]]
+#: Whatever NumPy makes an array of; its own type refuses nested lists of ints and floats.
+Numbers: TypeAlias = Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +51,8 @@ class Problem:
         Rows that only kcons knows.
     """
 
-    positions: ArrayLike
-    masses: ArrayLike
+    positions: Numbers
+    masses: Numbers
     pairs: Pairs = ()
     lengths: ArrayLike | None = None
     triples: Sequence[tuple[int, int, int]] = ()
@@ -173,12 +175,12 @@ class Problem:
 
 def distances(x: Array, pairs: Pairs, cell: ArrayLike | None = None) -> Array:
     """Distances of pairs, by minimum images in a cell."""
-    pairs = np.asarray(pairs, dtype=int).reshape(-1, 2)
-    d = x[pairs[:, 0]] - x[pairs[:, 1]]
+    i, j = np.asarray(pairs, dtype=int).reshape(-1, 2).T
+    d = x[i] - x[j]
     if cell is not None:
         lattice = np.asarray(cell, dtype=float)
         d = d - np.round(d @ np.linalg.inv(lattice)) @ lattice
-    return np.sqrt(np.sum(d * d, axis=1))
+    return np.asarray(np.sqrt(np.sum(d * d, axis=1)))
 
 
 def bends(x: Array, triples: Sequence[tuple[int, int, int]]) -> Array:

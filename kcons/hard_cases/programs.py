@@ -38,6 +38,16 @@ class Frame:
 Watch = Callable[[Frame], Any]
 
 
+def together(*watches: Watch) -> Watch:
+    """A watcher that tells several."""
+
+    def watch(frame: Frame) -> None:
+        for one in watches:
+            one(frame)
+
+    return watch
+
+
 class NotIntactError(AssertionError):
     """A call that failed has changed its input."""
 
@@ -107,7 +117,7 @@ class Core(Program):
             potential=(lambda x, t: problem.potential(x)) if problem.has_forces else None,
         )
 
-    def run(  # noqa: D102
+    def run(
         self,
         problem: Problem,
         dt: float,
@@ -152,7 +162,7 @@ class Core(Program):
             if [a.tobytes() for a in given] != before:
                 raise NotIntactError("input arrays were changed")
 
-    def degrees_of_freedom(self, problem: Problem) -> int:  # noqa: D102
+    def degrees_of_freedom(self, problem: Problem) -> int:
         return self.system(problem).motion.degrees_of_freedom
 
 
@@ -220,7 +230,7 @@ class PlainAse(Program):
         atoms.set_positions(atoms.get_positions())
         atoms.set_momenta(atoms.get_momenta())
 
-    def run(  # noqa: D102
+    def run(
         self,
         problem: Problem,
         dt: float,
@@ -254,7 +264,7 @@ class PlainAse(Program):
                     return seen
         return frame()
 
-    def degrees_of_freedom(self, problem: Problem) -> int:  # noqa: D102
+    def degrees_of_freedom(self, problem: Problem) -> int:
         return int(self.atoms(problem).get_number_of_degrees_of_freedom())
 
 
@@ -292,7 +302,7 @@ def _calculator(problem: Problem) -> Any:
             self, atoms: Any = None, properties: Any = ("energy",), system_changes: Any = all_changes
         ) -> None:
             super().calculate(atoms, properties, system_changes)
-            x = self.atoms.get_positions()
+            x = np.asarray(atoms.get_positions())
             self.results = {"energy": problem.potential(x), "forces": problem.forces(x)}
 
     return Forces()
@@ -330,8 +340,8 @@ class PlainOpenMM(Program):
             system.addForce(force)
         if problem.springs:
             bonds = openmm.HarmonicBondForce()
-            for i, j, k, rest in problem.springs:
-                bonds.addBond(i, j, rest, k)
+            for i, j, constant, rest in problem.springs:
+                bonds.addBond(i, j, rest, constant)
             system.addForce(bonds)
         return system
 
@@ -371,12 +381,12 @@ class PlainOpenMM(Program):
             # Velocities of the leapfrog belong to half a step earlier.
             free = not np.any(v) and not problem.has_forces
             try:
-                back = 0.0 if free else 0.5 * dt * problem.acceleration(problem.x, v)
+                back = np.zeros_like(v) if free else 0.5 * dt * problem.acceleration(problem.x, v)
             except (KconsError, np.linalg.LinAlgError):
-                back = 0.0
+                back = np.zeros_like(v)
             context.setVelocities(v - back)
 
-    def run(  # noqa: D102
+    def run(
         self,
         problem: Problem,
         dt: float,
@@ -454,7 +464,7 @@ class KconsInOpenMM(PlainOpenMM):
             else:
                 part.check(context)
 
-    def degrees_of_freedom(self, problem: Problem) -> int:  # noqa: D102
+    def degrees_of_freedom(self, problem: Problem) -> int:
         system, integrator, _ = self.build(problem, 0.001)
         context = self.context(system, integrator)
         context.setPositions(problem.x)

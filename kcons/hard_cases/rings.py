@@ -139,7 +139,7 @@ def honeycomb(program: Program, quick: bool) -> Outcome:
 
 @case("X18", "Flat porphyrin-like ring system, bonds and 1-3 distances", "right, or refused", "warn-or-raise")
 def porphyrin(program: Program, quick: bool) -> Outcome:
-    """Four five-rings joined by four bridging atoms: 24 atoms, all bonds and all distances between second neighbours."""
+    """Four five-rings joined by four bridging atoms: bonds and distances of second neighbours."""
     atoms: list[Array] = []
     pairs: list[tuple[int, int]] = []
     for k in range(4):

@@ -9,7 +9,7 @@ from kcons.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES, worst_residua
 from kcons.hard_cases.case import Outcome, case, outcome
 from kcons.hard_cases.chains import bonds, zigzag
 from kcons.hard_cases.problem import Array, Problem
-from kcons.hard_cases.programs import Core, Frame, KconsInAse, Program, wrapped
+from kcons.hard_cases.programs import Core, Frame, KconsInAse, Program, together, wrapped
 
 
 def _first(program: Program, problem: Problem, steps: int = 0, dt: float = 1e-3) -> tuple[Frame, Frame]:
@@ -72,7 +72,7 @@ def _scaled(program: Program, factor: float) -> Outcome:
     problem = Problem(factor * shape, masses, pairs, lengths, velocities=v)
     residual = worst_residual(problem)
     seen: list[Frame] = []
-    program.run(problem, 1e-3, 50, lambda frame: (residual(frame), seen.append(frame)), project=True)
+    program.run(problem, 1e-3, 50, together(residual, seen.append), project=True)
     return outcome(
         ("residual", residual.value, 1e-10),
         ("kinetic energy after 50 steps, off by (relative)", abs(seen[-1].kinetic / seen[1].kinetic - 1), 1e-3),
@@ -179,7 +179,7 @@ def wrapping(program: Program, quick: bool) -> Outcome:
     pairs = [*TRIANGLE, (3, 4), (4, 5), (5, 6), (6, 7), (3, 5)]
     free = Problem(x, masses, pairs)
     free = free.but(velocities=free.tangent(0.02 * rng.standard_normal((8, 3)) + np.array([0.1, -0.08, 0.12])))
-    steps = program.length(quick, 1000, 10_000)
+    steps = program.length(quick, 500, 10_000)
     plain = program.run(free, 0.01, steps).x
     limit, remark = 1e-11, f"{steps} steps"
     if not isinstance(program, Core):

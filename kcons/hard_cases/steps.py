@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 
@@ -12,7 +13,7 @@ from kcons.hard_cases.bodies import TRIANGLE, worst_residual
 from kcons.hard_cases.case import CannotExpressError, Check, Outcome, case, outcome
 from kcons.hard_cases.chains import bonds, zigzag
 from kcons.hard_cases.problem import Problem
-from kcons.hard_cases.programs import Core, Frame, PlainAse, Program
+from kcons.hard_cases.programs import Core, Frame, PlainAse, Program, together
 from kcons.hard_cases.starts import rotor
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle, Stepper, Suzuki4
 
@@ -41,7 +42,7 @@ def free_rotor(program: Program, quick: bool) -> Outcome:
         seen: list[Frame] = []
         program.run(rotor(), omega_dt, 50, seen.append)
         turned = 0.0
-        for before, after in zip(seen[:-1], seen[1:], strict=True):
+        for before, after in itertools.pairwise(seen):
             d, e = before.x[0] - before.x[1], after.x[0] - after.x[1]
             turned += math.atan2(d[0] * e[1] - d[1] * e[0], float(d @ e))
         found.append((f"{omega_dt:g}: angle off by", abs(turned - 50 * math.asin(omega_dt)), 1e-11))
@@ -174,7 +175,7 @@ def stiff_and_rigid(program: Program, quick: bool) -> Outcome:
     energies: list[float] = []
     residual = worst_residual(problem)
     steps = program.length(quick, 1000, 10_000)
-    program.run(problem, 1.0 / omega, steps, lambda frame: (residual(frame), energies.append(frame.energy)))
+    program.run(problem, 1.0 / omega, steps, together(residual, lambda frame: energies.append(frame.energy)))
     e = np.array(energies[1:])
     return outcome(
         ("energy", np.max(np.abs(e / e[0] - 1)), 0.5), ("residual", residual.value, 1e-10), remark=f"{steps} steps"

@@ -13,8 +13,7 @@ from scipy.optimize import fsolve
 from scipy.special import ellipj, ellipk
 
 from kcons import projection
-from kcons.hard_cases.problem import Array, Problem
-
+from kcons.hard_cases.problem import Array, Numbers, Problem
 
 _KNOWN: dict[tuple[Any, ...], Array] = {}
 
@@ -44,13 +43,13 @@ def cross_matrix(w: ArrayLike) -> Array:
     return np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
 
-def rotated(x: ArrayLike, seed: int = 0) -> Array:
+def rotated(x: Numbers, seed: int = 0) -> Array:
     """Turned into no particular orientation."""
     q = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
     return np.asarray(np.asarray(x, dtype=float) @ (q * np.linalg.det(q)))
 
 
-def spinning(x: Array, masses: Array, omega: ArrayLike, drift: ArrayLike = (0, 0, 0)) -> Array:
+def spinning(x: Array, masses: Array, omega: Numbers, drift: ArrayLike = (0, 0, 0)) -> Array:
     """Velocities of a rotation about the centre of mass, and of the centre itself."""
     return np.asarray(np.cross(omega, x - masses @ x / masses.sum()) + np.asarray(drift, dtype=float))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+import warnings
 from collections.abc import Iterable
 from typing import Literal
 
@@ -29,6 +30,9 @@ from kcons.openmm.requirements import (
     with_massless_atoms,
 )
 from kcons.steppers.state import START_TOLERANCE
+
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
 
 
 class CarriedConstraints:
@@ -70,6 +74,7 @@ class CarriedConstraints:
     lean = False
     #: Whether the System had no constraints of its own when the forces were added.
     alone = False
+    _told = False
 
     def __init__(
         self,
@@ -241,6 +246,7 @@ class CarriedConstraints:
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
         held, motion = self.motion.constraint_set, self.motion
+        self._tell_of_rounding(x)
         miss = np.abs(held.value(x, time))
         allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
         if not np.all(miss <= allowed):
@@ -260,6 +266,21 @@ class CarriedConstraints:
                 "remove that part by apply_velocities(context)",
                 item="velocities",
                 atoms=[atom],
+            )
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Warn, once, of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+        held = self.motion.constraint_set
+        if self._told or held.n_rows == 0:
+            return
+        reach = float(np.abs(x[held.touched]).max())
+        if np.spacing(reach) > COARSE * float(held.scale.min()):
+            self._told = True
+            warnings.warn(
+                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to "
+                f"{np.spacing(reach):.1g} nm; each step turns this into velocity, and the energy wanders. Move the "
+                "origin nearer",
+                stacklevel=3,
             )
 
     def apply_positions(self, context: openmm.Context) -> None:

@@ -82,7 +82,9 @@ class Trial:
 
 def molecule(rng: np.random.Generator) -> tuple[str, Array, Array, list[Constraint]]:
     """Kind, positions, masses from 1 to 1e4, and rows of a random molecule."""
-    shape = str(rng.choice(["tree", "ring", "braced", "two bodies", "angles", "dihedrals", "surfaces", "fixed", "flat"]))
+    shape = str(
+        rng.choice(["tree", "ring", "braced", "two bodies", "angles", "dihedrals", "surfaces", "fixed", "flat"])
+    )
     n = int(rng.integers(2, 13)) if shape not in ("ring", "angles", "flat") else int(rng.integers(3, 11))
     n = max(n, 5) if shape in ("two bodies", "dihedrals") else n
     n = min(n, 7) if shape == "braced" else n
@@ -189,7 +191,11 @@ def _residuals(asked: ConstraintSet, system: System, x: Array, v: Array, time: f
     size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
     rate = np.abs(rows @ v.ravel() - held.velocity_target(x, time)) / np.where(size > 0, size, 1.0)
     speed = float(np.linalg.norm(v)) or 1.0
-    return float((off / asked.scale).max(initial=0.0)), float(excess.max(initial=0.0)), float(rate.max(initial=0.0)) / speed
+    return (
+        float((off / asked.scale).max(initial=0.0)),
+        float(excess.max(initial=0.0)),
+        float(rate.max(initial=0.0)) / speed,
+    )
 
 
 def summary(trials: list[Trial]) -> dict[str, Any]:
