@@ -43,7 +43,7 @@ def _excess(log_x: Array, total: float = 1.0) -> float:
 @case(
     "H33",
     "Hypercycle near equilibrium, to t = 900",
-    "g - g_eq as its law, to 1 % where 3e-14 of it is left",
+    "g - g_eq by its law, to 1 % of 3e-14",
     hosts=NONE,
 )
 def near_equilibrium(program: Program, quick: bool) -> Outcome:
@@ -74,7 +74,7 @@ def wrong_budget(program: Program, quick: bool) -> Outcome:
 @case(
     "H35",
     "Near-extinction: ln x down to -2.6e4, and back",
-    "ln x as found with 20 digits, to 1e-6 (relative)",
+    "ln x as with 20 digits, to 1e-6",
     hosts=NONE,
 )
 def near_extinction(program: Program, quick: bool) -> Outcome:
@@ -126,9 +126,7 @@ def sum_of_two(program: Program, quick: bool) -> Outcome:
     return outcome(("x off by", np.abs(found.y[:, -1] - known).max(), 1e-7))
 
 
-@case(
-    "H38", "Critical damping, 1 +- 1e-9 of it, and a Jordan block of 3", "closed forms to 1e-12 (relative)", hosts=NONE
-)
+@case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", hosts=NONE)
 def defective(program: Program, quick: bool) -> Outcome:
     _need("flows")
     from kcons.flows import LinearFlow

@@ -74,7 +74,7 @@ def _pieces(part: str, quick: bool) -> list[tuple[str, Callable[[], Any]]]:
     if part == "steps":
         return [(f"steps/{s}/{m}", lambda m=m, s=s: runs.largest_step(m, s, quick)) for m, s in both]  # type: ignore[misc]
     if part == "drift":
-        seeds, steps = (2, 10_000) if quick else (3, 1_000_000)
+        seeds, steps = (8, 10_000) if quick else (8, 1_000_000)
         return [(f"drift/{s}", lambda s=s: runs.drift(s, seeds, steps)) for s in SCENES]  # type: ignore[misc]
     if part == "reversal":
         steps = 200 if quick else 2000
