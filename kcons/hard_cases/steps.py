@@ -31,6 +31,8 @@ def each_refused(calls: Mapping[str, Callable[[], float]]) -> Outcome:
             first = first or error
     if first is not None and not accepted:
         raise first
+    # The worst first.
+    accepted.sort(key=lambda check: -check.value)
     # A number that happens to be right does not make it a refusal.
     return Outcome(tuple(Check(c.name, c.value if c.value != 0 else 1e-300, 0.0) for c in accepted))
 
@@ -93,6 +95,9 @@ def chain_in_springs() -> tuple[Problem, float]:
     return problem.but(velocities=problem.tangent(0.3 * np.random.default_rng(6).standard_normal((8, 3)))), 0.5
 
 
+#: Residual of a run that ends without an error.
+SILENT = 1e-7
+
 STEPPERS: dict[str, Callable[[], Stepper]] = {
     "Rattle": Rattle,
     "Geodesic": Geodesic,
@@ -103,7 +108,9 @@ STEPPERS: dict[str, Callable[[], Stepper]] = {
 }
 
 
-@case("X42", "Step raised until failure", "the failure is an error; before it, residual 1e-8; largest steps are told")
+@case(
+    "X42", "Step raised until failure", "the failure is an error; before it, residual 1e-7 (SETTLE of OpenMM has 3e-8)"
+)
 def raised_step(program: Program, quick: bool) -> Outcome:
     steps = program.length(quick, 50, 500)
     told: list[str] = []
@@ -124,12 +131,12 @@ def raised_step(program: Program, quick: bool) -> Outcome:
                     error = type(failure).__name__
                     break
                 worst = max(worst, residual.value) if np.isfinite(residual.value) else float("nan")
-                if not worst <= 1e-8:
+                if not worst <= SILENT:
                     break
                 largest = dt
                 dt *= 1.2
             label = f"{scene}, {name}" if len(steppers) > 1 else scene
-            found.append((f"{label}: residual without an error, at step {dt:.3g}", worst, 1e-8))
+            found.append((f"{label}: residual without an error, at step {dt:.3g}", worst, SILENT))
             told.append(f"{label} {largest:.3g}" + (f" then {error}" if error else ""))
     return outcome(*found, remark=f"largest steps over {steps}: " + ", ".join(told))
 
