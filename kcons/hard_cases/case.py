@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from kcons.errors import KconsError
+
 if TYPE_CHECKING:
     from kcons.hard_cases.programs import Program
 
@@ -163,7 +165,7 @@ def all_cases() -> dict[str, Case]:
     return dict(sorted(_CASES.items()))
 
 
-def judge(case: Case, found: Outcome | BaseException, warned: str = "") -> Cell:
+def judge(case: Case, found: Outcome | BaseException, warned: str = "", program: str = "") -> Cell:
     """The verdict on what a program made of a case.
 
     Parameters
@@ -173,11 +175,17 @@ def judge(case: Case, found: Outcome | BaseException, warned: str = "") -> Cell:
         What its function returned or raised.
     warned : str
         Text of a warning of the program, if there was one.
+    program : str
+        Its name: of kcons only typed errors count as refusals.
     """
     if isinstance(found, CannotExpressError):
         return Cell("cannot express", False, str(found))
     if isinstance(found, BaseException):
         words = " ".join(str(found).split())
+        if isinstance(found, ImportError):
+            return Cell("cannot express", False, f"not installed: {words}")
+        if program in OURS and not isinstance(found, KconsError):
+            return Cell("crash/NaN", False, f"untyped {type(found).__name__}: {words}")
         met = case.kind != "bound"
         if not met and type(found).__name__ == "OpenMMException" and "NaN" in words:
             return Cell("crash/NaN", False, f"{type(found).__name__}: {words}")

@@ -22,7 +22,7 @@ def run_cell(case: Case, program: str, quick: bool) -> Cell:
         found, warned = quiet(lambda: case.function(PROGRAMS[program](), quick))
     except Exception as error:
         found = error
-    return judge(case, found, warned)
+    return judge(case, found, warned, program)
 
 
 class Worker:
@@ -102,4 +102,8 @@ def _serve(pipe: Connection) -> None:
             number, program, quick = pipe.recv()
         except (EOFError, KeyboardInterrupt):
             return
-        pipe.send(run_cell(cases[number], program, quick))
+        cell = run_cell(cases[number], program, quick)
+        try:
+            pipe.send(cell)
+        except BrokenPipeError:  # nobody waits any more
+            return
