@@ -12,13 +12,25 @@ came of it. A person's own case is one more function::
         return outcome(("residual", problem.residual(end.x), 1e-10))
 """
 
-from kcons.hard_cases.case import SYSTEMS, CannotExpressError, Case, Cell, Outcome, all_cases, case, judge, outcome
+from kcons.hard_cases.case import (
+    OURS,
+    SYSTEMS,
+    CannotExpressError,
+    Case,
+    Cell,
+    Outcome,
+    all_cases,
+    case,
+    judge,
+    outcome,
+)
 from kcons.hard_cases.problem import Problem
 from kcons.hard_cases.programs import PROGRAMS, Program
 from kcons.hard_cases.study import chosen, load, run
 from kcons.hard_cases.worker import run_cell
 
 __all__ = [
+    "OURS",
     "PROGRAMS",
     "SYSTEMS",
     "CannotExpressError",

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
-from scipy.optimize import fsolve
 from scipy.special import ellipj, ellipk
 
 from kcons import projection
@@ -86,12 +85,16 @@ def rigid_rattle(x: Array, masses: Array, omega: Array, dt: float, steps: int) -
     for _ in range(steps):
         body = turn.T @ momentum
 
-        def off(w: Array, body: Array = body) -> Array:
+        w = dt * np.linalg.solve(inertia, body)
+        for _ in range(100):
             P = _turn(w)
             S = P @ J - J @ P.T - dt * cross_matrix(body)
-            return np.array([S[2, 1], S[0, 2], S[1, 0]])
-
-        turn = turn @ _turn(fsolve(off, dt * np.linalg.solve(inertia, body), xtol=1e-14))
+            # To first order in w, S is the cross matrix of inertia w - dt L.
+            change = np.linalg.solve(inertia, [S[2, 1], S[0, 2], S[1, 0]])
+            w = w - change
+            if np.abs(change).max() < 1e-16:
+                break
+        turn = turn @ _turn(w)
     return np.asarray(centre + y @ turn.T)
 
 
