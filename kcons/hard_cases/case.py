@@ -140,7 +140,7 @@ def case(number: str, title: str, limit: str, kind: Kind = "bound", **cannot: st
     def register(function: Function) -> Function:
         if number in _CASES:
             raise ValueError(f"there are two cases {number}")
-        theme = function.__module__.rsplit(".", 1)[1]
+        theme = function.__module__.rsplit(".", 1)[-1]
         reasons = {name: reason for key, reason in cannot.items() for name in _NAMES[key]}
         _CASES[number] = Case(number, title, limit, kind, theme, function, reasons)
         return function
