@@ -554,3 +554,33 @@ def test_molecules_of_the_g2_set(what: str) -> None:
         a = motion.acceleration(y, motion.project_velocities(y, rng.standard_normal(x.shape)), np.ones(x.shape))
         assert np.all(np.isfinite(a)), name
     assert converted_sets >= 30
+
+
+def porphin_like():
+    """Four flat five-rings in a flat ring of bridges: all bonds, and all distances of second neighbours."""
+    x, pairs = [], set()
+    for k in range(4):
+        centre = 3.1 * np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2), 0])
+        first = len(x)
+        for t in np.pi + k * np.pi / 2 + 2 * np.pi * np.arange(5) / 5:
+            x.append(centre + 1.18 * np.array([np.cos(t), np.sin(t), 0]))
+        pairs |= {tuple(sorted((first + i, first + (i + 1) % 5))) for i in range(5)}
+    for k in range(4):
+        here, there = 5 * k + 4, 5 * ((k + 1) % 4) + 1
+        middle = 0.5 * (x[here] + x[there])
+        x.append(middle * (1 + 0.25 / np.linalg.norm(middle)))
+        pairs |= {(here, len(x) - 1), (there, len(x) - 1)}
+    bonded = [[j for p in pairs if i in p for j in p if j != i] for i in range(len(x))]
+    seconds = {(a, b) for near in bonded for a in near for b in near if a < b}
+    return np.array(x), sorted(pairs | seconds)
+
+
+def test_hinged_plates_that_lock_each_other_are_refused():
+    """Each five-ring alone can be held by linear rows; that they cannot fold against each other cannot."""
+    x, pairs = porphin_like()
+    with pytest.raises(SingularGeometryError, match="27 linearised degrees of freedom here but 8 at positions nearby"):
+        Motion(ConstraintSet(Distance(pairs), x, np.ones(len(x))), x)
+    # One of the plates is fine.
+    ring = [p for p in pairs if max(p) < 5]
+    motion = Motion(ConstraintSet(Distance(ring), x[:5], np.ones(5)), x[:5])
+    assert motion.degrees_of_freedom == 6

@@ -24,7 +24,7 @@ def fixed_and_bond(program: Program, quick: bool) -> Outcome:
     found: list[tuple[str, float, float]] = []
     for degrees in (10.0, 90.0):
         angle = np.radians(degrees)
-        dt, steps = 0.01, 300
+        dt, steps = 0.02, 100
         end = program.run(pendulum(angle), dt, steps)
         expected = truths.pendulum(angle, dt * steps)
         plain = np.abs(truths.dense_rattle(pendulum(angle), dt, steps)[1] - expected).max()

@@ -12,7 +12,7 @@ from kcons.hard_cases.programs import Core, Frame, Program
 
 #: Steps of the pendulum for each program: quick and full.
 STEPS = {
-    "kcons": (30_000, 10_000_000),
+    "kcons": (20_000, 10_000_000),
     "kcons in ASE": (3_000, 300_000),
     "kcons in OpenMM": (2_000, 200_000),
     "ASE": (500, 20_000),

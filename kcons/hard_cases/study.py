@@ -17,7 +17,7 @@ from kcons.hard_cases.worker import Worker
 
 FORMAT = "kcons-hard-cases-1"
 #: Seconds after which a program that has not answered is given up: quick and full.
-LIMITS = (40.0, 3600.0)
+LIMITS = (20.0, 3600.0)
 
 
 def chosen(only: Iterable[str] | None) -> dict[str, Case]:
