@@ -39,6 +39,7 @@ FAULTS: tuple[Outcome, ...] = ("NaN", "silent", "changed", "untyped error")
 #: Residuals of rows (relative to their scale) and of A v (relative to the speed) that are silent faults above this.
 ALLOWED = 1e-9
 STEPS = 4
+SHAPES = ("tree", "ring", "braced", "two bodies", "angles", "dihedrals", "surfaces", "fixed", "flat")
 STEPPERS: tuple[Callable[[], Stepper], ...] = (
     Rattle,
     Rattle,
@@ -82,9 +83,7 @@ class Trial:
 
 def molecule(rng: np.random.Generator) -> tuple[str, Array, Array, list[Constraint]]:
     """Kind, positions, masses from 1 to 1e4, and rows of a random molecule."""
-    shape = str(
-        rng.choice(["tree", "ring", "braced", "two bodies", "angles", "dihedrals", "surfaces", "fixed", "flat"])
-    )
+    shape = str(rng.choice(SHAPES))
     n = int(rng.integers(2, 13)) if shape not in ("ring", "angles", "flat") else int(rng.integers(3, 11))
     n = max(n, 5) if shape in ("two bodies", "dihedrals") else n
     n = min(n, 7) if shape == "braced" else n
