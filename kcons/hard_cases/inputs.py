@@ -207,7 +207,7 @@ def late_force(program: Program, quick: bool) -> Outcome:
 
         def spoiled(problem: Problem) -> Any:
             system = bare(problem)
-            force = openmm.CustomExternalForce(f"1e-9*log({float(problem.x[:, 0].max()) + 0.3!r}-x)")
+            force = openmm.CustomExternalForce(f"1e-9*sqrt({float(problem.x[:, 0].max()) + 0.3!r}-x)")
             for k in range(4):
                 force.addParticle(k, [])
             system.addForce(force)
