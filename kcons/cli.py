@@ -435,6 +435,8 @@ def _check(chosen: argparse.Namespace) -> int:
     page = [check_report.summary(result), *map(_rendered, tables), result.verdict]
     _say_written(check_report.write(result, folder, tables=page))
     return int(result.violated)
+
+
 # -- hard cases -------------------------------------------------------------------------------------
 
 

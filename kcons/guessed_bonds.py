@@ -21,7 +21,6 @@ COINCIDENT = 0.3
 
 
 def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolArray | None = None) -> IntArray:
-def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
     """Bonds that the distances suggest, shape (n, 2).
 
     Two atoms are bonded if they are closer than 1.25 times the sum of their covalent radii, under minimum images. A
@@ -46,7 +45,6 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
     for symbol, value in RADII.items():
         radius[topology.elements == symbol] = value
     able = np.flatnonzero((radius > 0) if among is None else (radius > 0) & among)
-    able = np.flatnonzero(radius > 0)
     if topology.n_atoms and not (topology.elements != "").any():
         raise InputError(
             "there are no bonds and no elements to guess them from; give a topology with bonds, or elements",
@@ -61,7 +59,6 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None) -> IntArray:
         return np.zeros((0, 2), np.int64)
     cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
     reach = 2 * STRETCH * float(radius[able].max())
-    reach = 2 * STRETCH * float(radius.max())
     pairs, away = _close(x[able], cell, snapshot.pbc, reach)
     pairs = able[pairs]
     i, j = pairs.T

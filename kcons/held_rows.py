@@ -27,7 +27,6 @@ from kcons.rigid_groups import (
     find_waters,
     inside_bodies,
     listed_bodies,
-    minimum_image,
     residue_bodies,
 )
 from kcons.topology import BoolArray, Snapshot, Topology, near_misses, sorted_pairs
@@ -159,7 +158,6 @@ def held_rows(
     -----
     UserWarning
         If bonds were guessed without being asked for (guess='missing').
-        If bonds were guessed.
     """
     kind = "none" if constrain is None else str(constrain).lower()
     if kind not in CONSTRAIN:
@@ -191,16 +189,6 @@ def held_rows(
             snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
         snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
         waters = find_waters(snapshot, called, model_site)
-    # Without residues, molecules decide what is water, and bonds what are molecules.
-    needs_bonds = kind != "none" or ((rigid_water or residues) and not snapshot.topology.residues_known)
-    guessed = 0
-    if needs_bonds:
-        snapshot, guessed = _with_bonds(snapshot, guess, remedy)
-    if not snapshot.topology.residues_known:
-        snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
-    waters = find_waters(
-        snapshot, WATER | {str(n).strip().upper() for n in water_names} if rigid_water else frozenset(), model_site
-    )
     if selected is not None:
         inside = selected[waters.triples].all(axis=1)
         seen = selected[waters.sites.parents].all(axis=1)
@@ -232,9 +220,6 @@ def held_rows(
     if guessed and guess == "missing":
         warnings.warn(
             f"{guessed} bonds were guessed from distances and covalent radii, since "
-    if guessed:
-        warnings.warn(
-            f"{guessed} of {len(snapshot.topology.bonds)} bonds were guessed from distances and covalent radii, since "
             f"the {snapshot.host or 'topology'} does not have them; {remedy}, or pass guess_bonds=False to refuse",
             UserWarning,
             stacklevel=3,
@@ -302,34 +287,6 @@ def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str, settled: Boo
             atoms=[atom],
         )
     found = guess_bonds(snapshot, lacking, ~settled)
-def _with_bonds(snapshot: Snapshot, guess: bool | str, remedy: str) -> tuple[Snapshot, int]:
-    """The snapshot with bonds, and how many of them are guessed."""
-    topology = snapshot.topology
-    n = topology.n_atoms
-    if guess is True:
-        found = guess_bonds(snapshot)
-        return replace(snapshot, topology=topology.with_bonds(found)), len(found)
-    bonded = np.zeros(n, dtype=bool)
-    bonded[topology.bonds] = True
-    size = np.bincount(topology.residues, minlength=topology.n_residues)[topology.residues]
-    # Ions and united atoms have no bonds, hydrogens always have.
-    lacking = ~bonded & ((size > 1) | ~np.bool_(topology.residues_known)) & (topology.elements != "")
-    if not lacking.any() and len(topology.bonds):
-        return snapshot, 0
-    if guess is False:
-        if len(topology.bonds):
-            atom = int(np.argmax(lacking))
-            raise InputError(
-                f"{topology.atom_name(atom)} has no bond, as {int(lacking.sum())} atoms; {remedy}, or let them be "
-                "guessed (guess_bonds='missing')",
-                item="bonds",
-                atoms=[atom],
-            )
-        raise InputError(
-            f"the {snapshot.host or 'topology'} has no bonds; {remedy}, or let them be guessed (guess_bonds='missing')",
-            item="bonds",
-        )
-    found = guess_bonds(snapshot, lacking)
     both = sorted_pairs(np.concatenate([topology.bonds, found]))
     return replace(snapshot, topology=topology.with_bonds(both)), len(both) - len(topology.bonds)
 

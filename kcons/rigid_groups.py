@@ -44,12 +44,6 @@ WATER = frozenset(
         *("TIP", "TIP2", "TIP3", "TIP3P", "TIP4", "TIP4P", "TIP4E", "TIP5", "TIP5P", "TP3M", "TIPS"),
         *("SPC", "SPCE", "SPC/E", "OPC", "OPC3"),
     }
-
-#: Residues that are water, and the molecule when there are no residues.
-WATER = frozenset(
-    ["HOH", "H2O", "WAT", "SOL", "DOD", "OH2", "HHO", "OHH", "TIP", "TIP2", "TIP3", "TIP3P", "TIP4", "TIP4P", "TIP4E"]
-    + ["TIP5", "TIP5P", "T3P", "T4P", "T5P", "T3H", "T4E", "TP3", "TP4", "TP5", "TP3M", "TIPS", "SPC", "SPCE", "SPC/E"]
-    + ["OPC", "OPC3"]
 )
 #: O-H length (angstrom), H-O-H angle (degrees), O-M length (angstrom) of named models.
 GEOMETRIES: dict[str, tuple[float, float, float]] = {
@@ -345,29 +339,6 @@ def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> No
             f"{snapshot.topology.atom_name(int(body[1]))}; give positions",
             atoms=body.tolist(),
         )
-
-
-def whole_groups(snapshot: Snapshot, atoms: IntArray) -> FloatArray:
-    """Positions of groups, each made whole by minimum images from atom to atom, shape (n, width, 3)."""
-    r = snapshot.positions[atoms]
-    if snapshot.cell is None or not snapshot.pbc.any():
-        return r
-    steps = minimum_image(snapshot, np.diff(r, axis=1))
-    r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
-    return r
-
-
-def minimum_image(snapshot: Snapshot, d: FloatArray) -> FloatArray:
-    """Shortest images of difference vectors, shape (..., 3)."""
-    if snapshot.cell is None or not snapshot.pbc.any():
-        return d
-    cell = snapshot.cell.copy()
-    axes = np.flatnonzero(snapshot.pbc)
-    if len(axes) < 3:
-        cell[~snapshot.pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
-    inverse = np.linalg.inv(cell)
-    inverse[:, ~snapshot.pbc] = 0.0
-    return d - np.round(d @ inverse) @ cell
 
 
 def inside_bodies(n_atoms: int, pairs: IntArray, groups: Sequence[IntArray]) -> IntArray:

@@ -84,5 +84,3 @@ def fitted(sites: IntArray, parents: IntArray, r_site: FloatArray, r_parents: Fl
     frame = np.stack([u, w, np.cross(u, w)], axis=-1)
     coefficients = np.linalg.solve(frame, (r_site - r_parents[:, 0])[..., None])[..., 0]
     return VirtualSites(sites, parents, np.asarray(coefficients, dtype=np.float64))
-    coefficients: FloatArray = np.linalg.solve(frame, (r_site - r_parents[:, 0])[..., None])[..., 0]
-    return VirtualSites(sites, parents, coefficients)

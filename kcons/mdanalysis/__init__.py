@@ -1,8 +1,10 @@
-"""MDAnalysis: constraints from any topology it reads, and conversions to ASE and OpenMM.
+"""MDAnalysis: constraints from any topology it reads, conversions, checks of trajectories, and writing them.
 
 Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
 """
 
+from kcons.mdanalysis.check import ConstraintCheck
+from kcons.mdanalysis.check_files import check_trajectory
 from kcons.mdanalysis.conversions import (
     ase_to_openmm,
     from_ase,
@@ -12,28 +14,6 @@ from kcons.mdanalysis.conversions import (
     to_openmm,
     universe_of,
 )
-from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
-
-__all__ = [
-    "ase_to_openmm",
-    "constraints_of",
-    "from_ase",
-    "from_openmm",
-    "openmm_to_ase",
-    "selected",
-    "snapshot_of",
-    "to_ase",
-    "to_openmm",
-    "universe_of",
-]
-"""kcons on MDAnalysis: checks of trajectories, and writing them."""
-"""MDAnalysis: constraints from any topology it reads, conversions, checks of trajectories, and writing them.
-
-Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
-"""
-
-from kcons.mdanalysis.check import ConstraintCheck
-from kcons.mdanalysis.check_files import check_trajectory
 from kcons.mdanalysis.loading import load_trajectory, open_universe
 from kcons.mdanalysis.result import CheckResult
 from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
@@ -47,11 +27,18 @@ __all__ = [
     "OpenMMReporter",
     "RunUnits",
     "TrajectoryWriter",
+    "ase_to_openmm",
     "check_trajectory",
     "constraints_of",
+    "from_ase",
+    "from_openmm",
     "load_trajectory",
     "open_universe",
+    "openmm_to_ase",
     "selected",
     "snapshot_of",
+    "to_ase",
+    "to_openmm",
+    "universe_of",
     "write_ase",
 ]
