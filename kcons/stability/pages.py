@@ -114,11 +114,18 @@ def _markdown(headings: list[str], rows: list[list[str]]) -> str:
 def markdown(result: Mapping[str, Any]) -> dict[str, str]:
     """The tables for the documentation, by part."""
     return {
-        "steps": _markdown(*steps_table(result)),
+        "steps": _markdown(*steps_table(result)) + _lengths(result, "steps", "Steps in a run"),
         "drift": _markdown(*drift_table(result)),
-        "reversal": _markdown(*reversal_table(result)),
+        "reversal": _markdown(*reversal_table(result)) + _lengths(result, "reversal", "Steps forth"),
         "fuzz": fuzz_words(result),
     }
+
+
+def _lengths(result: Mapping[str, Any], part: str, words: str) -> str:
+    """How long the runs of each scene were, with Rattle."""
+    found = {scene: _piece(result, part, scene, "Rattle") for scene in SCENES}
+    told = ", ".join(f"{scene} {piece['steps']}" for scene, piece in found.items() if piece and "steps" in piece)
+    return f"\n\n{words}: {told}." if told else ""
 
 
 def text(result: Mapping[str, Any]) -> str:
