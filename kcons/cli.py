@@ -11,20 +11,14 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcons import __version__
+from kcons import __version__, cli_check, cli_studies
 from kcons.errors import InputError, KconsError
+from kcons.terminal import console, names, numbers, rendered, say_written, show
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
     from kcons.runs import Method
     from kcons.scenes import Scene
     from kcons.scenes.fluid import Fluid
-
-
-#: Columns of a page that is no terminal.
-WIDE = 150
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,13 +83,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     compare.add_argument(
         "--dt",
-        type=_numbers,
+        type=numbers,
         help="time steps, comma separated, in the unit the scene shows; "
         "steppers with several force evaluations a step take longer ones at the same cost",
     )
     compare.add_argument(
         "--methods",
-        type=_names,
+        type=names,
         help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
     )
     compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
@@ -114,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         help="every scene, into one page (default ./compare-all; --quick: five minutes); goes on where it stopped",
     )
     report.add_argument(
-        "--only", type=_names, metavar="PARTS", help="of these, comma separated (--all --list shows them)"
+        "--only", type=names, metavar="PARTS", help="of these, comma separated (--all --list shows them)"
     )
     report.add_argument("--fresh", action="store_true", help="measure again what is there already")
     report.add_argument("--redraw", type=Path, metavar="DIR", help="pictures and page from the numbers in DIR, no run")
@@ -128,67 +122,10 @@ def _parser() -> argparse.ArgumentParser:
         description="What the engine will do for a scene, before any run.",
     )
     plan.set_defaults(run=_plan)
-    _add_check(commands)
+    cli_check.add(commands)
+    cli_studies.add(commands)
 
-    hard = commands.add_parser(
-        "hardcases",
-        help="what kcons, ASE and OpenMM do where constraints are difficult",
-        description="Run the hard cases side by side; table, picture, page and JSON of the verdicts.",
-    )
-    hard.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
-    hard.add_argument("--out", type=Path, default=Path("hardcases"), help="folder (default ./hardcases); goes on there")
-    hard.add_argument("--only", type=_names, help="numbers of cases, comma separated, such as H14,H16")
-    hard.add_argument("--list", action="store_true", help="list the cases, and leave")
-    hard.set_defaults(run=_hard_cases)
-
-    stability = commands.add_parser(
-        "stability",
-        help="largest stable steps, drift of the energy, reversibility, random molecules",
-        description="How far each method can be pushed on small scenes, and what it does beyond.",
-    )
-    stability.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
-    stability.add_argument("--out", type=Path, default=Path("stability"), help="folder (default ./stability)")
-    stability.add_argument("--only", type=_names, help="of steps, drift, reversal, fuzz; comma separated")
-    stability.set_defaults(run=_stability)
     return parser
-
-
-def _add_check(commands: Any) -> None:
-    check = commands.add_parser(
-        "check",
-        help="how well a trajectory of any engine kept its constraints",
-        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift; told by "
-        "the precision of the file. Exit status 0: kept; 1: violated; 2: an error.",
-    )
-    check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
-    check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
-    check.add_argument("--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, ...")
-    check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
-    check.add_argument("--no-rigid-water", action="store_true", help="do not expect water to be rigid")
-    check.add_argument("--rigid-residues", nargs="+", default=(), metavar="NAME", help="residues that are held rigid")
-    check.add_argument("--rigid-bodies", nargs="+", default=(), metavar="SELECTION", help="atoms that are held rigid")
-    check.add_argument(
-        "--targets", default="first", help="first (frame, default), mean, topology (its coordinates), or a TOML file"
-    )
-    check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
-    check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
-    check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
-    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
-    check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
-    check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
-    check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
-    check.set_defaults(run=_check)
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.split(",") if word.strip()]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 4,2,1") from None
-
-
-def _names(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 # -- compare ----------------------------------------------------------------------------------------
@@ -233,12 +170,12 @@ def _compare(chosen: argparse.Namespace) -> int:
             result = recommendation.recommend(
                 scene, result, target, reference=reference, made_by=_expression(chosen), budget=budget, watcher=watcher
             )
-    console = _console()
+    terminal = console()
     explained = report.explanation(result)
     if target is not None:
         explained += "\n\n" + recommendation.sentences(result)
-    _print(report.table(result, narrow=not report.fits(result, console.width)), explained, console)
-    _say_written(report.write(result, folder, tables=[_rendered(report.table(result)), explained]))
+    show(report.table(result, narrow=not report.fits(result, terminal.width)), explained, terminal)
+    say_written(report.write(result, folder, tables=[rendered(report.table(result)), explained]))
     return 0
 
 
@@ -275,7 +212,7 @@ def _compare_all(chosen: argparse.Namespace) -> int:
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
         raise InputError("--all runs all scenes and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
-        _say_written(everything.redraw(chosen.redraw, chosen.into))
+        say_written(everything.redraw(chosen.redraw, chosen.into))
         return 0
     folder: Path = chosen.out or Path("compare-all")
     items = everything.chosen(chosen.only)
@@ -306,19 +243,9 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
             fluid, methods=chosen.methods, budget=budget, seed=chosen.seed, watcher=watcher, settings=asked
         )
     table, explained = sampling_report.table(result), sampling_report.explanation(result)
-    _print(table, explained, _console())
-    _say_written(sampling_report.write(result, folder, tables=[_rendered(table), explained]))
+    show(table, explained, console())
+    say_written(sampling_report.write(result, folder, tables=[rendered(table), explained]))
     return 0
-
-
-def _print(table: Table, explained: str, console: Console) -> None:
-    console.print(table)
-    console.print(explained, highlight=False, markup=False)
-
-
-def _say_written(paths: list[Path]) -> None:
-    for path in paths:
-        print(f"wrote {path}")
 
 
 def _check_scene(chosen: argparse.Namespace) -> None:
@@ -376,101 +303,6 @@ def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
     from kcons import scenes
 
     return scenes.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
-
-
-def _rendered(table: Table) -> str:
-    """The table as plain text, wide enough for all columns."""
-    from io import StringIO
-
-    from rich.console import Console
-
-    page = StringIO()
-    Console(file=page, width=WIDE, color_system=None).print(table)
-    return page.getvalue().rstrip()
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    console = Console()
-    # Into a file or a pipe there is no width to fit into.
-    return console if console.is_terminal else Console(width=WIDE)
-
-
-# -- check ------------------------------------------------------------------------------------------
-
-
-def _check(chosen: argparse.Namespace) -> int:
-    try:
-        from kcons.mdanalysis.check_files import check_trajectory
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "MDAnalysis":
-            raise
-        raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
-    from kcons import check_report
-
-    folder: Path = chosen.out or Path(f"check-{chosen.trajectory.stem}")
-    result = check_trajectory(
-        chosen.trajectory,
-        chosen.topology,
-        chosen.constrain,
-        select=chosen.select,
-        rigid_water=not chosen.no_rigid_water,
-        rigid_residues=chosen.rigid_residues,
-        rigid_bodies=chosen.rigid_bodies,
-        targets=chosen.targets,
-        tolerance=chosen.tolerance,
-        precision=chosen.precision,
-        frames=chosen.frames,
-        workers=chosen.workers,
-        worst=chosen.worst,
-        rank=not chosen.no_rank,
-    )
-    console = _console()
-    tables = (check_report.unit_table(result), check_report.row_table(result))
-    console.print(check_report.summary(result), highlight=False, markup=False)
-    for table in tables:
-        console.print(table)
-    console.print(check_report.verdict(result), soft_wrap=True)
-    page = [check_report.summary(result), *map(_rendered, tables), result.verdict]
-    _say_written(check_report.write(result, folder, tables=page))
-    return int(result.violated)
-
-
-# -- hard cases -------------------------------------------------------------------------------------
-
-
-def _hard_cases(chosen: argparse.Namespace) -> int:
-    from kcons import hard_cases
-    from kcons.hard_cases import pages
-    from kcons.progress import Bars
-
-    cases = hard_cases.chosen(chosen.only)
-    if chosen.list:
-        for case in cases.values():
-            print(f"{case.number}  {case.title}: {case.limit}")
-        return 0
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    kept = chosen.out / "hard_cases.json"
-    with Bars() as watcher:
-        result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
-    _print(pages.table(result), pages.summary(result), _console())
-    _say_written([kept, *pages.write(result, chosen.out)])
-    return 0
-
-
-def _stability(chosen: argparse.Namespace) -> int:
-    from kcons import stability
-    from kcons.progress import Bars
-    from kcons.stability import pages
-
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    kept = chosen.out / "stability.json"
-    with Bars() as watcher:
-        result = stability.digest(stability.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher))
-    print(pages.text(result))
-    _say_written([kept, *pages.write(result, chosen.out)])
-    return 0
 
 
 # -- plan and list ----------------------------------------------------------------------------------

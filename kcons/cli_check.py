@@ -1,0 +1,75 @@
+"""The command `kcons check`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from kcons.errors import InputError
+from kcons.terminal import console, rendered, say_written
+
+
+def add(commands: Any) -> None:
+    """Its options."""
+    check = commands.add_parser(
+        "check",
+        help="how well a trajectory of any engine kept its constraints",
+        description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift; told by "
+        "the precision of the file. Exit status 0: kept; 1: violated; 2: an error.",
+    )
+    check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
+    check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
+    check.add_argument("--constrain", default="hbonds", metavar="NAME", help="hbonds (default), allbonds, hangles, ...")
+    check.add_argument("--select", default="all", help="rows within this selection only (MDAnalysis' language)")
+    check.add_argument("--no-rigid-water", action="store_true", help="do not expect water to be rigid")
+    check.add_argument("--rigid-residues", nargs="+", default=(), metavar="NAME", help="residues that are held rigid")
+    check.add_argument("--rigid-bodies", nargs="+", default=(), metavar="SELECTION", help="atoms that are held rigid")
+    check.add_argument(
+        "--targets", default="first", help="first (frame, default), mean, topology (its coordinates), or a TOML file"
+    )
+    check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
+    check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
+    check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
+    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
+    check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
+    check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
+    check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
+    check.set_defaults(run=_check)
+
+
+def _check(chosen: argparse.Namespace) -> int:
+    try:
+        from kcons.mdanalysis.check_files import check_trajectory
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "MDAnalysis":
+            raise
+        raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
+    from kcons import check_report
+
+    folder: Path = chosen.out or Path(f"check-{chosen.trajectory.stem}")
+    result = check_trajectory(
+        chosen.trajectory,
+        chosen.topology,
+        chosen.constrain,
+        select=chosen.select,
+        rigid_water=not chosen.no_rigid_water,
+        rigid_residues=chosen.rigid_residues,
+        rigid_bodies=chosen.rigid_bodies,
+        targets=chosen.targets,
+        tolerance=chosen.tolerance,
+        precision=chosen.precision,
+        frames=chosen.frames,
+        workers=chosen.workers,
+        worst=chosen.worst,
+        rank=not chosen.no_rank,
+    )
+    terminal = console()
+    tables = (check_report.unit_table(result), check_report.row_table(result))
+    terminal.print(check_report.summary(result), highlight=False, markup=False)
+    for table in tables:
+        terminal.print(table)
+    terminal.print(check_report.verdict(result), soft_wrap=True)
+    text = [check_report.summary(result), *map(rendered, tables), result.verdict]
+    say_written(check_report.write(result, folder, tables=text))
+    return int(result.violated)

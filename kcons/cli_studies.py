@@ -1,0 +1,66 @@
+"""The commands `kcons hardcases` and `kcons stability`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from kcons.terminal import console, names, say_written, show
+
+
+def add(commands: Any) -> None:
+    """Their options."""
+    hard = commands.add_parser(
+        "hardcases",
+        help="what kcons, ASE and OpenMM do where constraints are difficult",
+        description="Run the hard cases side by side; table, picture, page and JSON of the verdicts.",
+    )
+    hard.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
+    hard.add_argument("--out", type=Path, default=Path("hardcases"), help="folder (default ./hardcases); goes on there")
+    hard.add_argument("--only", type=names, help="numbers of cases, comma separated, such as H14,H16")
+    hard.add_argument("--list", action="store_true", help="list the cases, and leave")
+    hard.set_defaults(run=_hard_cases)
+
+    stability = commands.add_parser(
+        "stability",
+        help="largest stable steps, drift of the energy, reversibility, random molecules",
+        description="How far each method can be pushed on small scenes, and what it does beyond.",
+    )
+    stability.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
+    stability.add_argument("--out", type=Path, default=Path("stability"), help="folder (default ./stability)")
+    stability.add_argument("--only", type=names, help="of steps, drift, reversal, fuzz; comma separated")
+    stability.set_defaults(run=_stability)
+
+
+def _hard_cases(chosen: argparse.Namespace) -> int:
+    from kcons import hard_cases
+    from kcons.hard_cases import pages
+    from kcons.progress import Bars
+
+    cases = hard_cases.chosen(chosen.only)
+    if chosen.list:
+        for case in cases.values():
+            print(f"{case.number}  {case.title}: {case.limit}")
+        return 0
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    kept = chosen.out / "hard_cases.json"
+    with Bars() as watcher:
+        result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
+    show(pages.table(result), pages.summary(result), console())
+    say_written([kept, *pages.write(result, chosen.out)])
+    return 0
+
+
+def _stability(chosen: argparse.Namespace) -> int:
+    from kcons import stability
+    from kcons.progress import Bars
+    from kcons.stability import pages
+
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    kept = chosen.out / "stability.json"
+    with Bars() as watcher:
+        result = stability.digest(stability.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher))
+    print(pages.text(result))
+    say_written([kept, *pages.write(result, chosen.out)])
+    return 0
