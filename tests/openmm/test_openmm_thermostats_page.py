@@ -1,0 +1,50 @@
+"""The page on OpenMM shows the committed results of the thermostats, and they say what the page says."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent.parent
+RESULTS = ROOT / "docs" / "results" / "openmm_thermostats.json"
+
+
+def test_page_shows_the_committed_results():
+    shown = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "12_openmm_thermostats.py"), "--show", str(RESULTS)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    page = (ROOT / "docs" / "openmm.md").read_text(encoding="utf-8")
+    for line in shown.splitlines():
+        assert line.rstrip() in page
+
+
+def test_results_are_those_of_a_full_run():
+    results = json.loads(RESULTS.read_text(encoding="utf-8"))
+    assert results["full"] and results["machine"]["commit"]
+    speed = {name: row["ratio"] for name, row in results["measurements"]["speed"]["rows"].items()}
+    assert speed["VerletIntegrator"] == 1.0
+    assert speed["kcons Isokinetic"] >= 0.75
+
+
+def test_a_long_step_of_langevin_is_no_worse_than_a_short_one_of_openmm():
+    """What is left of the mean energy at 4 fs, against LangevinMiddleIntegrator at 2 fs, within standard errors."""
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))["measurements"]["sampling"]
+    zero = found["reference"]
+
+    def off(name: str, fs: float) -> tuple[float, float]:
+        (row,) = (row for row in found["sampling"][name] if row["fs"] == fs)
+        return abs(row["mean"] - zero["mean"]), math.hypot(row["error"], zero["error"])
+
+    ours, error = off("kcons Langevin", 4.0)
+    theirs, other = off("LangevinMiddleIntegrator", 2.0)
+    assert ours - theirs <= math.hypot(error, other)
+    assert ours <= 3 * error
