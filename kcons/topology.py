@@ -365,3 +365,27 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     """Names in a sentence, shortened."""
     distinct = sorted({str(n) for n in names})
     return ", ".join(distinct[:most]) + (f", ... ({len(distinct)} in all)" if len(distinct) > most else "")
+
+
+def selected_numbers(select: Any, n: int) -> IntArray:
+    """Numbers of the atoms that a mask or a list of numbers names.
+
+    Raises
+    ------
+    InputError
+        Words, which only MDAnalysis understands; nothing selected; atoms that do not exist.
+    """
+    given = np.asarray(select)
+    if given.dtype == bool and given.shape == (n,):
+        given = np.flatnonzero(given)
+    if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
+        raise InputError(
+            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
+            "for kcons.mdanalysis",
+            item="select",
+        )
+    if not given.size:
+        raise InputError("the selection has no atoms; widen it", item="select")
+    if given.min() < 0 or given.max() >= n:
+        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
+    return given.astype(np.int64)

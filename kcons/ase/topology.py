@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
 from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import MASSES, BoolArray, Snapshot, Topology, elements_of, sorted_pairs, split_residues
+from kcons.topology import (
+    MASSES,
+    BoolArray,
+    Snapshot,
+    Topology,
+    elements_of,
+    selected_numbers,
+    sorted_pairs,
+    split_residues,
+)
 
 __all__ = ["atoms_of", "constraints_of", "mend_elements", "snapshot_of"]
 
@@ -74,7 +83,7 @@ def constraints_of(
         water_geometry=water_geometry,
         rigid_residues=rigid_residues,
         rigid_bodies=rigid_bodies,
-        on=as_makers(on, lambda key: _numbers(key, len(atoms))),
+        on=as_makers(on, lambda key: selected_numbers(key, len(atoms))),
         selected=None if isinstance(select, str) and select == "all" else _mask(select, len(atoms)),
         angles=angles,
         guess=guess_bonds,
@@ -208,23 +217,5 @@ def _as_integers(ids: NDArray[np.str_]) -> IntArray:
 
 def _mask(select: Any, n: int) -> BoolArray:
     mask = np.zeros(n, dtype=bool)
-    mask[_numbers(select, n)] = True
+    mask[selected_numbers(select, n)] = True
     return mask
-
-
-def _numbers(select: Any, n: int) -> IntArray:
-    """Numbers of the atoms that a mask or a list of numbers names."""
-    given = np.asarray(select)
-    if given.dtype == bool and given.shape == (n,):
-        given = np.flatnonzero(given)
-    if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
-        raise InputError(
-            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
-            "for kcons.mdanalysis",
-            item="select",
-        )
-    if not given.size:
-        raise InputError("the selection has no atoms; widen it", item="select")
-    if given.min() < 0 or given.max() >= n:
-        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
-    return given.astype(np.int64)

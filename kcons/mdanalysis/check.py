@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,14 +16,14 @@ from numpy.typing import NDArray
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
-from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
+from kcons.mdanalysis.findings import Part, by_unit, rms_of, row_result, verdict_of
 from kcons.mdanalysis.loading import READ_ERRORS, intact_frames, last_offset, leftover, quiet
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.precision import FilePrecision, precision_of
 from kcons.mdanalysis.rank import rank_of
-from kcons.mdanalysis.result import Break, CheckResult, RowResult, UnitResult, fitted
+from kcons.mdanalysis.result import Break, CheckResult, fitted
 from kcons.mdanalysis.rows import UNITS, Deviations, RowTable, cell_matrix
 from kcons.mdanalysis.targets import TargetFile
 from kcons.solvers.frames import coordinate_grid, kinetic
@@ -39,30 +38,6 @@ SUMMED, MOST_SKIPPED = 100, 8
 SECOND_ORDER = 1.1
 #: Part of the kinetic energy that the centre of mass may have where its motion is removed.
 STILL = 1e-2
-
-
-@dataclass
-class Part:
-    """What one worker found in its frames."""
-
-    frames: IntArray
-    times: FloatArray
-    found: Deviations
-    twice_kinetic: FloatArray
-    momentum: FloatArray
-    reach: float
-    broken: Break | None = None
-
-    def with_next(self, other: Part) -> Part:
-        return Part(
-            np.concatenate([self.frames, other.frames]),
-            np.concatenate([self.times, other.times]),
-            self.found.with_next(other.found),
-            np.concatenate([self.twice_kinetic, other.twice_kinetic]),
-            np.concatenate([self.momentum, other.momentum]),
-            max(self.reach, other.reach),
-            other.broken,
-        )
 
 
 class _Remote:
@@ -435,9 +410,9 @@ class ConstraintCheck(AnalysisBase):
         # Rounding of the file and of the targets; that of a mean averages out.
         of_target = np.where(self._from_file & (self._mode != "mean"), half, self._target_error)
         rounding = self._spread * np.sqrt(half**2 + of_target**2)
-        units = self._by_unit(part, bound, rounding)
+        units = by_unit(self._table, part, bound, rounding)
         order = np.lexsort((-found.largest, ~violated))
-        worst = [self._row(int(row), part, allowed) for row in order[: self._n_worst]]
+        worst = [row_result(self._table, self._labels, int(row), part, allowed) for row in order[: self._n_worst]]
         in_frame = np.zeros(n_frames, dtype=bool)
         for unit in range(len(UNITS)):
             rows = found.worst_row[unit]
@@ -452,7 +427,7 @@ class ConstraintCheck(AnalysisBase):
             f"{name} {UNITS[unit]}": values[unit].tolist()
             for unit in range(len(UNITS))
             if (self._table.units == unit).any()
-            for name, values in (("largest", found.worst), ("rms", self._rms(found)))
+            for name, values in (("largest", found.worst), ("rms", rms_of(self._table, found)))
         }
         if temperature is not None:
             assert freedom is not None
@@ -464,7 +439,9 @@ class ConstraintCheck(AnalysisBase):
             n_rows=held.n_rows,
             n_constrained=len(held.touched),
             status=status,
-            verdict=self._verdict(status, worst[0], units, int(violated.sum()), frames, n_frames),
+            verdict=verdict_of(
+                status, self._tolerance, worst[0], units, (int(violated.sum()), held.n_rows), frames, n_frames
+            ),
             precision=self._precision.describe(part.reach),
             tolerance=self._tolerance,
             targets=self.target_text,
@@ -482,60 +459,6 @@ class ConstraintCheck(AnalysisBase):
             broken=broken,
             series=series,
             remarks=list(self._remarks),
-        )
-
-    def _rms(self, found: Deviations) -> FloatArray:
-        counts = np.array([[np.count_nonzero(self._table.units == unit)] for unit in range(len(UNITS))])
-        result: FloatArray = np.sqrt(found.squares / np.maximum(counts, 1))
-        return result
-
-    def _by_unit(self, part: Part, bound: FloatArray, rounding: FloatArray) -> list[UnitResult]:
-        found, n_frames = part.found, len(part.frames)
-        result = []
-        rms = self._rms(found)
-        for unit, name in enumerate(UNITS):
-            mine = self._table.units == unit
-            n = int(mine.sum())
-            if not n:
-                continue
-            rates = np.isfinite(found.rate_squares[unit])
-            rate_rms = float(np.sqrt(found.rate_squares[unit][rates].mean() / n)) if rates.any() else None
-            result.append(
-                UnitResult(
-                    unit=name,
-                    n_rows=n,
-                    largest=float(found.worst[unit].max()),
-                    rms=float(np.sqrt(found.squares[unit].sum() / (n * n_frames))),
-                    mean=float(found.sums[unit].sum() / (n * n_frames)),
-                    bound=float(bound[mine].max()),
-                    rounding_rms=float(np.sqrt(np.mean(rounding[mine] ** 2))),
-                    largest_mean=float(np.abs(found.total[mine]).max() / found.n_summed),
-                    drift=fitted(part.times, rms[unit]),
-                    rate_largest=float(np.nanmax(found.rate_worst[unit])) if rates.any() else None,
-                    rate_rms=rate_rms,
-                )
-            )
-        return result
-
-    def _row(self, row: int, part: Part, allowed: FloatArray) -> RowResult:
-        found, held = part.found, self._table.set
-        unit = int(self._table.units[row])
-        item, k = held.locate(row)
-        # By row, single precision is kept; by frame, double.
-        mine = np.flatnonzero(found.worst_row[unit] == row)
-        at = mine[np.float32(found.worst[unit][mine]) >= np.float32(found.largest[row])]
-        largest = found.worst[unit][at[0]] if len(at) else found.largest[row]
-        atoms = item.atoms[k]
-        return RowResult(
-            row=row,
-            name=f"{item.family} {self._labels.row(atoms)}",
-            atoms=[int(a) for a in atoms],
-            unit=UNITS[unit],
-            target=float(item.target_at(float(part.times[0]))[k]),
-            largest=float(largest),
-            mean=float(found.total[row] / found.n_summed),
-            allowed=float(allowed[row]),
-            frame=int(part.frames[at[0]]) if len(at) else None,
         )
 
     def _temperature(self, part: Part) -> tuple[int | None, int | None, dict[str, float] | None]:
@@ -570,21 +493,6 @@ class ConstraintCheck(AnalysisBase):
             "slope_error": line.error if line else float("nan"),
         }
         return rank, freedom, temperature
-
-    def _verdict(
-        self, status: str, row: RowResult, units: list[UnitResult], n_rows: int, frames: IntArray, n_frames: int
-    ) -> str:
-        most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
-        if status == "kept":
-            return f"kept to the precision of the file: largest deviation {most}"
-        if status == "tolerated":
-            return f"kept to the tolerance of {self._tolerance:g}: largest deviation {most}"
-        where = f" in frame {row.frame}" if row.frame is not None else ""
-        seen = f"; {len(frames)} of {n_frames} frames, from frame {frames[0]}" if len(frames) else ""
-        return (
-            f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): "
-            f"{row.name}{where}; {n_rows} of {len(self._table.units)} rows{seen}"
-        )
 
 
 def _flat(values: Any) -> NDArray[np.float32]:

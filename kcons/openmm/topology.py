@@ -14,7 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import Snapshot, Topology, sorted_pairs
+from kcons.topology import Snapshot, Topology, selected_numbers, sorted_pairs
 
 __all__ = ["constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -71,7 +71,7 @@ def constraints_of(
     selected = None
     if not (isinstance(select, str) and select == "all"):
         selected = np.zeros(n, dtype=bool)
-        selected[_numbers(select, n)] = True
+        selected[selected_numbers(select, n)] = True
     return held_rows(
         snapshot,
         constrain,
@@ -80,7 +80,7 @@ def constraints_of(
         water_geometry=water_geometry,
         rigid_residues=rigid_residues,
         rigid_bodies=rigid_bodies,
-        on=as_makers(on, lambda key: _numbers(key, n)),
+        on=as_makers(on, lambda key: selected_numbers(key, n)),
         selected=selected,
         angles=angles,
         guess=guess_bonds,
@@ -231,20 +231,3 @@ def _plain(values: Any, wanted: Any) -> FloatArray:
     if isinstance(values, list | tuple) and len(values) and unit.is_quantity(values[0]):
         return np.array([v.value_in_unit(wanted) for v in values], dtype=np.float64)
     return np.array(values, dtype=np.float64)
-
-
-def _numbers(select: Any, n: int) -> IntArray:
-    given = np.asarray(select)
-    if given.dtype == bool and given.shape == (n,):
-        given = np.flatnonzero(given)
-    if given.ndim != 1 or (given.size and not np.issubdtype(given.dtype, np.integer)):
-        raise InputError(
-            f"select {select!r:.60}: give 'all', a mask of {n} entries, or numbers of atoms; selections in words are "
-            "for kcons.mdanalysis",
-            item="select",
-        )
-    if not given.size:
-        raise InputError("the selection has no atoms; widen it", item="select")
-    if given.min() < 0 or given.max() >= n:
-        raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
-    return given.astype(np.int64)

@@ -1,0 +1,120 @@
+"""What was found in the frames of a trajectory, and what it says of rows and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.mdanalysis.names import AtomNames
+from kcons.mdanalysis.result import Break, RowResult, UnitResult, fitted
+from kcons.mdanalysis.rows import UNITS, Deviations, RowTable
+
+
+@dataclass
+class Part:
+    """What one worker found in its frames."""
+
+    frames: IntArray
+    times: FloatArray
+    found: Deviations
+    twice_kinetic: FloatArray
+    momentum: FloatArray
+    reach: float
+    broken: Break | None = None
+
+    def with_next(self, other: Part) -> Part:
+        return Part(
+            np.concatenate([self.frames, other.frames]),
+            np.concatenate([self.times, other.times]),
+            self.found.with_next(other.found),
+            np.concatenate([self.twice_kinetic, other.twice_kinetic]),
+            np.concatenate([self.momentum, other.momentum]),
+            max(self.reach, other.reach),
+            other.broken,
+        )
+
+
+def rms_of(table: RowTable, found: Deviations) -> FloatArray:
+    """Root mean square over the rows of each unit and frame, shape (units, frames)."""
+    counts = np.array([[np.count_nonzero(table.units == unit)] for unit in range(len(UNITS))])
+    result: FloatArray = np.sqrt(found.squares / np.maximum(counts, 1))
+    return result
+
+
+def by_unit(table: RowTable, part: Part, bound: FloatArray, rounding: FloatArray) -> list[UnitResult]:
+    """All rows of a unit together; `bound` is what rounding may do at most, `rounding` its standard deviation."""
+    found, n_frames = part.found, len(part.frames)
+    result = []
+    rms = rms_of(table, found)
+    for unit, name in enumerate(UNITS):
+        mine = table.units == unit
+        n = int(mine.sum())
+        if not n:
+            continue
+        rates = np.isfinite(found.rate_squares[unit])
+        rate_rms = float(np.sqrt(found.rate_squares[unit][rates].mean() / n)) if rates.any() else None
+        result.append(
+            UnitResult(
+                unit=name,
+                n_rows=n,
+                largest=float(found.worst[unit].max()),
+                rms=float(np.sqrt(found.squares[unit].sum() / (n * n_frames))),
+                mean=float(found.sums[unit].sum() / (n * n_frames)),
+                bound=float(bound[mine].max()),
+                rounding_rms=float(np.sqrt(np.mean(rounding[mine] ** 2))),
+                largest_mean=float(np.abs(found.total[mine]).max() / found.n_summed),
+                drift=fitted(part.times, rms[unit]),
+                rate_largest=float(np.nanmax(found.rate_worst[unit])) if rates.any() else None,
+                rate_rms=rate_rms,
+            )
+        )
+    return result
+
+
+def row_result(table: RowTable, labels: AtomNames, row: int, part: Part, allowed: FloatArray) -> RowResult:
+    """One row, by name."""
+    found, held = part.found, table.set
+    unit = int(table.units[row])
+    item, k = held.locate(row)
+    # By row, single precision is kept; by frame, double.
+    mine = np.flatnonzero(found.worst_row[unit] == row)
+    at = mine[np.float32(found.worst[unit][mine]) >= np.float32(found.largest[row])]
+    largest = found.worst[unit][at[0]] if len(at) else found.largest[row]
+    atoms = item.atoms[k]
+    return RowResult(
+        row=row,
+        name=f"{item.family} {labels.row(atoms)}",
+        atoms=[int(a) for a in atoms],
+        unit=UNITS[unit],
+        target=float(item.target_at(float(part.times[0]))[k]),
+        largest=float(largest),
+        mean=float(found.total[row] / found.n_summed),
+        allowed=float(allowed[row]),
+        frame=int(part.frames[at[0]]) if len(at) else None,
+    )
+
+
+def verdict_of(
+    status: str,
+    tolerance: float,
+    row: RowResult,
+    units: list[UnitResult],
+    rows: tuple[int, int],
+    frames: IntArray,
+    n_frames: int,
+) -> str:
+    """The result in a sentence; `rows`: how many are violated, and of how many."""
+    most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
+    if status == "kept":
+        return f"kept to the precision of the file: largest deviation {most}"
+    if status == "tolerated":
+        return f"kept to the tolerance of {tolerance:g}: largest deviation {most}"
+    where = f" in frame {row.frame}" if row.frame is not None else ""
+    seen = f"; {len(frames)} of {n_frames} frames, from frame {frames[0]}" if len(frames) else ""
+    return (
+        f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): "
+        f"{row.name}{where}; {rows[0]} of {rows[1]} rows{seen}"
+    )
