@@ -284,7 +284,8 @@ def show(result: dict[str, Any]) -> None:
     r = result["random"]
     print(
         f"\nRandom systems to t = 10/k_h: {r['trajectories']:,}, finite {r['finite']:,}, "
-        f"rows within {r['worst_row']:.1e} of max(1, |g_0|), {r['cpu_s']:.0f} s CPU"
+        f"{r['cpu_s']:.0f} s CPU\nRows within {r['worst_row']:.1e} of max(1, |g_0|), {r['above_1e-13']} of the systems "
+        f"above 1e-13; within {r['worst_of_terms']:.1e} of the terms of g_0"
     )
     e = result["ensemble"]
     print(f"\n{e['count']:,} hypercycles to t = {e['end']:g}, {e['threads']} threads")

@@ -53,12 +53,14 @@ def test_committed_result(committed):
     assert random["trajectories"] == random["finite"] >= 18_000
     assert random["failed"] == 0
     assert max(group["total"] for group in random["groups"]) < 1e-13
-    assert random["worst_row"] < 1e-13
+    # See test_a_million_random_systems.
+    assert random["above_1e-13"] < 50
+    assert random["worst_of_terms"] < 1e-13
+    assert committed["ensemble"]["count"] == 10_000
     for row in committed["ensemble"]["kinds"].values():
         assert row["failed"] == 0
         assert row["error_max"] < 1e-6
-        # Of one core, and two were used; how long that takes depends on what else runs.
-        assert row["cpu_s"] < 60.0
+        assert row["wall_s"] < 60.0
 
 
 def test_page_shows_the_committed_result(script, committed, capsys):
