@@ -1,14 +1,17 @@
 """Rigid groups of atoms as rows: water, residues, bodies; linear and planar ones by linear rows.
 
 A rigid body of n atoms needs 3n - 6 rows. All of its distances would be far more, and where it is linear or planar
-they are singular. So a few atoms, the bases, keep their distances, and every other atom is tied to the bases by
-x_a = sum w_i x_i (`LinearRelation`): two bases for atoms on a line, three in a plane, four in space.
+they are singular. So a few atoms, the bases, keep their distances: two for atoms on a line, three in a plane, four in
+space. On a line and in a plane every other atom is tied to the bases by x_a = sum w_i x_i (`LinearRelation`), in
+space by three distances: to those of the bases that it sees under the widest angles, or in a large body to three atoms
+nearby, so that no atom takes part in many rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -61,6 +64,10 @@ GEOMETRIES: dict[str, tuple[float, float, float]] = {
 #: Extent across a line or a plane, relative to the extent along it, that still counts as flat: what three decimals
 #: of a file leave of a ring that was planar.
 FLAT = 2e-3
+#: Bodies in space of more atoms than this are braced by neighbours instead of by four bases.
+LARGE = 50
+#: Among how many atoms nearby three are looked for, and what volume of three unit vectors is enough.
+_NEAR, _ENOUGH = 12, 0.2
 #: Bases are the first atoms that are this close to the best.
 _AS_GOOD = 1 - 1e-6
 
@@ -250,7 +257,7 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
     """
     pairs: list[IntArray] = []
     lengths: list[FloatArray] = []
-    tied: dict[int, list[tuple[IntArray, IntArray, FloatArray]]] = {2: [], 3: [], 4: []}
+    tied: dict[int, list[tuple[IntArray, IntArray, FloatArray]]] = {2: [], 3: []}
     for atoms in groups:
         r = whole_groups(snapshot, atoms)
         center = r.mean(axis=1, keepdims=True)
@@ -262,6 +269,12 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
         _refuse_coincident(snapshot, atoms, s)
         for d in np.unique(dimension).tolist():
             these = np.flatnonzero(dimension == d)
+            if d == 3 and atoms.shape[1] > LARGE:
+                for body in these.tolist():
+                    ends = _braced(r[body])
+                    pairs.append(atoms[body][ends])
+                    lengths.append(np.linalg.norm(r[body][ends[:, 0]] - r[body][ends[:, 1]], axis=1))
+                continue
             along = axes[these, :d]
             y = (r[these] - center[these]) @ np.swapaxes(along, 1, 2)
             bases = _bases(y)
@@ -276,6 +289,14 @@ def body_rows(snapshot: Snapshot, groups: Sequence[IntArray], flat: float = FLAT
             others = np.ones((len(these), n), dtype=bool)
             np.put_along_axis(others, bases, False, axis=1)
             rest = y[others].reshape(len(these), n - d - 1, d)
+            if d == 3:
+                seen = _best_triples(rest, corners)
+                at = np.take_along_axis(own[:, None], seen, axis=2)
+                ends = np.broadcast_to(atoms[these][others].reshape(len(these), -1, 1), at.shape)
+                pairs.append(np.stack([at, ends], axis=3).reshape(-1, 2))
+                from_base = np.linalg.norm(rest[:, :, None] - corners[:, None], axis=3)
+                lengths.append(np.take_along_axis(from_base, seen, axis=2).ravel())
+                continue
             edges = corners[:, 1:] - corners[:, :1]
             # rest - corner_0 = sum_i w_i edge_i
             w = np.linalg.solve(np.swapaxes(edges, 1, 2), np.swapaxes(rest - corners[:, :1], 1, 2))
@@ -314,6 +335,80 @@ def _bases(y: FloatArray) -> IntArray:
         # What is left is normal to the bases so far.
         away = away - np.einsum("bnd,bd->bn", away, direction)[:, :, None] * direction[:, None]
     return np.sort(np.stack(chosen, axis=1), axis=1)
+
+
+def _braced(x: FloatArray) -> IntArray:
+    """Pairs of atoms, 3n - 6, that hold a body in space, each atom by three atoms nearby that come before it.
+
+    A body grows from its middle outwards; see Henneberg's construction.
+    """
+    from scipy.spatial import cKDTree
+
+    n = len(x)
+    order = np.argsort(np.linalg.norm(x - x[np.argmin(np.linalg.norm(x - x.mean(axis=0), axis=1))], axis=1))
+    first = _first_four(x, order)
+    order = np.concatenate([first, order[~np.isin(order, first)]])
+    place = np.empty(n, np.int64)
+    place[order] = np.arange(n)
+    near = cKDTree(x).query(x, min(n, 3 * _NEAR))[1]
+    pairs = [(int(first[i]), int(first[j])) for i in range(4) for j in range(i)]
+    triples = np.array(list(combinations(range(_NEAR + 4), 3)))
+    for k in range(4, n):
+        atom = order[k]
+        known = near[atom][place[near[atom]] < k][:_NEAR]
+        best, volume = _widest(x, atom, known, triples)
+        if volume < _ENOUGH:
+            # A flat or lonely place: look at a few atoms at all distances, and at those that span space.
+            placed = order[:k][np.argsort(np.linalg.norm(x[order[:k]] - x[atom], axis=1))]
+            some = np.unique(np.geomspace(1, k, _NEAR).astype(np.int64)) - 1
+            wider, other = _widest(x, atom, np.unique(np.concatenate([placed[some], first])), triples)
+            best = wider if other > volume else best
+        pairs += [(int(atom), int(base)) for base in best]
+    return np.array(pairs)
+
+
+def _widest(x: FloatArray, atom: int, known: IntArray, triples: IntArray) -> tuple[IntArray, float]:
+    """The three of `known` that `atom` sees farthest from a plane, and the volume of their directions."""
+    choices = triples[triples[:, 2] < len(known)]
+    if not len(choices):
+        return known[:0], 0.0
+    sight = x[known] - x[atom]
+    sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    volume = np.abs(np.linalg.det(sight[choices]))
+    best = int(np.argmax(volume >= _AS_GOOD * volume.max()))
+    return known[choices[best]], float(volume[best])
+
+
+def _first_four(x: FloatArray, order: IntArray) -> IntArray:
+    """The first of `order`, and three of the atoms nearest to it that span space well."""
+    nearest = order[: max(_NEAR, 4)]
+    rest = np.array(list(combinations(range(1, len(nearest)), 3)))
+    for several in (nearest, order[np.unique(np.geomspace(1, len(order), len(nearest)).astype(np.int64)) - 1]):
+        best, volume = _widest(x, int(several[0]), several[1:], rest[rest[:, 2] < len(several)] - 1)
+        if volume >= _ENOUGH:
+            break
+    return np.concatenate([several[:1], best])
+
+
+def _best_triples(rest: FloatArray, corners: FloatArray) -> IntArray:
+    """For each atom the three of four bases that are farthest from being seen in one plane.
+
+    Parameters
+    ----------
+    rest : ndarray, shape (n_bodies, n_atoms, 3)
+    corners : ndarray, shape (n_bodies, 4, 3)
+
+    Returns
+    -------
+    ndarray of int, shape (n_bodies, n_atoms, 3)
+    """
+    triples = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
+    sight = corners[:, None] - rest[:, :, None]
+    sight = sight / np.linalg.norm(sight, axis=3, keepdims=True)
+    volume = np.abs(np.linalg.det(sight[:, :, triples]))
+    # The first that is as good as the best, so that rounding does not choose.
+    best = np.argmax(volume >= _AS_GOOD * volume.max(axis=2, keepdims=True), axis=2)
+    return triples[best]
 
 
 def _farthest(distance: FloatArray) -> IntArray:

@@ -23,6 +23,12 @@ SHAPES = {
     "square": (np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), 3 * 4 - 6),
     "tetrahedron": (np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), 6),
     "cloud": (2 * RNG.normal(size=(30, 3)), 3 * 30 - 6),
+    "large cloud": (4 * RNG.normal(size=(80, 3)), 3 * 80 - 6),
+    "sheet with one atom above": (
+        np.array([*[[1.4 * i, 1.4 * j, 0.0] for i in range(8) for j in range(7)], [5.0, 4.0, 3.0]]),
+        3 * 57 - 6,
+    ),
+    "pyramid": (np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0.2, 0.1, 0]]), 3 * 6 - 6),
 }
 
 
@@ -51,6 +57,13 @@ def test_rows_hold_all_distances_of_bodies(name):
             assert np.linalg.norm(after[i] - after[j]) == pytest.approx(
                 np.linalg.norm(before[i] - before[j]), abs=1e-10
             )
+
+
+def test_no_atom_of_a_large_body_takes_part_in_many_rows():
+    x = 6 * RNG.normal(size=(300, 3))
+    (rows,) = body_rows(snapshot(["C"] * 300, x), [np.arange(300)[None]])
+    assert rows.family == "Distance" and rows.n_rows == 3 * 300 - 6
+    assert np.bincount(rows.atoms.ravel()).max() <= 60
 
 
 def test_a_ring_out_of_a_file_is_held_flat():

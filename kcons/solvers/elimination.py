@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.errors import UnsupportedError
 
 UIntArray = NDArray[np.uint32]
 
@@ -31,6 +32,9 @@ FAST = {"contract", "arcp", "nsz"}
 
 #: A pivot below this part of its diagonal marks a row that depends on earlier ones.
 PIVOT_TOLERANCE = 1e-10
+
+#: Updates of a factorisation, each stored in four bytes.
+MOST_UPDATES = 2.5e8
 
 #: Places between a row and its children in the elimination tree, where other rows can stand between.
 DISTANCE = 2
@@ -72,8 +76,22 @@ def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Patt
         through which rows are coupled: atoms of infinite mass are left out.
     n_atoms : int
         Number of atoms.
+
+    Raises
+    ------
+    UnsupportedError
+        So many rows share an atom that the factors would not fit into memory.
     """
     position, struct_start, struct = _minimum_degree(row_start, row_atoms, n_atoms)
+    sizes = np.diff(struct_start).astype(np.float64)
+    updates = float(np.sum(sizes * (sizes - 1) / 2))
+    if updates > MOST_UPDATES:
+        raise UnsupportedError(
+            f"{len(row_start) - 1} rows are coupled so densely that eliminating them takes {updates:.1e} updates, more "
+            f"than the {MOST_UPDATES:.1e} that fit into memory; one atom takes part in {np.bincount(row_atoms).max()} "
+            "rows. Let atoms take part in fewer rows, and hold bodies of more than a thousand atoms by a rigid-body "
+            "integrator"
+        )
     order, clusters, start, columns, target_start, targets = _finish(position, struct_start, struct)
     return Pattern(order, clusters, start, columns, target_start, targets)
 

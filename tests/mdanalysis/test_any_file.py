@@ -10,6 +10,7 @@ from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
 
 from kcons import cli, scenes
+from kcons.constraints import LinearRelation
 from kcons.errors import InputError, UnsupportedError
 from kcons.scenes import any_file
 
@@ -109,13 +110,21 @@ def test_scene_with_a_force_field_is_the_one_of_openmm(alanine):
     assert scene.openmm.system.getNumConstraints() == 12
 
 
+def test_rigid_residues_in_openmm(alanine):
+    scene = quietly(scenes.from_file, alanine, rigid_residues=["ALA"])
+    inside = [k for k, name in enumerate(scene.symbols) if name]
+    assert scene.openmm.home and len(inside) == 22
+    assert scene.openmm.system.getNumConstraints() == scene.motion.constraint_set.n_rows
+    assert scene.motion.rank == 3 * 10 - 6 + 7  # the residue, and the hydrogens of both caps
+
+
 def test_forces_that_do_not_fit(ethanol, alanine):
     with pytest.raises(InputError, match="no forces 'emtt'; there are openmm, emt"):
         quietly(scenes.from_file, ethanol, forces="emtt")
     with pytest.raises(InputError, match="residue"):
         quietly(scenes.from_file, ethanol)  # no template
     with pytest.raises(UnsupportedError, match="holds distances only"):
-        quietly(scenes.from_file, alanine, rigid_residues=["ALA"])
+        any_file._openmm_host(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
 
 
 def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):

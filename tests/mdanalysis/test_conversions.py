@@ -10,7 +10,7 @@ from host_systems import ALANINE, DHFR, VILLIN, quietly, read_universe
 from openmm import app, unit
 
 from kcons.ase import constrain
-from kcons.constraints import CenterOfMass, Distance, RadiusOfGyration
+from kcons.constraints import CenterOfMass, Distance, LinearRelation, RadiusOfGyration
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis import (
     ase_to_openmm,
@@ -133,7 +133,11 @@ def test_rows_that_are_no_distances_are_carried(villin):
         group,
         "hangles",
         rigid_residues=["LEU"],
-        on={"name CA": RadiusOfGyration, "name N": CenterOfMass},
+        on={
+            "name CA": RadiusOfGyration,
+            "name N": CenterOfMass,
+            "name C": lambda atoms: LinearRelation(atoms[0], atoms[1:3], [0.4, 0.6], None),
+        },
     )
     made = to_openmm(group, rows)
     assert made.part is not None

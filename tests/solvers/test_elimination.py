@@ -3,6 +3,10 @@
 import numpy as np
 import pytest
 
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Distance
+from kcons.errors import UnsupportedError
+from kcons.solvers import elimination
 from kcons.solvers.elimination import make_pattern
 from kcons.solvers.linear import backward, factor, forward
 
@@ -110,3 +114,11 @@ def test_sweeps_solve_the_dense_system(pairs):
     expected = w[:, None] * (incidence.T @ (solution[:, None] * s))
     np.testing.assert_allclose(moves[:, :3], expected, atol=1e-9 * np.abs(expected).max())
     assert not entries.reshape(-1, 4)[:, 2:].any()
+
+
+def test_rows_that_are_coupled_too_densely_are_refused_in_words(monkeypatch):
+    monkeypatch.setattr(elimination, "MOST_UPDATES", 1e3)
+    x = np.random.default_rng(1).normal(size=(31, 3))
+    held = ConstraintSet(Distance([(0, k) for k in range(1, 31)]), x, np.ones(31))
+    with pytest.raises(UnsupportedError, match=r"30 rows are coupled so densely .* one atom takes part in 30 rows"):
+        Motion(held, x)
