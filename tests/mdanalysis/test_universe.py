@@ -106,7 +106,7 @@ def test_many_waters_are_one_object():
 
 
 def test_topologies_of_adenylate_kinase():
-    files = pytest.importorskip("MDAnalysis.tests.datafiles")
+    files = pytest.importorskip("MDAnalysisTests.datafiles")
     for topology, coordinates in ((files.PSF, files.CRD), (files.PDB_small, None)):
         universe = read_universe(topology, *([coordinates] if coordinates else []))
         rows = quietly(constraints_of, universe, "hangles")
