@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: A budget is consistent with the start where it differs by no more than this part.
 BUDGET_TOLERANCE = 1e-9
+#: Excess, as a part of the largest there is, that rounding leaves of none (it is quadratic in x - x_eq).
+AT_EQUILIBRIUM = 1e-29
 
 
 class EntropyLaw(ABC):
@@ -107,6 +109,14 @@ class Relaxation(EntropyLaw):
         return -(excess - (excess0 - self._budget(excess0))) / self.tau
 
     def check(self, excess0: FloatArray, most: FloatArray) -> None:
+        if np.all(excess0 <= AT_EQUILIBRIUM * np.abs(most)):
+            raise BudgetError(
+                "the start is already at equilibrium, where no entropy is left to be produced and the row has no "
+                "direction; start elsewhere, or hold the total population alone (with_fixed_total)",
+                budget=0.0 if self.budget is None else self.budget,
+                consistent=0.0,
+                time=0.0,
+            )
         if self.budget is None:
             return
         allowed = float(np.max(excess0))

@@ -100,8 +100,8 @@ def near_extinction(program: Program, quick: bool) -> Outcome:
 @case(
     "H36",
     "Start at equilibrium, entropy production asked for",
-    "refused, or at rest; no NaN",
-    "warn-or-raise",
+    "refused: already at equilibrium",
+    "raise",
     hosts=NONE,
 )
 def at_equilibrium(program: Program, quick: bool) -> Outcome:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from growth.reference_cases import case, system
-from kcons.errors import InputError
+from kcons.errors import BudgetError, InputError
 from kcons.growth import Hypercycle, Populations, solve, solve_ensemble
 
 STARTS = ("IC1", "IC2", "IC3sum2")
@@ -115,13 +115,19 @@ def test_settled_motion_continues_the_integrated_one():
     assert coarse.y == pytest.approx(fine.y, rel=1e-6)
 
 
-def test_start_at_equilibrium_stays_there():
+def test_start_at_equilibrium():
+    """H36: with nothing to produce it is refused; with no production asked for, or the total alone, it stays."""
     model = Hypercycle()
     x_eq = np.exp(model.mixture.equilibrium(1.0))
-    for constrained in (model.with_entropy_production(30.0), model.without_entropy_production()):
-        found = solve(constrained, (0.0, 50.0), x_eq)
-        assert found.success
-        assert found.y == pytest.approx(np.repeat(x_eq[:, None], len(found.t), axis=1), rel=1e-12)
+    for budget in (None, 0.0):
+        with pytest.raises(BudgetError, match="already at equilibrium"):
+            solve(model.with_entropy_production(30.0, budget=budget), (0.0, 50.0), x_eq)
+    found = solve(model.without_entropy_production(), (0.0, 50.0), x_eq)
+    assert found.success
+    assert found.y == pytest.approx(np.repeat(x_eq[:, None], len(found.t), axis=1), rel=1e-12)
+    # A run that has all but arrived can be gone on with.
+    near = solve(model.with_entropy_production(30.0), (0.0, 900.0), [0.6, 0.1, 0.1, 0.1, 0.1]).y[:, -1]
+    assert solve(model.with_entropy_production(30.0), (0.0, 50.0), near).success
 
 
 @pytest.mark.parametrize("n", [2, 3])
