@@ -108,6 +108,11 @@ def _notes(found: Comparison) -> list[str]:
         + (f": forces take {duration(forces)} beyond the call" if forces is not None else "")
         + (f"; times of repeated runs differ by up to {100 * margin:.0f} %" if margin is not None else "")
         + ".",
+        *(
+            f"{host} has forces of its own, and takes less than a microsecond for a step with nothing held: there "
+            "force evaluations decide."
+            for host in sorted(judged.without_forces)
+        ),
     ]
     for row in summary(found):
         if not row["rivals"]:

@@ -93,7 +93,7 @@ def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any
 
 
 TOO_LARGE = "too large for it: its own Python loops over bonds, or its set-up, would take hours"
-LEAVE_OUT = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-held", "dop853")
+LEAVE_OUT = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853")
 
 #: All parts, in the order in which they are run and shown.
 PLAN: tuple[Item, ...] = (
@@ -190,7 +190,15 @@ PLAN: tuple[Item, ...] = (
         "hangles",
         "HAngles",
         steps=(2.0, 1.0),
-        without=("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-middle", "openmm-nose", "openmm-kcons-"),
+        without=(
+            "ase-bonds",
+            "ase-internals",
+            "openmm-verlet-",
+            "openmm-middle",
+            "openmm-nose",
+            "openmm-kcons-",
+            "openmm-rattle",
+        ),
         why="CCMA takes a minute to set up for these constraints, each time, and loops in Python longer for a step",
         seconds=200,
         quick_seconds=0,

@@ -106,21 +106,32 @@ class Verdict:
     Attributes
     ----------
     decides : {'wall', 'evaluations'}
-        What decides in this scene.
+        What decides in this scene, where its forces are those of the scene.
     margin : float
         Wall times that differ by less are the same.
     standings : list of Standing
+    without_forces : frozenset of str
+        Hosts that compute the forces themselves, and in less than `NO_FORCE`: evaluations decide there.
     """
 
     decides: Cost
     margin: float
     standings: Sequence[Standing]
+    without_forces: frozenset[str] = frozenset()
+
+    def decides_on(self, host: str) -> Cost:
+        """What decides among the methods of one host."""
+        return "evaluations" if host == EVERY_HOST or host in self.without_forces else self.decides
 
     @property
     def losses(self) -> list[Loss]:
         """All losses in what decides, and in evaluations."""
-        counted = {self.decides, "evaluations"}
-        return [loss for standing in self.standings if standing.cost in counted for loss in standing.losses]
+        return [
+            loss
+            for standing in self.standings
+            if standing.cost in (self.decides_on(standing.host), "evaluations")
+            for loss in standing.losses
+        ]
 
 
 def is_ours(m: Measurement) -> bool:
@@ -213,7 +224,17 @@ def verdict(comparison: Comparison) -> Verdict:
             standings.append(_standing(comparison, host, cost, margin))
     if len(hosts) > 1:
         standings.append(_standing(comparison, EVERY_HOST, "evaluations", margin))
-    return Verdict("evaluations" if no_force else "wall", margin, standings)
+    return Verdict("evaluations" if no_force else "wall", margin, standings, _hosts_without_forces(comparison))
+
+
+def _hosts_without_forces(comparison: Comparison) -> frozenset[str]:
+    """Hosts whose steps with nothing held take less than `NO_FORCE`, forces and all."""
+    floors = [
+        (host_of(m.method), m.step_seconds)
+        for m in comparison.measurements
+        if m.status == "floor" and m.step_seconds is not None and host_of(m.method) == HOSTS["openmm"]
+    ]
+    return frozenset(host for host, seconds in floors if seconds < NO_FORCE)
 
 
 def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> Standing:
@@ -282,7 +303,7 @@ def summary(comparison: Comparison) -> list[dict[str, Any]]:
     length = comparison.scene["units"]["length"]
     rows = []
     for standing in found.standings:
-        if standing.cost != ("evaluations" if standing.host == EVERY_HOST else found.decides):
+        if standing.cost != found.decides_on(standing.host):
             continue
         beside = next((s for s in found.standings if s.host == standing.host and s.cost != standing.cost), None)
         rows.append(

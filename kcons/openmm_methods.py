@@ -285,6 +285,27 @@ class Projected(OpenMMMethod):
 
 
 @dataclass(frozen=True)
+class Compiled(OpenMMMethod):
+    """`RattleIntegrator`: OpenMM's own leapfrog steps, with both ends at the positions.
+
+    Attributes
+    ----------
+    tolerance : float
+    """
+
+    tolerance: float = TIGHT
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        from kcons.openmm import RattleIntegrator
+
+        host = _host(scene)
+        integrator = RattleIntegrator(setting * host.time, tolerance=self.tolerance)
+        context = host.context(host.system, integrator)
+        # Each time somebody looks costs a force evaluation: only the end is looked at.
+        return _HostRun(scene, context, integrator, setting, records=1)
+
+
+@dataclass(frozen=True)
 class Held(Projected):
     """`ProjectedIntegrator` with the constraints carried to kcons' own solver by `hold`.
 
@@ -377,6 +398,10 @@ def _of_kcons() -> list[OpenMMMethod]:
             scheme=scheme,
         )
         found.append(projected)
+    for tolerance in (1e-4, 1e-6, TIGHT):
+        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{exponent}"
+        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {exponent}", tolerance=tolerance))
     for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
         title = f"OpenMM + kcons {scheme}, own solver"
         found.append(Held(f"openmm-held-{scheme}", title, usual=scheme != "blanes-moan4", scheme=scheme))

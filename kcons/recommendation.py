@@ -189,12 +189,11 @@ def sharpen(
     floor = floor_of(comparison)
     curves = _curves(comparison)
     judged = verdict(comparison)
-    counted = {judged.decides, "evaluations"}
     found: list[Measurement] = []
     tried: set[tuple[str, float]] = set()
     for standing in judged.standings:
         ours = [c for c in curves.values() if is_ours(c[0]) and standing.host in (host_of(c[0].method), EVERY_HOST)]
-        if standing.cost not in counted or not ours:
+        if standing.cost not in (judged.decides_on(standing.host), "evaluations") or not ours:
             continue
         for target in sorted({max(error, floor) for loss in standing.losses for error in loss.errors}):
             predictions = [p for c in ours if (p := predicted(c, SAFETY * target, floor)) is not None]

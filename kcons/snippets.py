@@ -10,7 +10,7 @@ import inspect
 
 from kcons.errors import InputError
 from kcons.methods import METHODS, AseBonds, AseKcons, CoreStepper, ProjectedOde
-from kcons.openmm_methods import TIGHT, BuiltIn, Held, OnSurfaces, Projected, middle, nose_hoover, verlet
+from kcons.openmm_methods import TIGHT, BuiltIn, Compiled, Held, OnSurfaces, Projected, middle, nose_hoover, verlet
 from kcons.runs import Method
 from kcons.scenes import Scene
 
@@ -57,7 +57,7 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
         lines = _ase_bonds(dt, steps)
     elif isinstance(found, ProjectedOde) and not found.project:
         lines = _scipy(setting)
-    elif isinstance(found, BuiltIn | Held | Projected) and not isinstance(found, OnSurfaces):
+    elif isinstance(found, BuiltIn | Compiled | Projected) and not isinstance(found, OnSurfaces):
         assert scene.openmm is not None
         step = repr(float(f"{setting * scene.units.time_unit * scene.openmm.time:.15g}"))
         lines = _openmm(found, step, steps, keep_water=not _only_water(scene))
@@ -177,6 +177,9 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
             f'part = hold(system, host.surfaces, scene.positions * host.length, take="all", keep_water={keep_water})',
             f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", parts=[part], tolerance={TIGHT:g})',
         ]
+    elif isinstance(found, Compiled):
+        lines += ["from kcons.openmm import RattleIntegrator"]
+        made += [f"integrator = RattleIntegrator({dt}, tolerance={found.tolerance:g})"]
     elif isinstance(found, Projected):
         lines += ["from kcons.openmm import ProjectedIntegrator"]
         made += [f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", tolerance={TIGHT:g})']

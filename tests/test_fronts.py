@@ -142,3 +142,16 @@ def test_summary_has_a_row_for_each_host():
     (row,) = fronts.summary(comparison(*RATTLE, peer))
     assert (row["host"], row["cost"], row["losses"]) == ("arrays", "wall time", [])
     assert row["front"] == ["kcons RATTLE"]
+
+
+def test_evaluations_decide_on_a_host_that_computes_forces_in_no_time():
+    ours = point("openmm-rattle", "OpenMM + kcons compiled RATTLE, 1e-12", 1e-3, 100, 2e-5)
+    theirs = point("openmm-verlet", "OpenMM Verlet, 1e-5", 1e-3, 100, 1e-5)
+    arrays = (point("rattle", "kcons RATTLE", 1e-3, 100, 1.0), point("shake-1e-8", "SHAKE", 1e-3, 100, 0.9))
+    for floor_step, decides, losses in ((2e-7, "evaluations", 0), (2e-6, "wall", 1)):
+        floor = point("openmm-free", "floor", None, 100, 1e-5, status="floor", step_seconds=floor_step)
+        found = fronts.verdict(comparison(ours, theirs, floor, *arrays, force=1e-5, margin=0.05))
+        assert found.decides_on("OpenMM") == decides
+        assert found.decides_on("arrays") == "wall"
+        assert [loss.host for loss in found.losses if loss.host == "OpenMM"] == ["OpenMM"] * losses
+        assert any(loss.host == "arrays" for loss in found.losses)

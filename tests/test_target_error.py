@@ -190,7 +190,9 @@ def test_lines_of_code_on_arrays():
     assert np.abs(space["end"].positions - scene.reference().positions).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", ["openmm-verlet", "openmm-middle", "openmm-kcons-blanes-moan4", "openmm-held-rattle"])
+@pytest.mark.parametrize(
+    "name", ["openmm-verlet", "openmm-middle", "openmm-rattle-1e-6", "openmm-kcons-blanes-moan4", "openmm-held-rattle"]
+)
 def test_lines_of_code_in_openmm(chain, name):
     pytest.importorskip("openmm")
     text = snippets.code(chain, name, 1.25, CHAIN)

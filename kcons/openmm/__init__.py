@@ -6,6 +6,7 @@ collective variables, surfaces and the constraint objects of kcons.
 
 from kcons.openmm.carrier import CarriedConstraints
 from kcons.openmm.collective import CollectiveRows
+from kcons.openmm.compiled import RattleIntegrator
 from kcons.openmm.implicit_rows import ExpressionSurface
 from kcons.openmm.isokinetic import Isokinetic
 from kcons.openmm.langevin import Langevin
@@ -22,6 +23,7 @@ __all__ = [
     "Isokinetic",
     "Langevin",
     "ProjectedIntegrator",
+    "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
     "constraints_of",

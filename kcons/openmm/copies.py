@@ -39,6 +39,8 @@ RUN_STATE = frozenset(
         "kick",
         "growth",
         "lost",
+        "known",
+        "end",
     ]
 )
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import gc
 import weakref
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openmm
-from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
@@ -39,13 +38,19 @@ def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     return None
 
 
+# A State is in nm and ps whatever else is in use: _value spares the conversion, which takes longer than small Systems.
+
+
 def positions_of(context: openmm.Context) -> FloatArray:
-    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer))
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
 
 
 def velocities_of(context: openmm.Context) -> FloatArray:
-    state = context.getState(velocities=True)
-    return np.asarray(state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond))
+    return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
+
+
+def _box(context: openmm.Context) -> Any:
+    return context.getState().getPeriodicBoxVectors()._value
 
 
 class Guard:
@@ -77,6 +82,7 @@ class Guard:
         self._surroundings: tuple[object, ...] | None = None
         self._good: openmm.State | None = None
         self._freedom: int | None = None
+        self._left: tuple[int, Any] | None = None
 
     @property
     def alive(self) -> openmm.Context | None:
@@ -159,7 +165,7 @@ class Guard:
             context.setVelocities(v)
             raise
         self.started = True
-        self._remember()
+        self._remember(context.getState(positions=True, velocities=True))
 
     def _make_tangent(self, x: FloatArray, v: FloatArray) -> None:
         """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
@@ -181,13 +187,27 @@ class Guard:
     def surroundings_changed(self) -> bool:
         """Whether parameters or the box were changed since the last call: forces that were kept are old then."""
         context = self.context
-        box = context.getState().getPeriodicBoxVectors(asNumpy=True).value_in_unit(unit.nanometer)
-        now = (dict(context.getParameters()), box.tolist())
+        now = (dict(context.getParameters()), _box(context))
         before, self._surroundings = self._surroundings, now
         return before is not None and before != now
 
     def note_surroundings(self) -> None:
         self.surroundings_changed()
+
+    def meet_others(self) -> None:
+        """Make OpenMM compute forces anew if since the last step the box was changed, or others have made steps.
+
+        It keeps the forces of a CustomIntegrator whatever happens to the box, and whatever the other integrators of a
+        CompoundIntegrator do to x.
+        """
+        context = self.context
+        if self._left is not None and self._left != (context.getStepCount(), _box(context)):
+            context.setVelocities(velocities_of(context))
+
+    def leave(self) -> None:
+        """A call of `step` ends."""
+        context = self.context
+        self._left = context.getStepCount(), _box(context)
 
     def count(self, steps: int) -> None:
         """Count steps; check where a check is due.
@@ -207,17 +227,18 @@ class Guard:
         step = context.getStepCount()
         try:
             self.integrator.ensemble.verify(self.integrator)
-            x = positions_of(context)
-            _check_finite(x, velocities_of(context), step, self.rows.n_rows > 0)
+            now = context.getState(positions=True, velocities=True)
+            x = np.asarray(now.getPositions(asNumpy=True)._value)
+            _check_finite(x, np.asarray(now.getVelocities(asNumpy=True)._value), step, self.rows.n_rows > 0)
             self.check_rows(x, step)
         except (ConvergenceError, NonFiniteError):
             self.put_back()
             raise
-        self._remember()
+        self._remember(now)
 
-    def _remember(self) -> None:
+    def _remember(self, now: openmm.State) -> None:
         self.since_check = 0
-        self._good = self.context.getState(positions=True, velocities=True)
+        self._good = now
 
     def put_back(self) -> None:
         """The state that was checked last."""

@@ -181,11 +181,13 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
             guard.begin()
         if self._plan.kept and guard.surroundings_changed():
             self.refresh()
+        guard.meet_others()
         while steps > 0:
             block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
             self._run_block(guard, block)
             guard.count(block)
             steps -= block
+        guard.leave()
         if self._plan.kept:
             guard.note_surroundings()
 

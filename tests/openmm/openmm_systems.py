@@ -92,6 +92,21 @@ def dumbbell(length=0.1, masses=(12.0, 1.0), stiffness=50.0):
     return system, x, v
 
 
+def hexagon(rows):
+    """Planar six-ring held by some of its 15 distances."""
+    angles = np.arange(6) * np.pi / 3
+    x = 0.14 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    pairs = sorted(
+        ((i, j) for i in range(6) for j in range(i)), key=lambda ij: np.linalg.norm(x[ij[0]] - x[ij[1]]).round(6)
+    )
+    system = openmm.System()
+    for _ in x:
+        system.addParticle(12.0)
+    for i, j in pairs[:rows]:
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    return system, x
+
+
 def water_box(n=27, spacing=0.31, exact=False):
     """Flexible-free TIP3P on a lattice in a periodic box, with reaction field; exact: lengths that a float holds."""
     system = openmm.System()

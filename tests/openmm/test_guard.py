@@ -10,6 +10,7 @@ from openmm_systems import (
     PLATFORMS,
     alanine,
     dumbbell,
+    hexagon,
     holding,
     loose_alanine,
     residuals,
@@ -120,21 +121,6 @@ def test_nan_at_the_start():
 
 
 # -- checks during a run ----------------------------------------------------------------------------
-
-
-def hexagon(rows):
-    """Planar six-ring held by some of its 15 distances."""
-    angles = np.arange(6) * np.pi / 3
-    x = 0.14 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-    pairs = sorted(
-        ((i, j) for i in range(6) for j in range(i)), key=lambda ij: np.linalg.norm(x[ij[0]] - x[ij[1]]).round(6)
-    )
-    system = openmm.System()
-    for _ in x:
-        system.addParticle(12.0)
-    for i, j in pairs[:rows]:
-        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
-    return system, x
 
 
 @platforms

@@ -1,0 +1,441 @@
+"""RattleIntegrator: compiled leapfrog steps between two ends are RATTLE."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import (
+    DATA,
+    PLATFORMS,
+    alanine,
+    context_of,
+    dumbbell,
+    hexagon,
+    masses_of,
+    potential_energy,
+    residuals,
+    started,
+    state_of,
+    total_energy,
+    water_box,
+)
+
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator
+
+platforms = pytest.mark.parametrize("platform", PLATFORMS)
+
+
+def both(system, x, v, platform="Reference", **arguments):
+    """Context and integrator of each kind."""
+    made = [kind(1e-3, tolerance=1e-12, **arguments) for kind in (RattleIntegrator, ProjectedIntegrator)]
+    return [(started(system, integrator, x, v, platform), integrator) for integrator in made]
+
+
+def assert_same(ours, theirs, x_within, v_within):
+    (x, v), (y, w) = state_of(ours), state_of(theirs)
+    np.testing.assert_allclose(x, y, rtol=0, atol=x_within)
+    np.testing.assert_allclose(v, w, rtol=0, atol=v_within)
+
+
+# -- the motion -------------------------------------------------------------------------------------
+
+
+@platforms
+def test_same_motion_as_the_program(platform):
+    system, x, v = alanine()
+    (ours, compiled), (theirs, program) = both(system, x, v, platform)
+    for steps in (1, 2, 3, 14):
+        compiled.step(steps)
+        program.step(steps)
+    # The CPU platform has forces in single precision, which differ from run to run in the order of sums.
+    exact = platform == "Reference"
+    assert_same(ours, theirs, 1e-12 if exact else 1e-7, 1e-10 if exact else 1e-4)
+    assert ours.getStepCount() == 20
+    assert ours.getTime() / unit.picosecond == pytest.approx(0.02, rel=1e-12)
+    assert residuals(system, ours)[1] < 1e-11
+
+
+def test_calls_do_not_change_a_bit():
+    system, x, v = alanine()
+    ends = []
+    for calls in ([40], [3, 7, 10, 20], [20, 5, 15]):
+        context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+        for steps in calls:
+            integrator.step(steps)
+        ends.append(state_of(context))
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[0], ends[2])
+
+
+def test_checks_do_not_change_a_bit():
+    system, x, v = alanine()
+    ends = []
+    for check_every in (0, 7):
+        context = started(system, integrator := RattleIntegrator(1e-3, check_every=check_every), x, v)
+        integrator.step(35)
+        ends.append(state_of(context))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_order_two():
+    system, x, v = dumbbell()
+    context = started(system, fine := ProjectedIntegrator(1e-4, "blanes-moan6", tolerance=1e-14), x, v)
+    fine.step(640)
+    true, errors = state_of(context), []
+    for dt in (4e-3, 2e-3, 1e-3):
+        context = started(system, integrator := RattleIntegrator(dt, tolerance=1e-14), x, v)
+        integrator.step(round(0.064 / dt))
+        found = state_of(context)
+        errors.append([np.abs(found[k] - true[k]).max() for k in (0, 1)])
+    slopes = np.diff(np.log2(errors), axis=0)
+    np.testing.assert_allclose(slopes, -2, atol=0.1)
+
+
+def test_reversible():
+    system, x, v = alanine()
+    context = started(system, integrator := RattleIntegrator(1e-3, tolerance=1e-14), x, v)
+    integrator.applyVelocityConstraints(context, 1e-14)
+    before = state_of(context)
+    integrator.step(20)
+    there = state_of(context)
+    context.setVelocities(-there[1])
+    integrator.step(20)
+    back = state_of(context)
+    assert np.abs(there[0] - before[0]).max() > 1e-3
+    np.testing.assert_allclose(back[0], before[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(-back[1], before[1], rtol=0, atol=1e-10)
+
+
+def test_kinetic_energy_is_that_of_the_velocities():
+    system, x, v = alanine()
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    integrator.step(10)
+    speeds = state_of(context)[1]
+    kinetic = 0.5 * masses_of(system) @ np.einsum("ij,ij->i", speeds, speeds)
+    assert total_energy(context) - potential_energy(context) == pytest.approx(kinetic, rel=1e-12)
+    assert integrator.kinetic_energy() / unit.kilojoule_per_mole == pytest.approx(kinetic, rel=1e-12)
+
+
+def test_force_evaluations():
+    """One a step, one more a call; and one more for a start, or where somebody has changed something."""
+    system, x, v = dumbbell()
+    calls = []
+
+    def spring(state):
+        calls.append(1)
+        return 0.0, np.zeros((2, 3))
+
+    system.addForce(openmm.PythonForce(spring))
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    counts = []
+    for change in (False, False, True):
+        if change:
+            context.setVelocities(v)
+        calls.clear()
+        integrator.step(10)
+        counts.append(len(calls))
+    assert counts == [12, 11, 12]
+
+
+# -- what others change between calls ----------------------------------------------------------------
+
+
+def _warmer(context, integrator):
+    context.setVelocities(1.1 * state_of(context)[1])
+
+
+def _elsewhere(context, integrator):
+    context.setPositions(state_of(context)[0] + np.array([0.05, 0.0, 0.1]))
+
+
+def _stronger(context, integrator):
+    context.setParameter("k", 90.0)
+
+
+def _finer(context, integrator):
+    integrator.setStepSize(0.0005)
+
+
+def _updated(context, integrator):
+    force = next(f for f in context.getSystem().getForces() if isinstance(f, openmm.CustomBondForce))
+    force.setBondParameters(0, 0, 1, [4.0])
+    force.updateParametersInContext(context)
+    integrator.refresh()
+
+
+@pytest.mark.parametrize("change", [_warmer, _elsewhere, _stronger, _finer, _updated])
+def test_changes_between_calls(change):
+    ends = []
+    for kind in (RattleIntegrator, ProjectedIntegrator):
+        system, x, v = dumbbell()
+        pull = openmm.CustomBondForce("s*r")
+        pull.addPerBondParameter("s")
+        pull.addBond(0, 1, [1.0])
+        system.addForce(pull)
+        context = started(system, integrator := kind(1e-3, tolerance=1e-13), x, v)
+        integrator.step(10)
+        change(context, integrator)
+        integrator.step(10)
+        ends.append(state_of(context))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", [RattleIntegrator, ProjectedIntegrator])
+def test_change_of_the_box(kind):
+    """OpenMM keeps the forces of a CustomIntegrator when the box is changed; `step` sees that."""
+    system, x = water_box(27)
+    wider = 1.02 * np.array([row._value for row in system.getDefaultPeriodicBoxVectors()])
+    context = started(system, integrator := kind(1e-3, tolerance=1e-12), x, np.zeros_like(x))
+    integrator.step(5)
+    context.setPeriodicBoxVectors(*wider)
+    fresh = context_of(system, other := kind(1e-3, tolerance=1e-12))
+    fresh.setPeriodicBoxVectors(*wider)
+    fresh.setPositions(state_of(context)[0])
+    fresh.setVelocities(state_of(context)[1])
+    integrator.step(5)
+    other.step(5)
+    assert_same(context, fresh, 1e-7, 1e-4)  # SETTLE has lengths in single precision
+
+
+def test_barostat_and_centre_of_mass():
+    system, x = water_box(64)
+    system.addForce(openmm.MonteCarloBarostat(1.0, 300.0, 2))
+    system.addForce(openmm.CMMotionRemover(1))
+    integrator = RattleIntegrator(1e-3)
+    context = started(system, integrator, x)
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    volumes = set()
+    for _ in range(20):
+        integrator.step(4)
+        volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
+        assert residuals(system, context)[0] < 1e-7
+    assert len(volumes) > 5
+    assert np.abs(masses_of(system) @ state_of(context)[1]).max() < 1e-6
+    assert integrator.degrees_of_freedom() == 64 * 6 - 3
+
+
+def test_andersen_thermostat_acts_on_velocities_at_x():
+    """Leapfrog steps would give it those of half a step before: then there are none."""
+    system, x, v = dumbbell()
+    calls = []
+
+    def nothing(state):
+        calls.append(1)
+        return 0.0, np.zeros((2, 3))
+
+    system.addForce(openmm.PythonForce(nothing))
+    system.addForce(openmm.AndersenThermostat(300.0, 50.0))
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    integrator.step(10)
+    calls.clear()
+    integrator.step(10)
+    assert len(calls) == 10
+    assert residuals(system, context)[1] < 1e-9
+
+
+def test_steps_without_python():
+    """What OpenMM makes of it where Python is not asked is RATTLE as well."""
+    system, x, v = alanine()
+    (ours, compiled), (theirs, program) = both(system, x, v)
+    openmm.CompoundIntegrator.step(compiled, 10)
+    program.step(10)
+    np.testing.assert_array_equal(state_of(ours), state_of(theirs))
+
+
+# -- failures ----------------------------------------------------------------------------------------
+
+
+def test_start_off_the_constraints_is_refused():
+    system, x, v = alanine()
+    x = x.copy()
+    x[4] += 0.01
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimise"):
+        integrator.step(5)
+    np.testing.assert_array_equal(state_of(context), [x, v])
+
+
+@platforms
+@pytest.mark.parametrize(("rows", "error"), [(9, ConvergenceError), (12, NonFiniteError)])
+def test_solvers_that_do_not_converge_are_found(rows, error, platform):
+    """A planar ring by many of its distances breaks OpenMM's solver, which says nothing."""
+    system, x = hexagon(rows)
+    v = np.random.default_rng(0).normal(size=x.shape)
+    integrator = RattleIntegrator(2e-3, check_every=5)
+    context = started(system, integrator, x, v, platform)
+    with pytest.raises(error) as caught:
+        integrator.step(100)
+    assert np.isfinite(state_of(context)).all()
+    assert context.getStepCount() % 5 == 0
+    assert "hand them over" in str(caught.value)
+    if rows == 9:
+        assert residuals(system, context)[0] <= 2.1e-10
+        assert caught.value.step == context.getStepCount() + 5
+
+
+@platforms
+def test_explosion_puts_back_what_was_checked_last(platform):
+    system = openmm.System()
+    well = openmm.CustomExternalForce("k*x^4")
+    well.addGlobalParameter("k", 1.0)
+    well.addParticle(system.addParticle(1.0), [])
+    system.addForce(well)
+    integrator = RattleIntegrator(1e-3, check_every=10)
+    context = started(system, integrator, [[1.0, 0, 0]], [[0.5, 0, 0]], platform)
+    integrator.step(20)
+    good = state_of(context)
+    context.setParameter("k", 1e12)
+    with pytest.raises(NonFiniteError):
+        integrator.step(1000)
+    np.testing.assert_array_equal(state_of(context), good)
+    assert context.getStepCount() == 20
+    assert context.getTime() / unit.picosecond == pytest.approx(0.02)
+    context.setParameter("k", 1.0)
+    integrator.step(10)
+    other = started(
+        system, untroubled := RattleIntegrator(1e-3, check_every=10), [[1.0, 0, 0]], [[0.5, 0, 0]], platform
+    )
+    untroubled.step(30)
+    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
+
+
+def test_what_cannot_be_propagated_is_refused():
+    system = openmm.System()
+    for m in (16.0, 1.0, 1.0, 0.0):
+        system.addParticle(m)
+    system.setVirtualSite(3, openmm.ThreeParticleAverageSite(0, 1, 2, 0.8, 0.1, 0.1))
+    integrator = RattleIntegrator(1e-3)
+    context = started(system, integrator, np.eye(4, 3))
+    with pytest.raises(UnsupportedError, match="virtual"):
+        integrator.step(5)
+    assert context.getStepCount() == 0
+
+
+def test_arguments():
+    assert RattleIntegrator(2 * unit.femtoseconds).getStepSize() == 0.002 * unit.picosecond
+    integrator = RattleIntegrator(0.002)
+    assert integrator.getConstraintTolerance() == 1e-10 and integrator.check_every == 1000
+    assert repr(integrator) == "<RattleIntegrator: 2 fs>"
+    for bad in (0, -0.001, np.nan):
+        with pytest.raises(InputError, match="positive"):
+            RattleIntegrator(bad)
+        with pytest.raises(InputError, match="positive"):
+            integrator.setStepSize(bad)
+    with pytest.raises(InputError, match="tolerance"):
+        integrator.setConstraintTolerance(0.0)
+    with pytest.raises(InputError, match="check_every"):
+        RattleIntegrator(0.001, check_every=-1)
+    with pytest.raises(UnsupportedError, match="ProjectedIntegrator"):
+        integrator.addIntegrator(openmm.VerletIntegrator(0.001))
+    with pytest.raises(UnsupportedError, match="ProjectedIntegrator"):
+        integrator.setCurrentIntegrator(1)
+    with pytest.raises(UnsupportedError, match="belongs to no Context"):
+        integrator.step(1)
+    integrator.setConstraintTolerance(1e-7)
+    assert integrator._verlet.getConstraintTolerance() == 1e-7
+
+
+# -- a citizen of OpenMM ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pickle.loads(pickle.dumps(i))])
+def test_copies(how):
+    system, x, v = alanine()
+    first = RattleIntegrator(1e-3, tolerance=1e-9, check_every=50)
+    first.setIntegrationForceGroups({0, 1})
+    second = how(first)
+    assert second.getStepSize() == first.getStepSize()
+    assert (second.getConstraintTolerance(), second.check_every) == (1e-9, 50)
+    assert second.getIntegrationForceGroups() == first.getIntegrationForceGroups() == 3
+    contexts = [started(system, integrator, x, v) for integrator in (first, second)]
+    first.step(10)
+    second.step(10)
+    np.testing.assert_array_equal(*map(state_of, contexts))
+
+
+def test_force_groups():
+    system, x, v = dumbbell()
+    for group, strength in ((1, 30.0), (2, 5.0)):
+        extra = openmm.CustomBondForce(f"{strength}*r")
+        extra.addBond(0, 1, [])
+        extra.setForceGroup(group)
+        system.addForce(extra)
+    field = openmm.CustomExternalForce("9*x")
+    field.addParticle(0, [])
+    field.setForceGroup(3)
+    system.addForce(field)
+    (ours, compiled), (theirs, program) = both(system, x, v)
+    del ours, theirs
+    ends = []
+    for made in (compiled, program):
+        fresh = copy.copy(made)
+        fresh.setIntegrationForceGroups({0, 1, 2})
+        context = started(system, fresh, x, v)
+        fresh.step(10)
+        ends.append(state_of(context))
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-11)
+    with pytest.raises(UnsupportedError, match="before it is created"):
+        fresh.setIntegrationForceGroups({0})
+
+
+def test_restart(tmp_path):
+    """A checkpoint has the velocities before the last half kick; a state file goes on from those at x."""
+    system, x, v = alanine()
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    integrator.step(10)
+    mark = context.createCheckpoint()
+    saved = openmm.XmlSerializer.serialize(context.getState(positions=True, velocities=True))
+    integrator.step(10)
+    there = state_of(context)
+    context.loadCheckpoint(mark)
+    integrator.step(10)
+    np.testing.assert_array_equal(state_of(context), there)
+    other = started(system, again := RattleIntegrator(1e-3), x)
+    other.setState(openmm.XmlSerializer.deserialize(saved))
+    again.step(10)
+    np.testing.assert_allclose(state_of(other)[0], there[0], rtol=0, atol=1e-10)
+
+
+def test_reporters():
+    system, _, _ = alanine()
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    integrator = RattleIntegrator(1 * unit.femtosecond)
+    made = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    made.context.setPositions(pdb.positions)
+    made.minimizeEnergy(maxIterations=20)
+    integrator.setVelocitiesToTemperature(made.context, 300 * unit.kelvin, 2)
+    table = io.StringIO()
+    made.reporters.append(
+        app.StateDataReporter(table, 5, step=True, time=True, temperature=True, kineticEnergy=True, totalEnergy=True)
+    )
+    made.step(20)
+    rows = [[float(word) for word in line.split(",")] for line in table.getvalue().splitlines()[1:]]
+    assert [row[0] for row in rows] == [5, 10, 15, 20]
+    gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+    kinetic = np.array([row[2] for row in rows])
+    np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
+
+
+def test_steps_of_others_in_a_compound():
+    """OpenMM keeps the forces of a CustomIntegrator while another integrator moves x; `step` sees that."""
+    system, x, v = alanine()
+    compound, ours, other = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3), openmm.VerletIntegrator(1e-3)
+    other.setConstraintTolerance(1e-10)
+    compound.addIntegrator(ours)
+    compound.addIntegrator(other)
+    context = started(system, compound, x, v)
+    ours.step(2)
+    other.step(5)
+    fresh = started(system, alone := ProjectedIntegrator(1e-3), *state_of(context))
+    ours.step(1)
+    alone.step(1)
+    np.testing.assert_allclose(state_of(context)[0], state_of(fresh)[0], rtol=0, atol=1e-8)
