@@ -31,8 +31,9 @@ TEMPERATURE, COLLISIONS = 300.0, 1.0
 
 #: A run is watched at about so many times.
 RECORDS = 12
-#: Steps are timed in blocks of this many seconds and at most so many steps.
-BLOCK_SECONDS, BLOCK_STEPS = 0.01, 2000
+#: Steps that take less than this are timed in blocks: of so many seconds, and of so few and so many steps. A call of
+#: `step` has costs of its own, which those who make a million steps do not see.
+SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.01, 0.05, (100, 2000)
 BLOCKS = 3
 
 HALF_STEP = (
@@ -126,12 +127,12 @@ class _HostRun(Run):
         return self._done * self._evaluations
 
     def own_step_seconds(self) -> float | None:
-        if not self.finished or self._spent > BLOCK_SECONDS * self._planned:
+        if not self.finished or self._spent > SHORT_STEP * self._planned:
             return None
         self._end = self._state()
         if not np.isfinite(self._end[0]).all():
             return None
-        size = int(np.clip(BLOCK_SECONDS * self._planned / self._spent, 1, BLOCK_STEPS))
+        size = int(np.clip(BLOCK_SECONDS * self._planned / self._spent, *BLOCK_STEPS))
         found = []
         try:
             for _ in range(BLOCKS):
