@@ -14,7 +14,7 @@ from openmm import unit
 
 from kcons.errors import UnsupportedError
 from kcons.openmm.copies import settings_of
-from kcons.openmm.guard import Guard
+from kcons.openmm.guard import Guard, velocities_of
 from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.projected import ProjectedIntegrator
 
@@ -31,26 +31,14 @@ class EndWriter(LeanStepWriter):
     def write(self) -> None:
         p = self.program
         p.number("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
-        p.number("moved", "how far others have moved x or v since leapfrog steps ended")
-        p.vector("raw", "v of the last leapfrog step")
-        p.vector("x_last", "x where leapfrog steps ended")
-        p.vector("v_last", "v where leapfrog steps ended")
-        p.number("known", "1 where raw belongs to x_last and v_last")
         with p.when("end = 0", "a step"):
             super().write()
         with p.when("end = 1", "leapfrog steps follow"):
-            p.sum("moved", "(x-x_last)^2+(v-v_last)^2", "by whom ever")
-            with p.when("moved+(1-known) != 0", "then v is what it is"):
-                p.each("raw", "v-0.5*dt*f/m", "half a kick back")
-            p.each("v", "raw", "as if nobody had looked")
+            p.each("v", "v-0.5*dt*f/m", "half a kick back")
         with p.when("end = 2", "leapfrog steps were made"):
-            p.each("raw", "v", "to go on from")
             p.each("x", "x", "tells OpenMM that forces are old")
             p.each("v", "v+0.5*dt*f/m", "the applied forces act (half a kick)")
             p.hold_velocities("tangent to the constraints of the System")
-            p.each("x_last", "x", "to see whether others change it")
-            p.each("v_last", "v", "to see whether others change it")
-            p.let("known", "1", "raw belongs to them")
 
 
 class Ends(ProjectedIntegrator):
@@ -65,11 +53,6 @@ class Ends(ProjectedIntegrator):
             openmm.CustomIntegrator.step(self, 1)
         finally:
             self.setGlobalVariableByName("end", _STEP)
-
-    def refresh(self) -> None:
-        """Forget the velocities of the last leapfrog step: forces are no longer those that they lack."""
-        super().refresh()
-        self.setGlobalVariableByName("known", 0.0)
 
 
 class RattleIntegrator(openmm.CompoundIntegrator):
@@ -100,9 +83,9 @@ class RattleIntegrator(openmm.CompoundIntegrator):
     Notes
     -----
     K_{h/2} D_h (K_h D_h)^{n-1} K_{h/2} = K_{-h/2} (K_h D_h)^n K_{h/2}, where the leapfrog step K_h D_h is a kick and a
-    drift along the constraints (Andersen, J. Comput. Phys. 52, 24 (1983)). The velocities before the last half kick are
-    kept, and the next call goes on from there unless somebody has changed x or v: into how many calls steps are divided
-    does not change a bit of the motion, as long as none has fewer than three.
+    drift along the constraints (Andersen, J. Comput. Phys. 52, 24 (1983)). What the projection at the end takes out of
+    v lies along gradients at x, where the next drift absorbs it: into how many calls steps are divided does not change
+    the motion, up to rounding.
 
     An AndersenThermostat draws velocities between steps; with one, all steps are those of ProjectedIntegrator.
     """
@@ -149,8 +132,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         guard = ends._watch()
         if not guard.started:
             guard.begin()
-        if guard.surroundings_changed():
-            ends.refresh()
         guard.meet_others()
         while steps > 0:
             block = min(steps, ends.check_every - guard.since_check) if ends.check_every else steps
@@ -161,7 +142,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
             guard.count(block)
             steps -= block
         guard.leave()
-        guard.note_surroundings()
 
     def _leap(self, guard: Guard, steps: int) -> None:
         context = guard.context
@@ -180,8 +160,9 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         context.setStepCount(first + steps)
 
     def refresh(self) -> None:
-        """Compute the forces anew: to be called after `updateParametersInContext`, which cannot be seen from here."""
-        self._ends.refresh()
+        """Compute the forces anew at the next step: to be called after `updateParametersInContext`."""
+        context = self.context
+        context.setVelocities(velocities_of(context))
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System and its constraints, at the present state.
@@ -250,7 +231,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         """
         self._ends.setStepSize(size)
         self._verlet.setStepSize(self._dt)
-        self.refresh()
 
     def setConstraintTolerance(self, tol: float) -> None:
         """Change the relative tolerance of the System's constraints.

@@ -39,7 +39,6 @@ RUN_STATE = frozenset(
         "kick",
         "growth",
         "lost",
-        "known",
         "end",
     ]
 )
