@@ -14,34 +14,25 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
-from kcons.steppers.splitting import Stage
-from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
-from kcons.steppers.summation import Point
 from kcons.thermostats import kick as closed_form
 from kcons.thermostats.freedom import (
     Freedom,
     Momentum,
-    atom_numbers,
     carried,
     freedom,
     positive,
     warn_of_conserved_momenta,
 )
+from kcons.thermostats.isokinetic_step import SMALLEST, IsokineticStep, Share, left_for, split
 
 Convention = Literal["exact", "notes"]
 
-#: Kinetic energy below which v.f/2K may overflow.
-SMALLEST = 1e-290
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
 ROUNDING = 1e-12
-#: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
-MANY = 1e4
-_MAX_ITERATIONS = 50
 
 _S6 = (0.0792036964311957, 0.353172906049774, -0.0420650803577195)
 _S6_OTHER = (0.209515106613362, -0.143851773179818)
@@ -149,7 +140,7 @@ class Isokinetic(Splitting):
         self.convention: Convention = convention
         self.atoms = None if atoms is None else np.asarray(atoms)
         self.momentum: Momentum = momentum
-        self._shares: tuple[System, _Share] | None = None
+        self._shares: tuple[System, Share] | None = None
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -198,7 +189,7 @@ class Isokinetic(Splitting):
             return state
         state = system.with_forces(state)
         assert state.forces is not None
-        drive, rest = _split(system, state.positions, state.velocities, state.time)
+        drive, rest = split(system, state.positions, state.velocities, state.time)
         driven = 0.0 if drive is None else share.square(drive)
         found = share.square(rest) + driven
         if not found > SMALLEST:
@@ -217,12 +208,12 @@ class Isokinetic(Splitting):
         if off <= ROUNDING * float(np.abs(velocities).max()) and abs(found - twice) <= ROUNDING * twice:
             velocities = state.velocities
         else:
-            rest = share.scaled(rest, _left(twice, driven, state.step))
+            rest = share.scaled(rest, left_for(twice, driven, state.step))
             velocities = rest if drive is None else drive + rest
         variables = np.array([twice, 0.0, share.push_square(system, state), free.count])
         return replace(state, velocities=velocities, thermostat=variables)
 
-    def _twice_kinetic(self, share: _Share, free: Freedom, found: float) -> float:
+    def _twice_kinetic(self, share: Share, free: Freedom, found: float) -> float:
         if self.kinetic_energy is not None:
             return 2 * self.kinetic_energy
         if self.thermal_energy is None:
@@ -236,10 +227,10 @@ class Isokinetic(Splitting):
             )
         return (free.count - 1) * self.thermal_energy
 
-    def _share(self, system: System) -> _Share:
+    def _share(self, system: System) -> Share:
         known = self._shares
         if known is None or known[0] is not system:
-            known = self._shares = (system, _Share(system, self.atoms))
+            known = self._shares = (system, Share(system, self.atoms))
         return known[1]
 
     def step(self, system: System, state: State, dt: float) -> State:
@@ -255,7 +246,7 @@ class Isokinetic(Splitting):
             return still
         begin = self.start(system, state)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
-            run = _Step(system, self._share(system), begin, dt)
+            run = IsokineticStep(system, self._share(system), begin, dt)
             try:
                 return run.through(self.kicks, self._stages)
             except ConvergenceError as error:
@@ -268,7 +259,7 @@ class Isokinetic(Splitting):
         state = self.start(system, state)
         assert state.forces is not None
         share = self._share(system)
-        rest = _split(system, state.positions, state.velocities, state.time)[1]
+        rest = split(system, state.positions, state.velocities, state.time)[1]
         return float(closed_form.raw_sums(rest, state.forces, system.weights, share.masses)[0]) / share.square(rest)
 
     def compression_rate(self, system: System, state: State) -> float:
@@ -286,234 +277,3 @@ class Isokinetic(Splitting):
         assert state.thermostat is not None
         potential = system.total_energy(state) - system.kinetic_energy(state.velocities)
         return potential + float(state.thermostat[0] * state.thermostat[1])
-
-
-def _split(system: System, x: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray | None, FloatArray]:
-    """v, projected, as the slowest velocities that the targets demand (None where they rest) and the rest."""
-    motion = system.motion
-    whole = motion.project_velocities(x, v, time=time)
-    if not motion.plan.driven:
-        return None, whole
-    drive = motion.project_velocities(x, np.zeros_like(v), time=time)
-    return drive, whole - drive
-
-
-def _left(twice: float, driven: float, step: int) -> float:
-    """What moving targets leave of 2K."""
-    left = twice - driven
-    if not left > SMALLEST:
-        raise InputError(
-            f"moving targets alone have more kinetic energy than the thermostat allows at step {step}: raise the "
-            "temperature, or move them slower",
-            item="kinetic_energy",
-        )
-    return left
-
-
-class _Share:
-    """The thermostatted atoms."""
-
-    def __init__(self, system: System, atoms: ArrayLike | None) -> None:
-        inside = system.inverse_masses[:, 0] > 0
-        if atoms is not None:
-            chosen = np.zeros(system.n_atoms, dtype=bool)
-            chosen[atom_numbers(atoms, system.n_atoms)] = True
-            inside = inside & chosen
-        self.n_moving = int(inside.sum())
-        #: Masses of the thermostatted atoms for each coordinate; 0 for the others.
-        self.masses: FloatArray = np.repeat(np.where(inside, system.masses, 0.0)[:, None], 3, axis=1)
-        #: Coordinates of other atoms that move, None if there are none.
-        others = (self.masses == 0) & (system.weights > 0)
-        self.others = others if others.any() else None
-
-    def square(self, v: FloatArray) -> float:
-        """v^T M v."""
-        return float(closed_form.square_sum(v, self.masses))
-
-    def scaled(self, v: FloatArray, square: float) -> FloatArray:
-        """v with the length that v^T M v = `square` demands, other atoms as they are."""
-        has = self.square(v)
-        factor = math.sqrt(square / has) if has > 0 else math.nan
-        return np.where(self.masses > 0, v * factor, v)
-
-    def push_square(self, system: System, state: State) -> float:
-        """f . M_par^+ f at the state."""
-        assert state.forces is not None
-        x = state.positions
-        if state.remainder is not None:
-            x = (x - x[system.anchor]) + state.remainder
-        pace = paced(system, x, state.forces, state.time)
-        return float(closed_form.square_sum(pace, self.masses))
-
-
-def paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
-    """M_par^+ f."""
-    with np.errstate(over="ignore"):  # velocities are checked
-        return _paced(system, x, forces, time)
-
-
-def _paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> FloatArray:
-    motion = system.motion
-    if motion.plan.driven:
-        return np.asarray(motion.project_forces(x, forces, time=time) * system.inverse_masses)
-    pace = forces * system.weights
-    return motion.project_velocities(x, pace, time=time, out=pace) if motion.rank else pace
-
-
-class _Step:
-    """The arrays of one step on its way: velocities v = drive + u, the drive None where targets rest."""
-
-    def __init__(self, system: System, share: _Share, start: State, dt: float) -> None:
-        assert start.thermostat is not None and start.forces is not None
-        self.system, self.share, self.dt = system, share, dt
-        self.begin = start
-        self.number = start.step + 1
-        self.time, self.time_remainder = start.later(dt)
-        self.now = start.time
-        self.shift = None
-        x = start.positions
-        if start.remainder is not None:
-            self.shift = x[system.anchor]
-            x = (x - self.shift) + start.remainder
-        self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
-        self.x = x
-        self.forces = start.forces
-        self.drive: FloatArray | None = None
-        self.u = start.velocities
-        self.left = self.twice
-        if system.motion.plan.driven:
-            self.drive, self.u = _split(system, x, start.velocities, self.now)
-            self._settle()
-
-    def through(self, kicks: tuple[float, ...], stages: list[Stage]) -> State:
-        self.first_kick(kicks[0] * self.dt)
-        for fraction, stage in zip(kicks[1:], stages, strict=True):
-            if self.drive is None:
-                self.drift(stage)
-            else:
-                for piece in zip(stage.fractions, stage.ends, strict=True):
-                    self.driven_drift(piece)
-            if self.system.force is not None:
-                self.forces = self.system.forces(self.positions, self.velocities, self.now, self.number)
-            self.kick(fraction * self.dt)
-        v = self.velocities
-        check_finite(v, "velocity", self.number)
-        positions, remainder = self.positions, None
-        if self.shift is not None:
-            remainder = self.x - (positions - self.shift)
-        thermostat = np.array([self.twice, self.integral, self.push_square, self.count])
-        return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder, thermostat)
-
-    @property
-    def positions(self) -> FloatArray:
-        return self.x if self.shift is None else self.x + self.shift
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self.u if self.drive is None else self.drive + self.u
-
-    def _settle(self) -> None:
-        """How long u must be."""
-        assert self.drive is not None
-        self.left = _left(self.twice, self.share.square(self.drive), self.number)
-
-    # -- kicks ----------------------------------------------------------------------------------
-
-    def first_kick(self, t: float) -> None:
-        """The kick before the first drift, which takes out what the forces would do across the constraints."""
-        system, share = self.system, self.share
-        if system.force is None:
-            return
-        u = np.empty_like(self.u)
-        log_growth, done = closed_form.before_drift(
-            self.u, self.forces, system.weights, share.masses, self.push_square, self.left, t, MANY, u
-        )
-        if not done:
-            self.kick(t)
-            return
-        if share.others is not None:
-            u = np.where(share.others, self.u + t * system.weights * self.forces, u)
-        self.u = u
-        self.integral += log_growth
-
-    def kick(self, t: float) -> None:
-        """Bring u, projected, to its length, and follow the closed form."""
-        system, share = self.system, self.share
-        if system.force is None:
-            factor = math.sqrt(self.left / share.square(self.u))
-            self.u = self.u * factor if share.others is None else np.where(share.others, self.u, self.u * factor)
-            self.integral -= math.log(factor)
-            return
-        pace = _paced(system, self.x, self.forces, self.now)
-        u = np.empty_like(pace)
-        self.push_square, factor, log_growth, done = closed_form.after_drift(
-            self.u, pace, share.masses, self.left, t, u
-        )
-        self.integral += log_growth
-        if not done:
-            self._turn(pace, factor, t)
-            return
-        if share.others is not None:
-            u = np.where(share.others, self.u + t * pace, u)
-        self.u = u
-
-    def _turn(self, pace: FloatArray, factor: float, t: float) -> None:
-        share = self.share
-        u, growth = closed_form.turned(factor * self.u, pace, share.masses, self.left, t)
-        if share.others is not None:
-            u = np.where(share.others, self.u + t * pace, u)
-        self.u = u
-        self.integral += growth
-
-    # -- drifts ---------------------------------------------------------------------------------
-
-    def drift(self, stage: Stage) -> None:
-        system = self.system
-        point = Point(self.x, self.u, system.weights, exact=len(stage.ends) > 1)
-        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
-            then, self.now = self.now, self._time_at(end)
-            system.drift.move(point, np.empty_like(self.x), then, self.now, fraction * self.dt)
-        point.land()
-        check_finite(point.x, "position", self.number)
-        self.x = point.x
-        self.u = system.motion.project_velocities(self.x, point.v, time=self.now, out=point.v)
-
-    def driven_drift(self, piece: tuple[float, float]) -> None:
-        """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
-
-        So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
-        """
-        system, share = self.system, self.share
-        assert self.drive is not None
-        fraction, end = piece
-        then, now = self.now, self._time_at(end)
-        log_factor, last = 0.0, math.inf
-        for _ in range(_MAX_ITERATIONS):
-            point = Point(self.x, self.drive + self._times(math.exp(log_factor), self.u), system.weights, exact=False)
-            system.drift.move(point, np.empty_like(self.x), then, now, fraction * self.dt)
-            check_finite(point.x, "position", self.number)
-            drive, u = _split(system, point.x, point.v, now)
-            assert drive is not None
-            left = _left(self.twice, share.square(drive), self.number)
-            u = self._times(math.exp(log_factor), u)
-            miss = 0.5 * math.log(left / share.square(u))
-            if abs(miss) <= 1e-15 or (abs(miss) < 1e-12 and abs(miss) >= last):
-                break
-            last = abs(miss)
-            log_factor += 0.5 * miss
-        else:
-            raise ConvergenceError(
-                "kinetic energy and moving targets cannot be kept together; time step too large",
-                residual=last,
-                tolerance=1e-12,
-                iterations=_MAX_ITERATIONS,
-            )
-        self.x, self.now, self.drive, self.u, self.left = point.x, now, drive, u, left
-        self.integral -= 2 * log_factor
-
-    def _times(self, factor: float, u: FloatArray) -> FloatArray:
-        return u * factor if self.share.others is None else np.where(self.share.others, u, u * factor)
-
-    def _time_at(self, end: float) -> float:
-        start = self.begin
-        return self.time if end == 1.0 else start.time + (end * self.dt + start.time_remainder)
