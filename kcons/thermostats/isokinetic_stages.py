@@ -13,7 +13,6 @@ from typing import Any
 import numba
 import numpy as np
 
-from kcons.arrays import as_array
 from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS
 from kcons.plan import DistanceClusters
@@ -49,10 +48,10 @@ class IsokineticStages:
     def __init__(self, system: System, kind: int, tables: Tables, masses: FloatArray, others: bool) -> None:
         self._motion, self._shape = system.motion, (system.n_atoms, 3)
         self._before, self._after = _kernels(kind)
-        self._tables = tables
         self._atoms = system.weights, masses, others
+        self._solver = tables
         self._lattice: FloatArray | None = None
-        self._image = lattice_kind(None)
+        self._tables = (*self._atoms, *lattice_kind(None), *tables)
 
     @classmethod
     def of(cls, system: System, masses: FloatArray, others: bool) -> IsokineticStages | None:
@@ -68,14 +67,24 @@ class IsokineticStages:
         found = kind_and_tables(solver.solver) if type(solver) is DistanceClusters else None
         return None if found is None else cls(system, *found, masses, others)
 
-    def _cell(self) -> tuple[FloatArray, int]:
+    def tables(self) -> tuple[Any, ...]:
+        """What the kernels need to know, for one step: masses, the cell as it is now, the tables of the solver."""
         lattice = self._motion.lattice
         if lattice is not self._lattice:
-            self._lattice, self._image = lattice, lattice_kind(lattice)
-        return self._image
+            self._lattice = lattice
+            self._tables = (*self._atoms, *lattice_kind(lattice), *self._solver)
+        return self._tables
 
     def before(
-        self, x: FloatArray, u: FloatArray, f: FloatArray, square: float, twice: float, t: float, h: float
+        self,
+        x: FloatArray,
+        u: FloatArray,
+        f: FloatArray,
+        square: float,
+        twice: float,
+        t: float,
+        h: float,
+        tables: tuple[Any, ...],
     ) -> tuple[int, FloatArray, FloatArray, float]:
         """The kick over t before a flight over h, and the flight, which ends on the constraints.
 
@@ -85,6 +94,8 @@ class IsokineticStages:
             Positions, velocities on the constraints, forces.
         square, twice : float
             f.M_par^+ f and 2K.
+        tables : tuple
+            From `tables`, in this step.
 
         Returns
         -------
@@ -97,16 +108,13 @@ class IsokineticStages:
             The integral of alpha over the kick.
         """
         place, speed = np.empty(self._shape), np.empty(self._shape)
-        status, log_growth, iterations = self._before(
-            as_array(x, self._shape, "positions"), as_array(u, self._shape, "velocities"), f, square, twice, t, h,
-            speed, place, *self._atoms, *self._cell(), *self._tables,
-        )  # fmt: skip
+        status, log_growth, iterations = self._before(x, u, f, square, twice, t, h, speed, place, *tables)
         if status == DONE:
             self._motion.took(iterations)
         return status, place, speed, log_growth
 
     def after(
-        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float
+        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float, tables: tuple[Any, ...]
     ) -> tuple[int, FloatArray, FloatArray, float, float, float]:
         """Velocities and forces projected at x, and the kick over t.
 
@@ -116,6 +124,8 @@ class IsokineticStages:
             Positions; velocities, which are projected in place; forces.
         twice, t : float
             2K, and the time.
+        tables : tuple
+            From `tables`, in this step.
 
         Returns
         -------
@@ -128,9 +138,7 @@ class IsokineticStages:
             f.M_par^+ f, by what u is brought to its length, and the integral of alpha.
         """
         speed, pace = np.empty(self._shape), np.empty(self._shape)
-        status, square, factor, log_growth = self._after(
-            x, u, f, twice, t, speed, pace, *self._atoms, *self._cell(), *self._tables
-        )
+        status, square, factor, log_growth = self._after(x, u, f, twice, t, speed, pace, *tables)
         return status, speed, pace, square, factor, log_growth
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import as_array
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
@@ -112,13 +114,15 @@ class IsokineticStep:
     def __init__(self, system: System, share: Share, start: State, dt: float) -> None:
         assert start.thermostat is not None and start.forces is not None
         self.system, self.share, self.dt = system, share, dt
-        self.stages = share.stages
+        self.stages = share.stages if system.force is not None else None
+        self.tables: tuple[Any, ...] = () if self.stages is None else self.stages.tables()
         self.begin = start
         self.number = start.step + 1
         self.time, self.time_remainder = start.later(dt)
         self.now = start.time
         self.shift = None
-        x = start.positions
+        shape = system.n_atoms, 3
+        x = as_array(start.positions, shape, "positions")
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
@@ -126,17 +130,17 @@ class IsokineticStep:
         self.x = x
         self.forces = start.forces
         self.drive: FloatArray | None = None
-        self.u = start.velocities
+        self.u = as_array(start.velocities, shape, "velocities")
         self.left = self.twice
         if system.motion.plan.driven:
             self.drive, self.u = split(system, x, start.velocities, self.now)
             self._settle()
 
     def through(self, kicks: tuple[float, ...], stages: list[Stage]) -> State:
-        compiled = self.stages if self.system.force is not None else None
-        flown = (
-            compiled is not None and len(stages) == 1 and self._kick_and_fly(compiled, kicks[0] * self.dt, stages[0])
-        )
+        compiled = self.stages
+        flown = False
+        if compiled is not None and len(stages) == len(stages[0].fractions) == 1:
+            flown = self._kick_and_fly(compiled, kicks[0] * self.dt, stages[0])
         if not flown:
             self.first_kick(kicks[0] * self.dt)
         for fraction, stage in zip(kicks[1:], stages, strict=True):
@@ -244,11 +248,14 @@ class IsokineticStep:
         """The first kick and the only flight; whether they were done."""
         assert self.forces is not None
         h = stage.fractions[0] * self.dt
-        status, x, u, log_growth = stages.before(self.x, self.u, self.forces, self.push_square, self.left, t, h)
+        status, x, u, log_growth = stages.before(
+            self.x, self.u, self.forces, self.push_square, self.left, t, h, self.tables
+        )
         if status == KICK:
             return False
         self.now = self._time_at(stage.ends[0])
         if status == ENGINE:
+            check_finite(x, "position", self.number)
             self.system.motion.project_positions(x, self.x, time=self.now, velocities=u, dt=h, out=x)
         if status != DONE:
             check_finite(x, "position", self.number)
@@ -259,7 +266,9 @@ class IsokineticStep:
     def _project_and_kick(self, stages: IsokineticStages, t: float) -> bool:
         """What `project` and `kick` do; whether it was done."""
         assert self.forces is not None
-        status, u, pace, square, factor, log_growth = stages.after(self.x, self.u, self.forces, self.left, t)
+        status, u, pace, square, factor, log_growth = stages.after(
+            self.x, self.u, self.forces, self.left, t, self.tables
+        )
         if status == ENGINE:
             return False
         if status in _WHAT:
