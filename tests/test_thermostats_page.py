@@ -15,6 +15,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FILE = ROOT / "docs" / "results" / "thermostats.json"
 RESULT = json.loads(FILE.read_text(encoding="utf-8"))
+COST = ROOT / "docs" / "results" / "thermostat_cost.json"
 
 
 def of_group(group):
@@ -25,9 +26,12 @@ RUNS = {(r["fluid"], r["thermostat"]): r for r in of_group("runs")}
 ENERGIES = {m["fluid"]: m["energy"] for m in of_group("metropolis")}
 
 
-def test_page_shows_the_committed_results():
+@pytest.mark.parametrize(
+    "script, file", [("10_thermostats.py", FILE), ("22_thermostat_cost.py", COST)], ids=["sampling", "cost"]
+)
+def test_page_shows_the_committed_results(script, file):
     result = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "10_thermostats.py"), "--show", str(FILE)],
+        [sys.executable, str(ROOT / "examples" / script), "--show", str(file)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -37,6 +41,18 @@ def test_page_shows_the_committed_results():
     shown = "\n".join(line.rstrip() for line in result.stdout.strip("\n").split("\n"))
     page = (ROOT / "docs" / "thermostats.md").read_text(encoding="utf-8")
     assert shown in page
+
+
+def test_constant_kinetic_energy_costs_little_more_than_constant_energy():
+    """At most 1.2 times a step of ConstrainedDynamics in ASE."""
+    result = json.loads(COST.read_text(encoding="utf-8"))
+    assert result["full"]
+    ratios = {row["system"]: row["ratio"] for row in result["cost"]}
+    assert set(ratios) == {"8 dumbbells", "27 rigid waters", "216 rigid waters"}
+    assert max(ratios.values()) <= 1.2
+    for row in result["cost"]:
+        assert row["ratio"] == pytest.approx(row["isokinetic_us"] / row["constant_energy_us"], rel=0.1)
+        assert row["repeats"] >= 100
 
 
 @pytest.mark.parametrize("key", [key for key in RUNS if key[1] == "g - 1"], ids=lambda key: key[0])

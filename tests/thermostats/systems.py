@@ -12,10 +12,19 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, Distance
 from kcons.motion import Motion
 from kcons.steppers import State, System
+from kcons.thermostats import Isokinetic
 
 Array = NDArray[np.float64]
 METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 TEN = list(combinations(range(5), 2))
+SHAPE = np.array([[0.0, 0, 0], [1.0, 0, 0], [-0.3, 0.9, 0], [0.2, -0.5, 0.8]])
+MASSES = np.array([16.0, 1.0, 2.0, 3.0])
+ROWS = {
+    "dumbbells": [[0, 1]],
+    "bent": [[0, 1], [0, 2]],
+    "triangles": [[0, 1], [0, 2], [1, 2]],
+    "tetrahedra": [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
+}
 
 
 def system(rows: list[Constraint], x, masses, force=None, potential=None, time=0.0) -> System:
@@ -85,3 +94,37 @@ def integrated(system: System, state: State, end: float) -> tuple[Array, Array]:
     begin = np.concatenate([state.positions.ravel(), state.velocities.ravel()])
     found = solve_ivp(slope, (state.time, end), begin, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
     return found[: len(masses)].reshape(-1, 3), found[len(masses) :].reshape(-1, 3)
+
+
+def springs(x, t):
+    """Each atom in a harmonic well of its own strength, and an attraction of neighbouring molecules."""
+    return -np.linspace(0.1, 0.3, len(x))[:, None] * x - 0.05 * (x - np.roll(x, 3, axis=0))
+
+
+def far_springs(x, t):
+    return springs(x - 1e6, t)
+
+
+def molecules(name="dumbbells", n=11, *, ions=0, at=0.0, force=springs, **options) -> tuple[System, State]:
+    """Molecules that turn, and free atoms after them; 11 fill one group of lanes and part of a second."""
+    rng = np.random.default_rng(3)
+    size = 1 + max(map(max, ROWS[name]))
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    x = (np.einsum("ak,nkj->naj", SHAPE[:size], turn) + 3.0 * np.arange(n)[:, None, None] / n).reshape(-1, 3)
+    x = np.concatenate([x, rng.normal(size=(ions, 3))]) + at
+    masses = np.concatenate([np.tile(MASSES[:size], n), np.full(ions, 23.0)])
+    pairs = (size * np.arange(n)[:, None, None] + np.array(ROWS[name])).reshape(-1, 2)
+    system = System(Motion(ConstraintSet([Distance(pairs)], x, masses, **options), x), force)
+    return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
+
+
+def thermostats(system: System, **options) -> tuple[Isokinetic, Isokinetic]:
+    """One that uses compiled halves of `system`, and one that does not."""
+    pair = Isokinetic(momentum="free", **options), Isokinetic(momentum="free", **options)
+    assert pair[0]._share(system).stages is not None
+    pair[1]._share(system).stages = None
+    return pair
+
+
+def distance(a: State, b: State) -> float:
+    return max(float(np.abs(a.positions - b.positions).max()), float(np.abs(a.velocities - b.velocities).max()))
