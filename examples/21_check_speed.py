@@ -87,7 +87,7 @@ def reading(path: str, atoms: int) -> dict[str, float]:
 def checking(path: str, molecules: int, workers: int) -> dict[str, float]:
     """The check, in a process of its own."""
     command = [sys.executable, __file__, "--check", path, str(molecules), str(workers)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return dict(json.loads(done.stdout))
 
 
@@ -100,7 +100,7 @@ def check(path: str, molecules: int, workers: int) -> None:
     job = ConstraintCheck(universe, rows(molecules))
     job.run(stop=3)  # compile
     start = time.perf_counter()
-    parallel = {"backend": "multiprocessing", "n_workers": workers} if workers > 1 else {}
+    parallel = {"n_workers": workers} if workers > 1 else {}
     setup = time.process_time(), time.perf_counter()
     job._bind(0)
     setup = time.process_time() - setup[0], time.perf_counter() - setup[1]

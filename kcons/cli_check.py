@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
     check.add_argument("--tolerance", type=float, default=1e-4, help="relative, of the engine (default 1e-4)")
     check.add_argument("--precision", type=float, help="step of the coordinates in the file, Å, where not known")
     check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
-    check.add_argument("--workers", type=int, default=1, help="processes (default 1)")
+    check.add_argument("--workers", type=int, default=1, help="threads (DCD files) or processes (default 1)")
     check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
     check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
     check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,26 +17,24 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
-from kcons.mdanalysis.findings import Part, by_unit, rms_of, row_result, verdict_of
+from kcons.mdanalysis.dcd import PlainDcd, plain_dcd
+from kcons.mdanalysis.findings import BOLTZMANN, Part, by_unit, joined, rms_of, row_result, temperature_of, verdict_of
 from kcons.mdanalysis.loading import READ_ERRORS, intact_frames, last_offset, leftover, quiet
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.precision import FilePrecision, precision_of
 from kcons.mdanalysis.rank import rank_of
-from kcons.mdanalysis.result import Break, CheckResult, fitted
+from kcons.mdanalysis.result import Break, CheckResult
 from kcons.mdanalysis.rows import UNITS, Deviations, RowTable, cell_matrix
 from kcons.mdanalysis.targets import TargetFile
+from kcons.mdanalysis.workers import inherited, short_pickle, with_backend
 from kcons.solvers.frames import coordinate_grid, kinetic
 
-#: Boltzmann's constant in amu Å²/(ps² K).
-BOLTZMANN = 0.831446261815324
 #: Times a run that the largest coordinate is looked up.
 SAMPLES = 32
 #: Frames, at least, that a mean of a row is taken over, and one in how many frames at least.
 SUMMED, MOST_SKIPPED = 100, 8
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1
-#: Part of the kinetic energy that the centre of mass may have where its motion is removed.
-STILL = 1e-2
 
 
 class _Remote:
@@ -45,16 +42,6 @@ class _Remote:
 
     def __init__(self, part: Part) -> None:
         self.frames, self.times, self.results = part.frames, part.times, Results(part=part)
-
-
-def _joined(parts: Sequence[Part]) -> Part:
-    """Parts in order, up to the first break."""
-    whole = parts[0]
-    for part in parts[1:]:
-        if whole.broken is not None:
-            break
-        whole = whole.with_next(part)
-    return whole
 
 
 class ConstraintCheck(AnalysisBase):
@@ -98,7 +85,8 @@ class ConstraintCheck(AnalysisBase):
     order; targets that were read from a file are rounded themselves, which doubles the bound. Velocities of leapfrog
     integrators belong to the middle of a step and are not tangent at the positions they are stored with.
 
-    Backends: serial, multiprocessing, dask (`run(backend=..., n_workers=...)`).
+    Backends: serial, multiprocessing, dask, and threads for DCD files and rows that are all lengths
+    (`run(backend=..., n_workers=...)`); of several workers, threads where they can be had, processes otherwise.
     """
 
     _analysis_algorithm_is_parallelizable = True
@@ -211,20 +199,28 @@ class ConstraintCheck(AnalysisBase):
         Raises
         ------
         InputError
-            There are no frames; the first frame cannot be read.
+            There are no frames; the first frame cannot be read; threads where the file cannot be read by them.
         KconsError
             Constraints that cannot be, at the first frame.
         """
         chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
-        self._intact = intact_frames(self._path, self._format, self._trajectory.n_frames)
         self._bind(self._first(chosen))
+        in_blocks = self._blocks_of() is not None
+        # The compiled look at a block sees damage by itself.
+        n_frames = self._trajectory.n_frames
+        self._intact = n_frames if in_blocks else intact_frames(self._path, self._format, n_frames)
+        options = with_backend(options, in_blocks)
         self._pass_of_means = self._mode == "mean"
-        if self._pass_of_means:
+        with inherited(self, options["backend"]):
+            if self._pass_of_means:
+                super().run(**chosen, **options)
+                self._hold_means()
+                self._pass_of_means = False
             super().run(**chosen, **options)
-            self._hold_means()
-            self._pass_of_means = False
-        super().run(**chosen, **options)
         return self
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return short_pickle(self) or super().__reduce_ex__(protocol)
 
     def _first(self, chosen: dict[str, Any]) -> int:
         if chosen["frames"] is None:
@@ -313,33 +309,63 @@ class ConstraintCheck(AnalysisBase):
             np.zeros((n, 3)),
             0.0,
         )
-        done = 0
-        every = max(n // SAMPLES, 1)
         # Means need all frames; what is only told about rows does not.
-        sums = 1 if self._pass_of_means else min(max(n // SUMMED, 1), MOST_SKIPPED)
+        every = (1 if self._pass_of_means else min(max(n // SUMMED, 1), MOST_SKIPPED), max(n // SAMPLES, 1))
+        table = self._table.fresh()
+        file = self._blocks_of()
         verbose = getattr(self, "_verbose", False) if verbose is None else verbose
-        turns = ProgressBar(range(n), verbose=verbose, **(progressbar_kwargs or {})) if verbose else range(n)
-        trajectory = self._trajectory
-        previous = None
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            for k in turns:
-                frame = int(numbers[k])
-                try:
-                    if frame >= self._intact:
-                        raise OSError("its records are damaged")
-                    ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
-                    previous = frame
-                    self._look(part, k, ts, k % every == 0 or k == n - 1, k % sums == 0)
-                except (*READ_ERRORS, KconsError, FloatingPointError) as error:
-                    part.broken = Break(frame, self._reason(error, frame))
-                    break
-                done = k + 1
-        self._table.collect(found)
+        with ProgressBar(total=n, verbose=verbose, **(progressbar_kwargs or {})) as bar:
+            if file is not None:
+                done = self._read_blocks(file, table, part, every, bar)
+            else:
+                with quiet():
+                    done = self._read_frames(table, part, every, bar)
+        table.collect(found)
         found.cut(done)
         part.frames, part.times = part.frames[:done], part.times[:done]
         part.twice_kinetic, part.momentum = part.twice_kinetic[:done], part.momentum[:done]
         return _Remote(part)
+
+    def _blocks_of(self) -> PlainDcd | None:
+        """The file, where it can be read in blocks."""
+        return plain_dcd(self._trajectory) if self._table.only_lengths else None
+
+    def _read_blocks(self, file: PlainDcd, table: RowTable, part: Part, every: tuple[int, int], bar: Any) -> int:
+        """Frames that were looked at, up to a break."""
+        numbers = np.where(part.frames < 0, part.frames + file.n_frames, part.frames)
+        part.times[:] = file.times(numbers)
+        points = np.empty((file.n_atoms, 3), dtype=np.float32)
+        done = 0
+        try:
+            for block in file.blocks(numbers):
+                looked, reach = table.look_at_block(part.found, done, block, points, every)
+                done += looked
+                part.reach = max(part.reach, reach)
+                bar.update(looked)
+                if looked < len(block.words):
+                    table.refuse(points)
+        except (OSError, KconsError) as error:
+            frame = int(part.frames[done])
+            part.broken = Break(frame, self._reason(error, frame))
+        return done
+
+    def _read_frames(self, table: RowTable, part: Part, every: tuple[int, int], bar: Any) -> int:
+        """Frames that MDAnalysis' reader gave, up to a break."""
+        trajectory = self._trajectory
+        n = len(part.frames)
+        previous = None
+        for k, frame in enumerate(part.frames.tolist()):
+            try:
+                if frame >= self._intact:
+                    raise OSError("its records are damaged")
+                ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
+                previous = frame
+                self._look(table, part, k, ts, k % every[1] == 0 or k == n - 1, k % every[0] == 0)
+            except (*READ_ERRORS, KconsError, FloatingPointError) as error:
+                part.broken = Break(frame, self._reason(error, frame))
+                return k
+            bar.update()
+        return n
 
     def _reason(self, error: BaseException, frame: int) -> str:
         """What the reader says; iteration hides it."""
@@ -351,19 +377,19 @@ class ConstraintCheck(AnalysisBase):
         lines = str(error).strip().splitlines()
         return lines[0].strip() if lines else "the file ends"
 
-    def _look(self, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
+    def _look(self, table: RowTable, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
         x = _flat(ts.positions)
         v = _flat(ts.velocities) if ts.has_velocities else None
         time = float(ts.time)
         part.times[k] = time
-        self._table.look(part.found, k, x, v, ts.dimensions, time, summed)
+        table.look(part.found, k, x, v, ts.dimensions, time, summed)
         if sample:
             part.reach = max(part.reach, float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
         if v is not None and self._masses is not None:
             part.twice_kinetic[k], *part.momentum[k] = kinetic(v, self._masses)
 
     def _get_aggregator(self) -> ResultsGroup:
-        return ResultsGroup(lookup={"part": _joined})
+        return ResultsGroup(lookup={"part": joined})
 
     # -- conclusions ----------------------------------------------------------------------------
 
@@ -422,7 +448,11 @@ class ConstraintCheck(AnalysisBase):
                 in_frame |= (rows >= 0) & (found.worst[unit] > np.where(rows >= 0, allowed[rows], np.inf))
         frames = part.frames[in_frame]
         status = "violated" if violated.any() else "tolerated" if beyond_file.any() else "kept"
-        rank, freedom, temperature = self._temperature(part)
+        masses = self._unit_masses if self._masses is None else self._masses
+        freedom, temperature = None, None
+        if self._rank is not None:
+            freedom, temperature, remarks = temperature_of(part, self._rank, masses, self._removed)
+            self._remarks.extend(remarks)
         series = {
             f"{name} {UNITS[unit]}": values[unit].tolist()
             for unit in range(len(UNITS))
@@ -453,46 +483,13 @@ class ConstraintCheck(AnalysisBase):
             violated_rows=int(violated.sum()),
             violated_frames=int(in_frame.sum()),
             first_violated_frame=int(frames[0]) if len(frames) else None,
-            rank=rank,
+            rank=self._rank,
             degrees_of_freedom=freedom,
             temperature=temperature,
             broken=broken,
             series=series,
             remarks=list(self._remarks),
         )
-
-    def _temperature(self, part: Part) -> tuple[int | None, int | None, dict[str, float] | None]:
-        rank = self._rank
-        if rank is None:
-            return None, None, None
-        masses = self._masses if self._masses is not None else self._unit_masses
-        moving = int(np.count_nonzero(masses > 0))
-        freedom = 3 * moving - rank
-        twice = part.twice_kinetic
-        has = np.isfinite(twice)
-        if self._masses is None or not has.any():
-            return rank, max(freedom - (self._removed or 0), 0), None
-        removed = self._removed
-        if removed is None:
-            centre = np.einsum("ij,ij->i", part.momentum[has], part.momentum[has]) / self._masses.sum()
-            still = float(centre.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
-            removed = 3 if still and freedom > 3 else 0
-            what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
-            self._remarks.append(f"the centre of mass is {what}")
-        freedom -= removed
-        if freedom <= 0:
-            self._remarks.append("no temperature: the constraints leave no degree of freedom")
-            return rank, 0, None
-        kelvin = twice / (BOLTZMANN * freedom)
-        line = fitted(part.times, kelvin)
-        temperature = {
-            "mean": float(np.nanmean(kelvin)),
-            "deviation": float(np.nanstd(kelvin)),
-            "frames": float(has.sum()),
-            "slope": line.slope if line else float("nan"),
-            "slope_error": line.error if line else float("nan"),
-        }
-        return rank, freedom, temperature
 
 
 def _flat(values: Any) -> NDArray[np.float32]:

@@ -29,7 +29,7 @@ def check_trajectory(
     targets: str | Path = "first",
     frames: str | None = None,
     workers: int = 1,
-    backend: str = "multiprocessing",
+    backend: str | None = None,
     **options: Any,
 ) -> CheckResult:
     """How well a trajectory kept its constraints.
@@ -45,9 +45,9 @@ def check_trajectory(
     frames : str, optional
         'A:B:STEP' as in a slice; all by default.
     workers : int
-        Processes that read at the same time.
-    backend : {'multiprocessing', 'dask'}
-        Of MDAnalysis, where there are several workers.
+        How many read at the same time.
+    backend : {'threads', 'multiprocessing', 'dask'}, optional
+        Where there are several workers; by default threads for DCD files and rows that are all lengths, else processes.
     **options
         For `ConstraintCheck`.
 

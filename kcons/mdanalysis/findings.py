@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,11 @@ from kcons.constraints.target import FloatArray
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.result import Break, RowResult, UnitResult, fitted
 from kcons.mdanalysis.rows import UNITS, Deviations, RowTable
+
+#: Boltzmann's constant in amu Å²/(ps² K).
+BOLTZMANN = 0.831446261815324
+#: Part of the kinetic energy that the centre of mass may have where its motion is removed.
+STILL = 1e-2
 
 
 @dataclass
@@ -35,6 +41,16 @@ class Part:
             max(self.reach, other.reach),
             other.broken,
         )
+
+
+def joined(parts: Sequence[Part]) -> Part:
+    """Parts in order, up to the first break."""
+    whole = parts[0]
+    for part in parts[1:]:
+        if whole.broken is not None:
+            break
+        whole = whole.with_next(part)
+    return whole
 
 
 def rms_of(table: RowTable, found: Deviations) -> FloatArray:
@@ -118,3 +134,45 @@ def verdict_of(
         f"violated by {row.largest:.3g} {row.unit} ({row.largest - row.allowed:.2g} more than allowed): "
         f"{row.name}{where}; {rows[0]} of {rows[1]} rows{seen}"
     )
+
+
+def temperature_of(
+    part: Part, rank: int, masses: FloatArray, removed: int | None
+) -> tuple[int, dict[str, float] | None, list[str]]:
+    """Degrees of freedom, temperature where there are velocities and masses, and what to say about them.
+
+    Parameters
+    ----------
+    part : Part
+        All frames.
+    rank : int
+        Of the constraints.
+    masses : ndarray, shape (n_atoms,)
+    removed : int, optional
+        Degrees of freedom that the engine took away; found from the total momentum by default.
+    """
+    freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
+    twice = part.twice_kinetic
+    has = np.isfinite(twice)
+    if not has.any():
+        return max(freedom - (removed or 0), 0), None, []
+    remarks = []
+    if removed is None:
+        centre = np.einsum("ij,ij->i", part.momentum[has], part.momentum[has]) / masses.sum()
+        still = float(centre.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
+        removed = 3 if still and freedom > 3 else 0
+        what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
+        remarks.append(f"the centre of mass is {what}")
+    freedom -= removed
+    if freedom <= 0:
+        return 0, None, [*remarks, "no temperature: the constraints leave no degree of freedom"]
+    kelvin = twice / (BOLTZMANN * freedom)
+    line = fitted(part.times, kelvin)
+    temperature = {
+        "mean": float(np.nanmean(kelvin)),
+        "deviation": float(np.nanstd(kelvin)),
+        "frames": float(has.sum()),
+        "slope": line.slope if line else float("nan"),
+        "slope_error": line.error if line else float("nan"),
+    }
+    return freedom, temperature, remarks

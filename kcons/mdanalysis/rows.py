@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -13,6 +14,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
+from kcons.mdanalysis.dcd import Block, look_at
 from kcons.solvers.frames import LANES, coordinate_grid, length_rates, lengths, padded, triangles
 from kcons.solvers.lattice import NO_LATTICE
 
@@ -132,6 +134,19 @@ class RowTable:
             self._other_units = self.units[self.other_rows]
             self._holonomic = self._others.holonomic
 
+    @property
+    def only_lengths(self) -> bool:
+        """Whether compiled code does all of it, so that whole blocks of a file can be looked at."""
+        return self._others is None
+
+    def fresh(self) -> RowTable:
+        """One that shares all but what is changed while frames are looked at; each worker needs its own."""
+        other = copy.copy(self)
+        other._box, other._dimensions = np.zeros((2, 3, 3)), ()
+        for name in ("_largest", "_total", "_triangle_largest", "_triangle_total"):
+            setattr(other, name, np.zeros_like(getattr(self, name)))
+        return other
+
     # -- cell -----------------------------------------------------------------------------------
 
     def cell_of(self, dimensions: NDArray[np.float32] | None) -> tuple[FloatArray, float]:
@@ -213,7 +228,7 @@ class RowTable:
                 if largest > worst:
                     worst, row = largest, self._single_rows[min(k_worst, len(self._single_rows) - 1)]
             if not squares < np.inf:
-                self._refuse(x)
+                self.refuse(x)
             into.sums[0, k], into.squares[0, k] = sums, squares
             into.worst[0, k], into.worst_row[0, k] = worst, row
             if v is not None:
@@ -225,6 +240,77 @@ class RowTable:
                 into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
         if self._others is not None:
             self._look_at_others(into, k, x, v, lattice if limit < np.inf else None, time, summed)
+
+    def look_at_block(
+        self,
+        into: Deviations,
+        k: int,
+        block: Block,
+        points: NDArray[np.float32],
+        every: tuple[int, int],
+    ) -> tuple[int, float]:
+        """Put what is found in the frames of a block into the k-th place and those that follow; lengths only.
+
+        Parameters
+        ----------
+        points : ndarray of float32, shape (n_atoms, 3)
+            Room for a frame; on return the last one that was looked at.
+        every : (int, int)
+            One frame in how many counts in the sums by row, and in the largest coordinate.
+
+        Returns
+        -------
+        Frames until the first that is not finite, and the largest coordinate.
+        """
+        n = len(block.words)
+        lattices, limits = np.empty((n, 2, 3, 3)), np.empty(n)
+        alike = bool((block.dimensions == block.dimensions[0]).all())
+        for f in range(1 if alike else n):
+            lattices[f], limits[f] = self.cell_of(block.dimensions[f])
+        if alike:
+            lattices[1:], limits[1:] = lattices[0], limits[0]
+        here = slice(k, k + n)
+        side, place = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        done, reach, n_summed = look_at(
+            block.words,
+            block.x,
+            points,
+            k,
+            *every,
+            into.n_frames,
+            limits,
+            lattices,
+            self.grid,
+            self._corners,
+            self._triangle_targets,
+            self._triangle_largest,
+            self._triangle_total,
+            self._places,
+            self._targets,
+            self._largest,
+            self._total,
+            into.sums[0, here],
+            into.squares[0, here],
+            into.worst[0, here],
+            side,
+            place,
+        )
+        into.n_summed += n_summed
+        rows = np.where(
+            side < 0, self._row_of(self._single_rows, place), self._row_of(self._triangle_rows, place, side)
+        )
+        into.worst_row[0, here] = rows
+        return done, reach
+
+    @staticmethod
+    def _row_of(rows: IntArray, place: IntArray, side: IntArray | None = None) -> IntArray:
+        """Numbers of rows; where they are not of this kind, any."""
+        n = rows.shape[-1]
+        if not n:
+            return np.full(len(place), -1, dtype=np.int64)
+        at = np.minimum(place, n - 1)
+        result: IntArray = rows[at] if side is None else rows[np.maximum(side, 0), at]
+        return result
 
     def collect(self, into: Deviations) -> None:
         """Put what was found by row where it belongs, and begin anew."""
@@ -253,7 +339,7 @@ class RowTable:
         with np.errstate(all="ignore"):
             off = others.value(here, time)
         if not np.isfinite(off).all():
-            self._refuse(x)
+            self.refuse(x)
         size = np.abs(off)
         into.largest[self.other_rows] = np.maximum(into.largest[self.other_rows], size)
         if summed:
@@ -279,7 +365,8 @@ class RowTable:
                 if not into.rate_worst[unit, k] >= rates[best]:
                     into.rate_worst[unit, k], into.rate_row[unit, k] = rates[best], self.other_rows[best]
 
-    def _refuse(self, x: NDArray[np.float32]) -> None:
+    def refuse(self, x: NDArray[np.float32]) -> None:
+        """Say which atom of a frame makes it undefined."""
         points = x.reshape(-1, 3)
         bad = self.set.touched[~np.isfinite(points[self.set.touched]).all(axis=1)]
         if len(bad):
