@@ -124,6 +124,7 @@ def check(path: str, molecules: int, workers: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", action="store_true", help="files of 1 GB")
+    parser.add_argument("--size", type=float, default=1.0, help="with --full: size of the files in GB")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--check", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -131,7 +132,7 @@ def main() -> None:
     if chosen.check:
         check(chosen.check[0], int(chosen.check[1]), int(chosen.check[2]))
         return
-    size, repeats = (1e9, 3) if chosen.full else (2e6, 1)
+    size, repeats = (1e9 * chosen.size, 3) if chosen.full else (2e6, 1)
     cases = (("dcd", 33_000), ("xtc", 33_000), ("dcd", 3_000)) if chosen.full else (("xtc", 1_000),)
     results = []
     for ending, molecules in cases:
