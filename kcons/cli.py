@@ -68,7 +68,9 @@ def _parser() -> argparse.ArgumentParser:
     files = common.add_argument_group("any file that MDAnalysis reads; these options make it read PDB files, too")
     files.add_argument("--coordinates", type=Path, metavar="FILE", help="coordinates of a topology without")
     files.add_argument(
-        "--forces", help="openmm (default), emt, lj, tip3p, gfn1, gfn2, or another calculator of ASE; not for plan"
+        "--forces",
+        help="openmm (default), force fields of OpenMM by name, comma separated (amber14-all,amber14/tip3p), or emt, "
+        "lj, tip3p, gfn1, gfn2, or another calculator of ASE; not for plan",
     )
     files.add_argument("--select", metavar="WORDS", help="hold only what is within this selection of MDAnalysis")
     files.add_argument("--rigid-residues", nargs="+", metavar="NAME", help="residues held rigid")

@@ -29,8 +29,8 @@ from kcons.mdanalysis.targets import TargetFile
 from kcons.mdanalysis.workers import inherited, short_pickle, with_backend
 from kcons.solvers.frames import coordinate_grid, kinetic
 
-#: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one in
-#: how many frames at least.
+#: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
+#: in how many frames at least.
 SAMPLES, SUMMED, MOST_SKIPPED = 32, 100, 8
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1

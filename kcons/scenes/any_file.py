@@ -144,7 +144,7 @@ def from_file(
     select: str = "all",
     rigid_residues: Sequence[str] = (),
     forces: str = "openmm",
-    force_field: Sequence[str] = FORCE_FIELD,
+    force_field: Sequence[str] | None = None,
     platform: str = "",
 ) -> Scene:
     """The molecules of a file at 300 K.
@@ -158,9 +158,10 @@ def from_file(
     seed : int
         Of the velocities.
     forces : str
-        'openmm'; 'emt', 'lj', 'tip3p', 'gfn1', 'gfn2', or the name of any calculator of ASE.
-    force_field : sequence of str
-        Files for openmm.app.ForceField.
+        'openmm'; 'emt', 'lj', 'tip3p', 'gfn1', 'gfn2', or the name of any calculator of ASE; or force fields of OpenMM
+        by name, separated by commas: 'amber14-all,amber14/tip3p'. Of OpenMM's 'tip3p.xml' the ending has to be said.
+    force_field : sequence of str, optional
+        Files for openmm.app.ForceField, where forces are 'openmm'.
     platform : str
         Of OpenMM.
 
@@ -169,6 +170,9 @@ def from_file(
     InputError, UnsupportedError
         As `plan`; unknown forces, or forces that do not fit the atoms.
     """
+    named = _force_fields(forces)
+    if named is not None and force_field is not None:
+        raise InputError(f"forces are {forces!r} already; leave --forcefield out", item="force_field")
     found = plan(
         path,
         coordinates=coordinates,
@@ -188,8 +192,8 @@ def from_file(
     snapshot = whole_molecules(replace(snapshot, positions=found.positions))
     x = snapshot.positions
     host: OpenMMHost | None = None
-    if forces.lower() == "openmm":
-        host = _openmm_host(snapshot, found.rows, force_field, platform)
+    if named is not None or forces.lower() == "openmm":
+        host = _openmm_host(snapshot, found.rows, named or force_field or FORCE_FIELD, platform)
         potential = host.potential()
     else:
         potential = _of_ase(snapshot, forces)
@@ -225,6 +229,24 @@ def _distances(rows: HeldRows) -> IntArray | None:
     if not all(isinstance(item, Distance) for item in rows):
         return None
     return np.concatenate([item.atoms for item in rows])
+
+
+def _force_fields(forces: str) -> tuple[str, ...] | None:
+    """Files of OpenMM that are named, None if something else is."""
+    names = [name.strip() for name in forces.split(",")]
+    if len(names) == 1 and names[0].lower() in ("openmm", *CALCULATORS):
+        return None
+    files = tuple(name if name.endswith(".xml") else f"{name}.xml" for name in names)
+    if len(names) == 1 and files[0] != names[0] and not _has_force_field(files[0]):
+        return None
+    return files
+
+
+def _has_force_field(file: str) -> bool:
+    found = find_spec("openmm")
+    if found is None or found.origin is None:
+        return False
+    return (Path(found.origin).parent / "app" / "data" / file).is_file()
 
 
 def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMHost:
@@ -289,7 +311,8 @@ def _calculator(name: str, atoms: Any) -> Any:
         return known.get_calculator_class(word)()
     except Exception as error:
         raise InputError(
-            f"no forces {name!r}; there are openmm, {', '.join(CALCULATORS)}, and the calculators of ASE that need no "
-            f"settings ({type(error).__name__}: {error})",
+            f"no forces {name!r}; there are openmm, {', '.join(CALCULATORS)}, force fields of OpenMM by name (such as "
+            "amber14-all,amber14/tip3p), and the calculators of ASE that need no settings "
+            f"({type(error).__name__}: {error})",
             item="forces",
         ) from error

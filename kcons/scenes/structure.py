@@ -257,7 +257,7 @@ def _box(topology: Any) -> FloatArray | None:
     vectors = topology.getPeriodicBoxVectors()
     if vectors is None:
         return None
-    box = np.array([[v.x, v.y, v.z] for v in vectors._value])
+    box = np.array([list(v) for v in vectors._value], dtype=float)
     return None if np.diag(box).max() < 0.2 else box
 
 

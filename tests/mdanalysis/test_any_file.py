@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import ase.io
+import numpy as np
+import openmm.app
 import pytest
 from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
@@ -155,3 +158,55 @@ def test_pdb_files_go_the_new_way_when_asked(capsys):
     status, out, _ = plan(ALANINE, "--select", "all", capsys=capsys)
     assert status == 0
     assert "hbonds: 12 Distance" in out
+
+
+VILLIN = Path(openmm.app.__file__).parent / "data" / "test.pdb"
+
+
+def test_a_protein_in_water_with_force_fields_by_name(tmp_path, capsys, monkeypatch):
+    """Villin in water: rows and energy are those of OpenMM alone, in a box that is not NumPy's."""
+    from openmm import app, unit
+
+    monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
+    scene = quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
+    pdb = app.PDBFile(str(VILLIN))
+    system = app.ForceField("amber14-all.xml", "amber14/tip3p.xml").createSystem(
+        pdb.topology, nonbondedMethod=app.PME, constraints=app.HBonds, rigidWater=True
+    )
+    wanted = {
+        tuple(sorted(p[:2])): p[2].value_in_unit(unit.angstrom)
+        for p in map(system.getConstraintParameters, range(system.getNumConstraints()))
+    }
+    held = {tuple(sorted(pair)) for pair in scene.bonds.tolist()}
+    assert held == set(wanted) and scene.constraint_set.n_atoms == 8867
+    box = [list(v.value_in_unit(unit.angstrom)) for v in system.getDefaultPeriodicBoxVectors()]
+    np.testing.assert_allclose(scene.cell, box, atol=1e-4)
+    # The same water: the parameters of the Systems, which one by one decide the energy.
+    theirs, ours = (
+        next(f for f in one.getForces() if isinstance(f, openmm.NonbondedForce))
+        for one in (system, scene.openmm.system)
+    )
+    for k in range(0, 8867, 7):
+        assert theirs.getParticleParameters(k) == ours.getParticleParameters(k)
+
+
+def test_compare_runs_on_a_protein_in_water(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
+    arguments = ["compare", str(VILLIN), "--constrain", "hbonds", "--forces", "amber14-all,amber14/tip3p", "--quick"]
+    status = cli.main([*arguments, "--budget", "1", "--methods", "openmm-kcons-rattle", "--dt", "4"])
+    told = capsys.readouterr()
+    assert status == 0, told.err
+    assert "test.pdb, 8867 atoms, hbonds" in told.out
+    assert json.loads((tmp_path / "compare-test" / "compare.json").read_text())
+
+
+def test_force_fields_that_do_not_fit(ethanol):
+    with pytest.raises(InputError, match="--forcefield out"):
+        quietly(scenes.from_file, VILLIN, forces="amber14-all", force_field=["tip3p.xml"])
+    with pytest.raises(InputError, match="residue Cl 36"):
+        quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all")
+    with pytest.raises(InputError, match=r"nosuch\.xml"):
+        quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all,nosuch")
+    with pytest.raises(InputError, match="residue"):
+        quietly(scenes.from_file, ethanol, forces="tip3p.xml")
