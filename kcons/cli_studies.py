@@ -30,6 +30,10 @@ def add(commands: Any) -> None:
     stability.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
     stability.add_argument("--out", type=Path, default=Path("stability"), help="folder (default ./stability)")
     stability.add_argument("--only", type=names, help="of steps, drift, reversal, fuzz; comma separated")
+    stability.add_argument("--scenes", type=names, help="of water, chain, dumbbells, rotor, pendulum, butane")
+    stability.add_argument(
+        "--into", type=Path, nargs="+", metavar="FILE", help="add to these results (JSON) and this page (Markdown)"
+    )
     stability.set_defaults(run=_stability)
 
 
@@ -60,7 +64,13 @@ def _stability(chosen: argparse.Namespace) -> int:
     chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"
     with Bars() as watcher:
-        result = stability.digest(stability.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher))
+        found = stability.run(only=chosen.only, scenes=chosen.scenes, quick=chosen.quick, kept=kept, watcher=watcher)
+    result = stability.digest(found)
+    if chosen.into:
+        before, result = stability.put_into(result, chosen.into[0])
+        for page in chosen.into[1:]:
+            pages.renew(page, before, result)
+        say_written(chosen.into)
     print(pages.text(result))
     say_written([kept, *pages.write(result, chosen.out)])
     return 0

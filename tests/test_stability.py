@@ -10,7 +10,7 @@ import pytest
 
 from kcons import cli
 from kcons.errors import InputError
-from kcons.stability import SCENES, attempt, drift, fuzz, largest_step, pages, reversal, run, trial
+from kcons.stability import SCENES, attempt, drift, fuzz, largest_step, pages, put_into, reversal, run, trial
 from kcons.stability.runs import Copies
 
 ROOT = Path(__file__).parent.parent
@@ -114,3 +114,37 @@ def test_committed_results_have_no_faults():
     assert pages.failures(result) == []
     assert result["fuzz"]["faults"] == []
     assert result["fuzz"]["trials"] >= 10_000
+
+
+def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
+    """As the command does it; results from before stay what they are."""
+    page, numbers = tmp_path / "stability.md", tmp_path / "stability.json"
+    page.write_text((ROOT / "docs" / "stability.md").read_text(encoding="utf-8"), encoding="utf-8")
+    stored = json.loads(RESULTS.read_text(encoding="utf-8"))
+    stored["pieces"].pop("drift/butane", None)
+    before_it = pages.markdown(stored)["drift"]
+    page.write_text(
+        page.read_text(encoding="utf-8").replace(
+            pages.markdown(json.loads(RESULTS.read_text(encoding="utf-8")))["drift"], before_it
+        ),
+        encoding="utf-8",
+    )
+    numbers.write_text(json.dumps(stored), encoding="utf-8")
+    found = run(only=["drift"], scenes=["butane"], quick=True)
+    assert list(found["pieces"]) == ["drift/butane"]
+    with pytest.raises(InputError, match="quick"):
+        put_into(found, numbers)
+    found["made_by"]["quick"] = False
+    before, after = put_into(found, numbers)
+    assert json.loads(numbers.read_text(encoding="utf-8")) == after
+    assert {k: v for k, v in after["pieces"].items() if k != "drift/butane"} == stored["pieces"]
+    assert after["fuzz"] == stored["fuzz"] and list(after["added"]) == ["drift/butane"]
+    pages.renew(page, before, after)
+    assert "| butane | 0.02 | 10,000 | 8 |" in page.read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="does not show the drift"):
+        pages.renew(page, before, after)
+
+
+def test_a_scene_that_is_not_there():
+    with pytest.raises(InputError, match="no scene 'methane'"):
+        run(only=["drift"], scenes=["methane"], quick=True)

@@ -3,6 +3,6 @@
 from kcons.stability.fuzz import Trial, trial
 from kcons.stability.runs import attempt, drift, largest_step, reversal
 from kcons.stability.scenes import SCENES
-from kcons.stability.study import digest, run
+from kcons.stability.study import digest, put_into, run
 
-__all__ = ["SCENES", "Trial", "attempt", "digest", "drift", "largest_step", "reversal", "run", "trial"]
+__all__ = ["SCENES", "Trial", "attempt", "digest", "drift", "largest_step", "put_into", "reversal", "run", "trial"]

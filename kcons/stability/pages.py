@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import page
+from kcons.errors import InputError
 from kcons.stability.fuzz import FAULTS
 from kcons.stability.runs import METHODS
 from kcons.stability.scenes import SCENES
@@ -200,3 +201,19 @@ def write(result: Mapping[str, Any], folder: Path) -> list[Path]:
     made = f"{about['date']}, commit {about['commit']}\n{about['cpu']}, {about['cores']} cores, one thread"
     sections.append(page.Section("Made by", literal=made + ("\nquick" if result["made_by"]["quick"] else "\nfull")))
     return [png, page.write(folder / "stability.html", "Stability of constrained dynamics", sections)]
+
+
+def renew(shown: Path, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+    """Put the tables of other results into a page that shows those from before.
+
+    Raises
+    ------
+    InputError
+        The page does not show them.
+    """
+    text, old, new = shown.read_text(encoding="utf-8"), markdown(before), markdown(after)
+    for part, words in new.items():
+        if old.get(part, "") not in text or part not in old:
+            raise InputError(f"{shown} does not show the {part} of the results so far", item="page")
+        text = text.replace(old[part], words)
+    shown.write_text(text, encoding="utf-8")
