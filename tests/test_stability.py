@@ -141,7 +141,11 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
     assert after["fuzz"] == stored["fuzz"] and list(after["added"]) == ["drift/butane"]
     pages.renew(page, before, after)
     assert "| butane | 0.02 | 10,000 | 8 |" in page.read_text(encoding="utf-8")
-    with pytest.raises(InputError, match="does not show the drift"):
+    once = page.read_text(encoding="utf-8")
+    pages.renew(page, before, after)
+    assert page.read_text(encoding="utf-8") == once
+    page.write_text("# Another page", encoding="utf-8")
+    with pytest.raises(InputError, match="does not show the"):
         pages.renew(page, before, after)
 
 
