@@ -274,13 +274,17 @@ class KconsInAse(PlainAse):
     name = "kcons in ASE"
     pace = 1.0
 
-    def __init__(self, own_dynamics: bool = True) -> None:
+    def __init__(self, own_dynamics: bool = True, thermostat: Callable[[Any, float], Any] | None = None) -> None:
         #: False for ASE's VelocityVerlet.
         self.own_dynamics = own_dynamics
+        #: Dynamics of atoms and time step, instead of `ConstrainedDynamics`.
+        self.thermostat = thermostat
 
     def dynamics(self, atoms: Any, dt: float) -> Any:
         from kcons.ase import ConstrainedDynamics
 
+        if self.thermostat is not None:
+            return self.thermostat(atoms, dt)
         return ConstrainedDynamics(atoms, dt) if self.own_dynamics else super().dynamics(atoms, dt)
 
     def hold(self, atoms: Any, problem: Problem) -> None:
@@ -444,15 +448,19 @@ class KconsInOpenMM(PlainOpenMM):
 
     name = "kcons in OpenMM"
 
+    def __init__(self, ensemble: Any = None) -> None:
+        #: For `ProjectedIntegrator`.
+        self.ensemble = ensemble
+
     def build(self, problem: Problem, dt: float) -> tuple[Any, Any, Any]:
         from kcons.openmm import ProjectedIntegrator, hold
 
         system = self.bare_system(problem.but(fixed=()) if len(problem.fixed) else problem)
         rows = problem.rows()
         if not rows:
-            return system, ProjectedIntegrator(dt), None
+            return system, ProjectedIntegrator(dt, ensemble=self.ensemble), None
         part = hold(system, rows, problem.x, take="all", keep_water=False)
-        return system, ProjectedIntegrator(dt, parts=[part]), part
+        return system, ProjectedIntegrator(dt, parts=[part], ensemble=self.ensemble), part
 
     def start(self, problem: Problem, context: Any, part: Any, dt: float, project: bool) -> None:
         context.setPositions(problem.x)
