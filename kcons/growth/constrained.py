@@ -28,7 +28,9 @@ from kcons.growth.rows import EPSILON, Row
 #: Newton iterations of a projection at most.
 MOST_ITERATIONS = 25
 #: A projection has arrived where what is left is this many times the round-off of the row.
-ROUND_OFF = 3.0
+ROUND_OFF = 1.0
+#: Systems that have arrived part from the others where they are more than this share of them.
+WORTH_PARTING = 0.3
 #: After this many iterations, so many times the round-off are accepted.
 STALLED, ACCEPTED = 4, 50.0
 #: Least ln x. Where the rows press on a species that is extinct, ln x falls like -e^(lambda t), beyond all numbers of
@@ -278,13 +280,12 @@ class ConstrainedGrowth:
         return best, best_left
 
     def _iterate(
-        self, p: Populations, values: list[FloatArray], best: FloatArray, best_left: FloatArray
+        self, p: Populations, values: list[FloatArray], best: FloatArray, best_left: FloatArray, iteration: int = 0
     ) -> tuple[FloatArray, FloatArray]:
         """Newton's iteration from `p` with the row values `values`; the best state on the way and what is left."""
         rows = [row for row in self.rows if row.holonomic]
         lanes = best.shape[1:]
-        y = best
-        for iteration in range(MOST_ITERATIONS):
+        while iteration < MOST_ITERATIONS:
             change = orthogonal_rows.solve(
                 p.x, [r.gradient(p) for r in rows], [-v for v in values], np.zeros_like(p.x)
             ).z
@@ -292,13 +293,21 @@ class ConstrainedGrowth:
             with np.errstate(all="ignore"):
                 largest = np.max(np.abs(change) * (p.x > 0), axis=0)
                 change = np.where(np.isfinite(change), change / np.maximum(largest, 1.0), 0.0)
-            y = y + change
-            p = Populations.from_logarithms(p.time, y)
+            p = Populations.from_logarithms(p.time, p.log_x + change)
             values, left = _misses(rows, p, lanes)
             better = left < best_left
-            best = np.where(better, y, best)
+            best = np.where(better, p.log_x, best)
             best_left = np.where(better, left, best_left)
-            if np.all(best_left <= (ROUND_OFF if iteration < STALLED else ACCEPTED)):
+            there = best_left <= (ROUND_OFF if iteration < STALLED else ACCEPTED)
+            iteration += 1
+            if np.all(there):
+                break
+            if np.count_nonzero(there) > WORTH_PARTING * there.size:
+                late = np.flatnonzero(~there)
+                p = Populations(np.asarray(p.time)[late], p.x[:, late], p.log_x[:, late])
+                best[:, late], best_left[late] = self.take(late)._iterate(
+                    p, [v[late] for v in values], best[:, late], best_left[late], iteration
+                )
                 break
         return best, best_left
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import DOP853
 
 from kcons.errors import InputError
+from kcons.growth.compensated_sums import two_sum
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.model import FloatArray, Populations, positive_populations
 
@@ -210,7 +211,7 @@ class _Batch:
             third = np.sum((h * np.tensordot(DOP853.E3[:-1], K, axes=1) / scale) ** 2, axis=0)
             error = np.where(fifth == 0, 0.0, fifth / np.sqrt((fifth + 0.01 * third) * len(self.y)))
             good = error < 1.0
-            t_new, rest_new = _sum(self.t, self.t_rest + h)
+            t_new, rest_new = two_sum(self.t, self.t_rest + h)
             t_new, rest_new = np.where(clipped, goal, t_new), np.where(clipped, 0.0, rest_new)
             y_new = np.where(good, y_new, self.y)
             y_new, left = self.system.try_project(np.where(good, t_new, self.t), y_new)
@@ -260,10 +261,3 @@ class _Batch:
                 self.log_x[k, :, lanes] = found.T
         self.settled_time[self.lanes[index]] = self.t[index]
         self.next[index] = len(self.times)
-
-
-def _sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """a + b and its rounding error (Knuth's two-sum)."""
-    total = a + b
-    part = total - a
-    return total, (a - (total - part)) + (b - part)

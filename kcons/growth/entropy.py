@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from kcons.errors import BudgetError, InputError
+from kcons.growth.compensated_sums import compensated_sum
 from kcons.growth.mixture import Mixture
 from kcons.growth.model import FloatArray, Populations
 from kcons.growth.rows import EPSILON, Row
@@ -264,19 +265,22 @@ class EntropyRow(Row):
         return self.law.excess_rate(np.asarray(p.time) - self.start, excess, excess0)
 
     def value(self, p: Populations) -> FloatArray:
-        return self.mixture.excess(p, self._total(p)) - self.law_excess(p.time)
+        return self.mixture.excess_over(p, self._total(p), self.law_excess(p.time))
 
     def size(self, p: Populations) -> FloatArray:
         # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
         error = np.maximum(1.0, np.abs(p.log_x))
         slope = np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * EPSILON * error) * error, axis=0)
-        return np.abs(self.law_excess(p.time)) + slope
+        # Far from equilibrium the excess cancels, see Mixture.excess_over.
+        return np.minimum(np.abs(self.law_excess(p.time)), self.mixture.kT * self._total(p)) + slope
 
     def bind(self, p: Populations) -> EntropyRow:
         bound = copy.copy(self)
         bound.start = p.time
-        bound.total = np.asarray(np.sum(p.x, axis=0))
-        bound.excess0 = self.mixture.excess(p, bound.total)
+        bound.total = compensated_sum(p.x)
+        # In two steps, the second of which sees what the first rounded off.
+        about = self.mixture.excess(p, bound.total)
+        bound.excess0 = about + self.mixture.excess_over(p, bound.total, about)
         most = self.mixture.largest_gibbs_energy(bound.total) - self.mixture.least_gibbs_energy(bound.total)
         self.law.check(bound.excess0, np.asarray(most))
         return bound

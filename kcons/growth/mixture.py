@@ -17,7 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.errors import InputError
+from kcons.growth.compensated_sums import compensated_sum, two_sum
 from kcons.growth.model import FloatArray, Populations
+
+#: Below this |ln x/x_eq| the excess of a species is summed as a power series.
+NEAR = 0.2
 
 
 class Mixture:
@@ -100,6 +104,28 @@ class Mixture:
         v = np.log1p((np.sum(p.x, axis=0) - c) / c)
         return np.asarray(self.kT * (np.sum(x_eq * entropy_function(u), axis=0) - c * entropy_function(v)))
 
+    def excess_over(self, p: Populations, total: ArrayLike, level: FloatArray) -> FloatArray:
+        """`excess` less `level`, to the round-off of the potentials about their mean.
+
+        Far from equilibrium the excess is many times as large as what the populations differ in, and so is its
+        round-off. The part of each population in `level` is therefore taken from its own term: with a = level/(c kT)
+        kT [sum (x_eq h(ln x/x_eq) - a x) - c h(ln X/c) + a (X - c)],  with ln x/x_eq and X - c to twice the precision.
+        """
+        c = np.asarray(total, dtype=np.float64)
+        log_eq = self._fractions(p) + np.log(c)
+        a = level / (c * self.kT)
+        # A trial step of an integrator may overflow; it is then rejected.
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            x_eq = np.exp(log_eq)
+            u, rest = two_sum(p.log_x, -log_eq)
+            near = np.abs(u) < NEAR
+            terms = p.x * ((u - a) + rest) - (p.x - x_eq)
+            if near.any():
+                terms = np.where(near, x_eq * _entropy_series(np.where(near, u + rest, 0.0)) - a * p.x, terms)
+            more = compensated_sum([*p.x, -c])
+            terms_of_sum = [-c * entropy_function(np.log1p(more / c)), a * more]
+            return np.asarray(self.kT * compensated_sum([*terms, *terms_of_sum]))
+
     def relative_potentials(self, p: Populations) -> FloatArray:
         """mu less that of the largest population, shape of p.x.
 
@@ -130,16 +156,19 @@ class Mixture:
 def entropy_function(u: ArrayLike) -> FloatArray:
     """h(u) = u e^u - e^u + 1, which is 0 with zero slope at u = 0 and positive elsewhere, to full relative accuracy."""
     u = np.asarray(u, dtype=np.float64)
-    near = np.abs(u) < 0.2
+    near = np.abs(u) < NEAR
     if not near.any():
         return _plain_entropy_function(u)
-    # u^2/2 + u^3/3 + u^4/8 + ...: sum over k >= 2 of (k - 1) u^k/k!.
-    small = np.where(near, u, 0.0)
-    series = np.zeros_like(small)
-    for factor in _SERIES:
-        series = series * small + factor
-    series = series * small * small
+    series = _entropy_series(np.where(near, u, 0.0))
     return series if near.all() else np.where(near, series, _plain_entropy_function(u))
+
+
+def _entropy_series(u: FloatArray) -> FloatArray:
+    # u^2/2 + u^3/3 + u^4/8 + ...: sum over k >= 2 of (k - 1) u^k/k!.
+    series = np.zeros_like(u)
+    for factor in _SERIES:
+        series = series * u + factor
+    return series * u * u
 
 
 def _plain_entropy_function(u: FloatArray) -> FloatArray:

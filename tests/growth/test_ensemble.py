@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from growth.exact_mixture import exact_energies
 from kcons.errors import BudgetError, ConstraintError, InputError
 from kcons.growth import ConstrainedGrowth, GrowthModel, Hypercycle, Populations, TotalPopulation, solve, solve_ensemble
 
@@ -54,6 +55,22 @@ def test_rows_hold_to_round_off():
     bound = system.bind(Populations.from_values(np.zeros(40), x0))
     for t, log_x in zip(found.t, found.log_x, strict=True):
         assert abs(bound.residuals(Populations.from_logarithms(np.full(40, t), log_x))).max() < 1e-15
+
+
+def test_entropy_row_where_the_excess_is_much_larger_than_the_gibbs_energy():
+    # One of the million of docs/growth.md: g_0 is -1.08, a sum of terms of 70, and lies 165 above equilibrium.
+    mu0, kT = [-56.5140392407906, 41.8127322553325, 13.366563603233304], 8.60383824140328
+    start = np.array([[0.06724395465832678], [0.6105286479569814], [-3.357717120539264]])
+    model = Hypercycle(3, 1.383051805375621, mu0, kT)
+    times = np.linspace(0.1, 1.0, 10) * 10.0 / float(model.k_h)
+    found = solve_ensemble(model.without_entropy_production(), times, log_x0=start, rtol=1e-6, atol=1e-8)
+    total0, energy0, least = exact_energies(mu0, kT, start[:, 0])
+    size = max(1.0, abs(float(energy0)))
+    for log_x in found.log_x[:, :, 0]:
+        total, energy, _ = exact_energies(mu0, kT, log_x)
+        assert abs(float(total - total0)) < 2e-15 * size
+        assert abs(float(energy - energy0)) < 1e-13 * size
+        assert abs(float(energy - total * least - energy0 + total0 * least)) < 1e-13 * size
 
 
 def test_those_that_settle_are_finished_at_once():

@@ -1,9 +1,12 @@
 """Thermodynamics of ideal mixtures."""
 
+from decimal import Decimal
+
 import numpy as np
 import pytest
 from scipy.special import rel_entr
 
+from growth.exact_mixture import exact_energies
 from growth.reference_cases import case
 from kcons.errors import InputError
 from kcons.growth import Mixture, Populations
@@ -94,3 +97,33 @@ def test_entropy_function_is_accurate_for_all_arguments():
 def test_bad_mixtures_are_refused(arguments):
     with pytest.raises(InputError):
         Mixture(*arguments)
+
+
+def test_excess_over_a_level_has_the_round_off_of_its_terms():
+    rng = np.random.default_rng(5)
+    sharp, plain = [], []
+    for _ in range(200):
+        # The third would be nearly alone at equilibrium, and is rare: the excess is hundreds of the terms of g.
+        mixture = Mixture(rng.normal(size=3) * 30.0 - [0.0, 0.0, 200.0])
+        p = Populations.from_logarithms(0.0, np.log(rng.dirichlet([1.0, 1.0, 1.0])) - [0.0, 0.0, 40.0])
+        total = float(np.sum(p.x))
+        level = float(mixture.excess(p, total))
+        X, g, least = exact_energies(mixture.mu0, 1.0, p.log_x)
+        exact = float(g - X * least - Decimal(level))
+        sharp.append(abs(float(mixture.excess_over(p, total, np.array(level))) - exact) / level)
+        plain.append(abs(float(mixture.excess(p, total)) - level - exact) / level)
+    assert max(sharp) < 1e-15
+    # What it is for.
+    assert max(plain) > 1e-14
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.05, 0.3])
+def test_excess_over_a_level_near_equilibrium(size):
+    mixture = Mixture(MU0)
+    log_x = mixture.equilibrium(1.0) + size * np.array([1.0, -2.0, 0.5, 3.0, -1.0])
+    log_x -= np.log(np.sum(np.exp(log_x)))
+    p = Populations.from_logarithms(0.0, log_x)
+    excess = mixture.excess(p, 1.0)
+    level = 0.75 * excess
+    assert mixture.excess_over(p, 1.0, level) == pytest.approx(0.25 * excess, rel=1e-13)
+    assert mixture.excess_over(p, 1.0, np.zeros(())) == pytest.approx(excess, rel=1e-14)
