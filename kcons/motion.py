@@ -22,8 +22,7 @@ from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ContradictionError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
-from kcons.plan import DistanceClusters, Plan, make_plan
-from kcons.solvers.water import RigidTriangles
+from kcons.plan import Plan, make_plan
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
@@ -108,18 +107,10 @@ class Motion:
     def degrees_of_freedom(self) -> int:
         return 3 * self.constraint_set.n_moving - self.plan.rank
 
-    @property
-    def triangles(self) -> RigidTriangles | None:
-        """The solver where rigid triangles at rest are all that is held: for kernels that do more in one call."""
-        if self._atoms is not None or self._moving or self._several or self.plan.driven or not self.plan.solvers:
-            return None
-        solver = self.plan.solvers[0]
-        inner = solver.solver if isinstance(solver, DistanceClusters) else None
-        return inner if isinstance(inner, RigidTriangles) else None
-
     def took(self, iterations: int) -> None:
-        """Remember for reports what a kernel that used `triangles` took."""
-        self._iterations[0] = iterations
+        """Remember for reports what a kernel took that did the work of all solvers in one call."""
+        for k in range(len(self._iterations)):
+            self._iterations[k] = iterations
 
     # -- cell -----------------------------------------------------------------------------------
 

@@ -6,8 +6,11 @@ positions change once, after every cluster has converged, so that a failure leav
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -101,7 +104,7 @@ class SparseDistances:
     ) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place; `lengths` in the order of `rows`."""
         for careful in (False, True):
-            failed, residual, iterations, worst = _positions(
+            failed, residual, iterations, worst = solve_positions(
                 careful, x_new, x_ref, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None,
                 *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
                 self._solution, self._kept_moves, self._kept_solution,
@@ -111,9 +114,9 @@ class SparseDistances:
         if failed:
             return Outcome(False, residual, iterations, worst)
         if velocities is None:
-            _apply(x_new, self._atoms, self._moves)
+            apply(x_new, self._atoms, self._moves)
         else:
-            _apply_both(x_new, velocities, inv_dt, self._atoms, self._moves)
+            apply_both(x_new, velocities, inv_dt, self._atoms, self._moves)
         if multipliers is not None:
             _natural(self._state, self._solution, 1.0, multipliers)
         return Outcome(True, residual, iterations, worst)
@@ -127,7 +130,7 @@ class SparseDistances:
         multipliers: FloatArray | None,
     ) -> Outcome:
         """M-orthogonal projection of y onto u.(y_i - y_j) = rates, in place."""
-        failed, residual, iterations, worst = _tangents(
+        failed, residual, iterations, worst = solve_tangents(
             x, y, self.lengths if rates is None else rates, rates is not None,
             NO_LATTICE if lattice is None else lattice, lattice is not None,
             *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
@@ -135,10 +138,16 @@ class SparseDistances:
         )  # fmt: skip
         if failed:
             return Outcome(False, residual, iterations, worst)
-        _apply(y, self._atoms, self._moves)
+        apply(y, self._atoms, self._moves)
         if multipliers is not None:
             _natural(self._state, self._solution, -1.0, multipliers)
         return Outcome(True, residual, iterations, worst)
+
+    def tables(self) -> tuple[tuple[NDArray[Any], ...], tuple[FloatArray, ...]]:
+        """What `solve_positions` and `solve_tangents` are given of the rows, and the rooms that they work in."""
+        return self._tables, (self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
+            self._solution, self._kept_moves, self._kept_solution,
+        )  # fmt: skip
 
     def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
@@ -150,11 +159,11 @@ class SparseDistances:
 
 def lengths_resolved(x: FloatArray, pairs: UIntArray, lengths: FloatArray, lattice: FloatArray | None) -> bool:
     """Whether each |sigma| at `x` is within max(1e-14 d, 2 eps (|x_i| + |x_j|))."""
-    return bool(_lengths_resolved(x, pairs, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None))
+    return bool(resolved(x, pairs, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _lengths_resolved(x, pairs, lengths, lattice, periodic):  # type: ignore[no-untyped-def]
+def resolved(x, pairs, lengths, lattice, periodic):  # type: ignore[no-untyped-def]
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         ax, ay, az = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
@@ -270,7 +279,7 @@ def _measure(first, last, lengths, links, state, starts, moves):  # type: ignore
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _positions(  # type: ignore[no-untyped-def]
+def solve_positions(  # type: ignore[no-untyped-def]
     careful, x_new, x_ref, lengths, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
     targets, couplings, weights, state, entries, pivots, starts, places, moves, solution, kept_moves, kept_solution,
 ):  # fmt: skip
@@ -362,7 +371,7 @@ def _worst(first, last, state, lengths):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(  # type: ignore[no-untyped-def]
+def solve_tangents(  # type: ignore[no-untyped-def]
     x, y, rates, driven, lattice, periodic, clusters, atoms, atom_start, w, links, columns,
     targets, couplings, weights, state, entries, pivots, starts, places, moves, solution,
 ):  # fmt: skip
@@ -453,14 +462,14 @@ def _natural(state, solution, sign, multipliers):  # type: ignore[no-untyped-def
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _apply(x, atoms, moves):  # type: ignore[no-untyped-def]
+def apply(x, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)
         add_to_point(x, g, load_quad(moves, 4 * a))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
+def apply_both(x, v, inv_dt, atoms, moves):  # type: ignore[no-untyped-def]
     for a in range(len(atoms)):
         g = 3 * entry(atoms, a)
         move = load_quad(moves, 4 * a)

@@ -19,11 +19,10 @@ from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import Flights
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
-from kcons.steppers.summation import Point
+from kcons.steppers.summation import NO_WORK, Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
-_NO_INTERVALS = np.empty((0, 0))
 
 
 class Splitting:
@@ -58,7 +57,9 @@ class Splitting:
         self.kick_first = len(self.kicks) > len(self.drifts)
         self._stages = _stages(self.drifts, self.flight)
         self._whole_stages = _stages(self.drifts, (1.0,))
-        self._fractions = np.array([stage.fractions for stage in self._stages])
+        self._fractions = [np.array(stage.fractions) for stage in self._stages]
+        self._many = len(self.drifts) * len(self.flight) > 1
+        self._no_kicks = (0.0,) * len(self.kicks)
 
     @property
     def force_evaluations(self) -> int:
@@ -88,27 +89,85 @@ class Splitting:
         still = stays(state, dt)
         if still is not None:
             return still
-        start = system.with_forces(state) if self.kick_first else state
-        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            step = _Step(system, start, dt, len(self.drifts) * len(self.flight) > 1, self.exact_flight)
-            stages = self._whole_stages if step.exact else self._stages
-            if step.flights is not None:
-                step.intervals = self._fractions * dt
-                step.tables = step.flights.tables()
-            try:
-                if system.velocity_dependent:
-                    step.with_friction(self.drifts, stages)
-                elif self.kick_first:
-                    step.kick_first(self.kicks, stages)
-                else:
-                    step.drift_first(self.kicks, stages)
-            except ConvergenceError as error:
-                step.refuse_unsound()
-                raise explained(error, system, state, dt, step.number) from error
-            except (InputError, NonFiniteError):
-                step.refuse_overflow()
-                raise
-            return step.end()
+        start = system.with_forces(state) if self.kick_first and state.forces is None else state
+        flights = system.flights
+        if flights is None or system.velocity_dependent or not self.kick_first:
+            return self._piecewise(system, start, dt)
+        if self.exact_flight and system.great_circles is not None:
+            return self._piecewise(system, start, dt)
+        return self._compiled(system, start, dt, flights)
+
+    # Overflow is looked for, and named with the step's number. As a decorator this costs half of a `with`.
+    @np.errstate(over="ignore", invalid="ignore")
+    def _piecewise(self, system: System, start: State, dt: float) -> State:
+        step = _Step(system, start, dt, self._many, self.exact_flight)
+        stages = self._whole_stages if step.exact else self._stages
+        if step.flights is not None:
+            step.fractions = self._fractions
+            step.tables = step.flights.tables()
+        try:
+            if system.velocity_dependent:
+                step.with_friction(self.drifts, stages)
+            elif self.kick_first:
+                step.kick_first(self.kicks, stages)
+            else:
+                step.drift_first(self.kicks, stages)
+        except ConvergenceError as error:
+            step.refuse_unsound()
+            raise explained(error, system, start, dt, step.number) from error
+        except (InputError, NonFiniteError):
+            step.refuse_overflow()
+            raise
+        return step.end()
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _compiled(self, system: System, start: State, dt: float, flights: Flights) -> State:
+        """K D K ... D K in few calls, each of which costs as much as its work on a few molecules."""
+        x, before = start.positions, start.velocities
+        shape, number, now = x.shape, start.step + 1, start.time
+        time, time_remainder = start.later(dt)
+        shift: FloatArray | None = None
+        if start.remainder is not None:
+            shift = x[system.anchor]
+            x = (x - shift) + start.remainder
+        weights, tables = system.weights, flights.tables()
+        v, work = np.empty(shape), np.empty((3, *shape)) if self._many else NO_WORK
+        kicks, forces = self._no_kicks, start.forces
+        f = weights
+        if system.force is not None and forces is not None:
+            kicks, f = self.kicks, forces
+        out, left = x, len(self._stages)
+        try:
+            for kick, stage, fractions in zip(kicks, self._stages, self._fractions, strict=False):
+                left -= 1
+                out = np.empty(shape)
+                now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else time
+                bad = flights.stage(
+                    x, before, v, work, kick * dt, f, weights, before is not v, fractions, dt, out, now, tables
+                )
+                if bad:
+                    check_finite(f, bad, number)
+                x, before = out, v
+                if system.force is not None:
+                    f = system.forces(x if shift is None else x + shift, v, now, number, copy=not left, finite=False)
+            bad = flights.end(x, v, work, kicks[-1] * dt, f, weights, now, tables)
+            if bad:
+                check_finite(f if bad == "force" else x if bad == "position" else v, bad, number)
+        except ConvergenceError as error:
+            raise explained(error, system, start, dt, number) from error
+        except InputError:
+            for array, item in ((out, "position"), (v, "velocity"), (work[1] if self._many else v, "velocity")):
+                check_finite(array, item, number)
+            raise
+        if system.force is not None:
+            forces = f
+        remainder = None
+        if shift is not None:
+            out = x + shift
+            remainder = x - (out - shift)
+        elif system.is_far(x):  # by now: from here on relative to one atom
+            remainder = work[0].copy() if self._many else np.zeros(shape)
+        return State(out, v, time, forces, number, remainder, time_remainder)
 
 
 class Stage(NamedTuple):
@@ -138,9 +197,9 @@ class _Step:
         circles = system.great_circles if exact_flight else None
         self.exact = circles is not None
         self.flight: Drift = system.drift if circles is None else circles
-        #: Where stages are compiled: the lengths of their flights, and what the kernels need.
+        #: Where stages are compiled: the fractions of the step that their flights take, and what the kernels need.
         self.flights = None if self.exact else system.flights
-        self.intervals: FloatArray = _NO_INTERVALS
+        self.fractions: Sequence[FloatArray] = ()
         self.tables: tuple[Any, ...] = ()
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
@@ -157,9 +216,6 @@ class _Step:
 
     def kick_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """K D K ... D K."""
-        if self.flights is not None:
-            self.compiled_kick_first(kicks, stages, self.flights)
-            return
         self.kick(kicks[0])
         for fraction, stage in zip(kicks[1:-1], stages[:-1], strict=True):
             self.drift(stage)
@@ -169,28 +225,6 @@ class _Step:
         self.evaluate(keep=True)
         self.kick(kicks[-1])
         self.project()
-
-    def compiled_kick_first(self, kicks: Sequence[float], stages: list[Stage], flights: Flights) -> None:
-        """The same in few calls, each of which costs as much as its work on a few molecules."""
-        system, start, point, dt, shift, tables = self.system, self.start, self.point, self.dt, self.shift, self.tables
-        driven = system.force is not None
-        forces = self.forces if self.forces is not None and driven else system.weights
-        x = point.x
-        left = len(stages)
-        for kick, stage, intervals in zip(kicks, stages, self.intervals, strict=False):
-            left -= 1
-            self.out = x = np.empty_like(x)
-            now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else self.time
-            bad = flights.stage(point, kick * dt if driven else 0.0, forces, intervals, x, now, tables)
-            if bad:
-                self.refuse(bad)
-            if driven:
-                seen = x if shift is None else x + shift
-                self.forces = forces = system.forces(seen, point.v, now, self.number, copy=not left, finite=False)
-        self.now = now
-        bad = flights.end(point, kicks[-1] * dt if driven else 0.0, forces, now, tables)
-        if bad:
-            self.refuse(bad)
 
     def drift_first(self, kicks: Sequence[float], stages: list[Stage]) -> None:
         """D K D ... K D; the forces of the last kick are not those of the end."""
@@ -225,7 +259,7 @@ class _Step:
         self.out = out = np.empty_like(point.x)
         if self.flights is not None:
             self.now = now = self.ended(stage.ends[-1])
-            bad = self.flights.stage(point, *point.take_kick(), self.intervals[stage.number], out, now, self.tables)
+            bad = self.flights.move(point, self.fractions[stage.number], dt, out, now, self.tables)
             if bad:
                 self.refuse(bad)
             return
@@ -276,7 +310,8 @@ class _Step:
     def project(self) -> None:
         point = self.point
         if self.flights is not None:
-            bad = self.flights.end(point, *point.take_kick(), self.now, self.tables)
+            kick, force = point.take_kick()
+            bad = self.flights.end(point.x, point.v, point.work, kick, force, point.weights, self.now, self.tables)
             if bad:
                 self.refuse(bad)
             return

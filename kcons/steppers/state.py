@@ -275,8 +275,8 @@ class System:
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
         raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
-        if not copy and type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.flags.c_contiguous:
-            f: FloatArray = raw
+        if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.flags.c_contiguous:
+            f: FloatArray = raw.copy() if copy else raw
         else:
             f = self._force_array(raw, copy, step)
         if f.shape != (self.n_atoms, 3):

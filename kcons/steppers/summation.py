@@ -13,7 +13,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 
 #: Stands for the work arrays where a step adds up nothing.
-_NO_WORK = np.empty((0, 0, 3))
+NO_WORK = np.empty((0, 0, 3))
 
 
 class Point:
@@ -41,7 +41,7 @@ class Point:
             self.work = np.empty((3, *x.shape))
             self.x_low, self.push = self.work[0], self.work[1]
         else:
-            self.work, self.x_low, self.push = _NO_WORK, None, v
+            self.work, self.x_low, self.push = NO_WORK, None, v
         #: Whether the forces of all kicks that were done are finite.
         self.sound = True
         self._kick = 0.0
