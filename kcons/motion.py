@@ -117,7 +117,7 @@ class Motion:
     @property
     def lattice(self) -> FloatArray | None:
         """The cell and its inverse as they are now, shape (2, 3, 3); None without periodicity."""
-        return self._cell()
+        return self.cell()
 
     def set_cell(
         self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True, positions: ArrayLike | None = None
@@ -240,7 +240,7 @@ class Motion:
     ) -> None:
         """Run all solvers on the local arrays in place; restore them and raise if one fails."""
         plan = self.plan
-        lattice = self._cell()
+        lattice = self.cell()
         targets = self._local.target(time) if self._moving else None
         # One solver alone restores what it changed; several need a copy to go back to.
         saved = (x.copy(), None if velocities is None else velocities.copy()) if self._several else None
@@ -286,8 +286,10 @@ class Motion:
         for solver, lam in zip(self.plan.solvers, found, strict=True):
             multipliers[solver.rows] = lam
 
-    def _cell(self) -> FloatArray | None:
-        """The cell as it is now, which a barostat may have changed in the set that was given."""
+    def cell(self) -> FloatArray | None:
+        """`lattice`, which a barostat may have changed in the set that was given."""
+        if self._given.lattice is self._lattice and self.constraint_set.lattice is self._lattice:
+            return self._lattice
         for source in (self._given, self.constraint_set):
             if source.lattice is not self._lattice:
                 self._lattice = source.lattice
@@ -313,7 +315,7 @@ class Motion:
         """
         if out is not None:
             check_out(out, self._shape)
-        self._cell()
+        self.cell()
         result = as_array(x, self._shape, "positions").copy()
         local = result if self._atoms is None else result[self._atoms]
         targets = self._local.target(time) if self._moving else None
@@ -398,7 +400,7 @@ class Motion:
         what: str,
     ) -> None:
         plan = self.plan
-        lattice = self._cell()
+        lattice = self.cell()
         saved = y.copy() if self._several else None
         if len(plan.pinned):
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
@@ -502,7 +504,7 @@ class Motion:
         """
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
-        self._cell()
+        self.cell()
         return diagnosis.make_report(
             self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition
         )

@@ -1,14 +1,13 @@
 """Distance rows of every shape behind one pair of kernels, for kernels that do more than solve in one call.
 
 A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
-compiled for each of their combinations. Here all that the solvers need lies in three arrays: rigid triangles, eight at
-a time (`kcons.solvers.water`), and whatever else is held by sparse elimination (`kcons.solvers.distances`), which
-knows every shape and is the fastest for few rows of many shapes.
+compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
+time (`kcons.solvers.water`), and whatever else is held by sparse elimination (`kcons.solvers.distances`), which knows
+every shape and is the fastest for few rows of many shapes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numba as nb
@@ -18,9 +17,9 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers import distances
+from kcons.solvers.borrowed import piece
 from kcons.solvers.distances import SparseDistances
-from kcons.solvers.elimination import UIntArray
-from kcons.solvers.groups import OPEN
+from kcons.solvers.groups import NO_LATTICE, OPEN, lattice_kind
 from kcons.solvers.storage import LINE, aligned
 from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tangents
 
@@ -28,10 +27,10 @@ from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tan
 _MAX_ROUNDS = 4
 #: Numbers in a cache line.
 _ALIGNMENT = LINE // 8
-_NO_NUMBERS = np.zeros(0)
-_NO_OFFSETS = np.zeros(0, dtype=np.uint32)
 
-Packed = tuple[FloatArray, IntArray, UIntArray]
+#: Pieces: lengths, pairs, what `SparseDistances.tables` gives, tables of triangles, fixed atoms, the cell.
+_LENGTHS, _PAIRS, _ATOMS, _MOVES = 0, 1, 3, 16
+_CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, MORE = range(20, 30)
 
 
 def packed(
@@ -41,7 +40,8 @@ def packed(
     inverse_masses: FloatArray,
     pinned: IntArray,
     places: FloatArray,
-) -> Packed:
+    *more: NDArray[Any],
+) -> FloatArray:
     """What `packed_positions` and `packed_tangents` need to know.
 
     Parameters
@@ -55,84 +55,63 @@ def packed(
     pinned : ndarray of int
         Fixed atoms.
     places : ndarray, shape (n_pinned, 3)
+    *more : ndarray of float64 or uint32, flat
+        Pieces number `MORE` and on, for the caller's own kernels.
 
     Returns
     -------
-    numbers : ndarray of float64
-    whole : ndarray of int64
-        Begins with where the pieces of all three are.
-    small : ndarray of uint32
+    ndarray of float64
+        Begins with where each piece starts and ends, as integers.
     """
+    pieces: list[NDArray[Any]]
     if len(pairs):
         solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses)
-        (clusters, atoms, atom_start, w, links, columns, targets, couplings, weights), rooms = solver.tables()
-        floats = [solver.lengths, w, couplings, weights, *rooms]
-        integers = [clusters, atom_start]
-        unsigned = [atoms, links, columns, targets, pairs[solver.rows].ravel()]
+        tables, rooms = solver.tables()
+        pieces = [solver.lengths, pairs[solver.rows].astype(np.uint32).ravel(), *tables, *rooms]
     else:
-        floats, integers, unsigned = [_NO_NUMBERS] * 13, [np.zeros(1, dtype=np.int64)] * 2, [_NO_OFFSETS] * 5
+        none, offsets, start = np.zeros(0), np.zeros(0, dtype=np.uint32), np.zeros(1, dtype=np.int64)
+        pieces = [none, offsets, start, offsets, start, none, *[offsets] * 3, *[none] * 11]
     if triangles is None:
-        floats += [_NO_NUMBERS] * 3
-        unsigned += [_NO_OFFSETS] * 2
+        pieces += [np.zeros(0, dtype=np.uint32)] * 2 + [np.zeros(0)] * 3
     else:
         corners, slots, sides, inv_mass, undo = triangles.tables()
-        floats += [sides.ravel(), inv_mass, undo]
-        unsigned += [corners, slots]
-    floats.append(places.ravel())
-    unsigned.append(pinned)
-    head = 2 * (len(floats) + len(integers) + len(unsigned))
-    parts = [_placed(floats, 0), _placed(unsigned, 0), _placed(integers, head)]
-    numbers, small, whole = aligned(parts[0][1]), np.zeros(parts[1][1], np.uint32), np.zeros(parts[2][1], np.int64)
-    whole[:head] = np.concatenate([cuts for cuts, _ in parts]).ravel()
-    for room, pieces, (cuts, _) in zip((numbers, small, whole), (floats, unsigned, integers), parts, strict=True):
-        for piece, (start, end) in zip(pieces, cuts, strict=True):
-            room[start:end] = piece
-    return numbers, whole, small
-
-
-def _placed(pieces: Sequence[NDArray[Any]], start: int) -> tuple[IntArray, int]:
-    """Where each piece begins and ends, shape (n, 2), each in a cache line of its own; and the end of all."""
+        pieces += [corners, slots, sides.ravel(), inv_mass, undo]
+    pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel(), *more]
     cuts = np.zeros((len(pieces), 2), dtype=np.int64)
-    for k, piece in enumerate(pieces):
-        cuts[k] = start, start + piece.size
-        start += -(-piece.size // _ALIGNMENT) * _ALIGNMENT
-    return cuts, start
+    end = 2 * len(pieces)
+    for k, part in enumerate(pieces):
+        # Each in cache lines of its own, counted in its own numbers.
+        first = -(-end // _ALIGNMENT) * LINE // part.itemsize
+        cuts[k] = first, first + part.size
+        end = -(-(first + part.size) * part.itemsize // 8)
+    room = aligned(end)
+    room.view(np.int64)[: cuts.size] = cuts.ravel()
+    for part, (first, last) in zip(pieces, cuts, strict=True):
+        room.view(part.dtype)[first:last] = part
+    return room
 
 
-# Places in the header: floats, then unsigned numbers, then integers, each with its start and its end.
-
-
-@nb.njit(cache=True, inline="always")
-def _floats(numbers, whole, k):  # type: ignore[no-untyped-def]
-    return numbers[whole[2 * k] : whole[2 * k + 1]]
-
-
-@nb.njit(cache=True, inline="always")
-def _unsigned(small, whole, k):  # type: ignore[no-untyped-def]
-    return small[whole[34 + 2 * k] : whole[34 + 2 * k + 1]]
-
-
-@nb.njit(cache=True, inline="always")
-def _integers(whole, k):  # type: ignore[no-untyped-def]
-    return whole[whole[50 + 2 * k] : whole[50 + 2 * k + 1]]
+def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
+    """Change the periodic cell, shape (2, 3, 3) with its inverse, in tables of `packed`."""
+    values, kind = lattice_kind(lattice)
+    header = tables.view(np.int64)
+    tables[header[2 * _LATTICE] : header[2 * _LATTICE + 1]] = values.ravel()
+    header[header[2 * _KIND]] = kind
 
 
 @nb.njit(cache=True, inline="always")
-def _solve(x, x_ref, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]
+def _solve(x, x_ref, lattice, periodic, t, u, h):  # type: ignore[no-untyped-def]
     """Newton's method for all rows but those of triangles; nothing changes but the rooms."""
     return distances.solve_positions(
-        False, x, x_ref, _floats(numbers, whole, 0), lattice, kind != OPEN, _integers(whole, 0),
-        _unsigned(small, whole, 0), _integers(whole, 1), _floats(numbers, whole, 1), _unsigned(small, whole, 1),
-        _unsigned(small, whole, 2), _unsigned(small, whole, 3), _floats(numbers, whole, 2),
-        _floats(numbers, whole, 3), _floats(numbers, whole, 4), _floats(numbers, whole, 5),
-        _floats(numbers, whole, 6), _floats(numbers, whole, 7), _floats(numbers, whole, 8),
-        _floats(numbers, whole, 9), _floats(numbers, whole, 10), _floats(numbers, whole, 11),
-        _floats(numbers, whole, 12),
+        False, x, x_ref, piece(t, h, 0), lattice, periodic, piece(h, h, 2), piece(u, h, 3), piece(h, h, 4),
+        piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10),
+        piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, 16),
+        piece(t, h, 17), piece(t, h, 18), piece(t, h, 19),
     )  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]
+def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Returns
@@ -140,66 +119,63 @@ def packed_positions(x, x_ref, v, inv_dt, lattice, kind, numbers, whole, small):
     int
         Iterations; -1 where there is no solution, with `x` and `v` as they were but for fixed atoms.
     """
-    pinned, places = _unsigned(small, whole, 7), _floats(numbers, whole, 16)
+    t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
+    lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
+    pinned, places = piece(u, h, _PINNED), piece(t, h, _PLACES)
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
-    atoms = _unsigned(small, whole, 0)
+    atoms, slots = piece(u, h, _ATOMS), piece(u, h, _SLOTS)
     most = 0
     if atoms.size:
-        failed, _, most, _ = _solve(x, x_ref, lattice, kind, numbers, whole, small)
+        failed, _, most, _ = _solve(x, x_ref, lattice, kind != OPEN, t, u, h)
         if failed:
             return -1
-    slots = _unsigned(small, whole, 6)
     if slots.size:
         landed, _, iterations, _ = triangle_positions(
-            x, x_ref, v, inv_dt, _unsigned(small, whole, 5), slots, _floats(numbers, whole, 13).reshape(-1, 3),
-            _floats(numbers, whole, 14), lattice, kind, places[:0], _floats(numbers, whole, 15),
+            x, x_ref, v, inv_dt, piece(u, h, _CORNERS), slots, piece(t, h, _SIDES).reshape(-1, 3),
+            piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO),
         )  # fmt: skip
         if not landed:
             return -1
         most = max(most, iterations)
     if atoms.size:
-        moves = _floats(numbers, whole, 9)
+        moves, pairs, lengths = piece(t, h, _MOVES), piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS)
         distances.apply_both(x, v, inv_dt, atoms, moves)
-        pairs, lengths = _unsigned(small, whole, 4).reshape(-1, 2), _floats(numbers, whole, 0)
-        for _ in range(_MAX_ROUNDS):
-            # Large multipliers have a rounding that shows in the positions; another round takes it away.
-            if distances.resolved(x, pairs, lengths, lattice, kind != OPEN):
-                break
-            failed, _, _, _ = _solve(x, x_ref, lattice, kind, numbers, whole, small)
+        rounds = 0
+        # Large multipliers have a rounding that shows in the positions; another round takes it away.
+        while rounds < _MAX_ROUNDS and not distances.resolved(x, pairs, lengths, lattice, kind != OPEN):
+            failed, _, _, _ = _solve(x, x_ref, lattice, kind != OPEN, t, u, h)
             if failed:
                 break
             distances.apply_both(x, v, inv_dt, atoms, moves)
+            rounds += 1
     return most
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_tangents(x, v, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
-    pinned = _unsigned(small, whole, 7)
+    t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
+    lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
+    pinned = piece(u, h, _PINNED)
     for k in range(pinned.size):
         for axis in range(3):
             v[pinned[k], axis] = 0.0
-    atoms = _unsigned(small, whole, 0)
-    moves = _floats(numbers, whole, 9)
+    atoms, slots, moves = piece(u, h, _ATOMS), piece(u, h, _SLOTS), piece(t, h, _MOVES)
     if atoms.size:
         failed, _, _, _ = distances.solve_tangents(
-            x, v, moves, False, lattice, kind != OPEN, _integers(whole, 0),
-            atoms, _integers(whole, 1), _floats(numbers, whole, 1), _unsigned(small, whole, 1),
-            _unsigned(small, whole, 2), _unsigned(small, whole, 3), _floats(numbers, whole, 2),
-            _floats(numbers, whole, 3), _floats(numbers, whole, 4), _floats(numbers, whole, 5),
-            _floats(numbers, whole, 6), _floats(numbers, whole, 7), _floats(numbers, whole, 8),
-            moves, _floats(numbers, whole, 10),
+            x, v, t, False, lattice, kind != OPEN, piece(h, h, 2), atoms, piece(h, h, 4),
+            piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10),
+            piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), moves,
+            piece(t, h, 17),
         )  # fmt: skip
         if failed:
             return False
-    slots = _unsigned(small, whole, 6)
     if slots.size:
         converged, _, _, _ = triangle_tangents(
-            x, v, _unsigned(small, whole, 5), slots, moves[:0], _floats(numbers, whole, 14), lattice, kind, moves[:0],
-            _floats(numbers, whole, 15),
-        )  # fmt: skip
+            x, v, piece(u, h, _CORNERS), slots, t[:0], piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO)
+        )
         if not converged:
             return False
     if atoms.size:

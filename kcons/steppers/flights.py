@@ -8,26 +8,30 @@ as it was for the engine, which has more means and names the row.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.plan import DistanceClusters
-from kcons.solvers.groups import lattice_kind
-from kcons.solvers.packed import Packed, packed, packed_positions, packed_tangents
+from kcons.solvers.borrowed import piece
+from kcons.solvers.packed import MORE, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.water import RigidTriangles
-from kcons.steppers.summation import Point, add_kick, all_finite, fly, fly_first, fly_once, land
+from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 128
 
-#: What a kernel reports.
-_DONE, _FORCE, _POSITION, _VELOCITY, _ENGINE = range(5)
-_WHAT = ("", "force", "position", "velocity")
+#: What a kernel reports of a stage besides iterations: the force is not finite; the engine has to do a flight (less the
+#: number of the flight).
+_FORCE, _ENGINE = -1, -2
+#: What it reports of the end of a step; less than 0 where the engine has to do it.
+_WHAT = ("", "force", "position", "velocity", "far")
 
 
 class Flights:
@@ -36,86 +40,55 @@ class Flights:
     Parameters
     ----------
     motion : Motion
-    tables : tuple of ndarray
-        All its rows, from `kcons.solvers.packed`.
+    tables : ndarray
+        All its rows, from `kcons.solvers.packed`, 1/m for each coordinate, the atoms that show whether the system is
+        far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
     """
 
-    def __init__(self, motion: Motion, tables: Packed) -> None:
+    def __init__(self, motion: Motion, tables: FloatArray) -> None:
         self.motion = motion
         self._tables = tables
+        self._cell = motion.cell
+        #: The state that the last step ended in, whose arrays need no `known`.
+        self.last: object = None
+        #: Iterations that the engine has been told of.
+        self.took = -1
         self._lattice = motion.lattice
-        self._all_tables = (*lattice_kind(self._lattice), *tables)
+        set_lattice(tables, self._lattice)
 
     @classmethod
-    def of(cls, motion: Motion) -> Flights | None:
-        """For the rows of `motion`, or None if they are too many, move, or hold anything but distances."""
-        found = _packed(motion)
-        return None if found is None else cls(motion, found)
-
-    def tables(self) -> tuple[Any, ...]:
-        """What the kernels need to know, for one step: the cell as it is now, and the rows."""
-        lattice = self.motion.lattice
-        if lattice is not self._lattice:
-            self._lattice, self._all_tables = lattice, (*lattice_kind(lattice), *self._tables)
-        return self._all_tables
-
-    def move(
-        self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: tuple[Any, ...]
-    ) -> str:
-        """`stage` for a point, with the kick that it has not taken yet; `out` becomes point.x."""
-        kick, force = point.take_kick()
-        v, fresh = point.v, point.fresh
-        if fresh:
-            point.v = np.empty_like(v)
-            if point.x_low is None:
-                point.push = point.v
-            point.fresh = False
-        bad = self.stage(point.x, v, point.v, point.work, kick, force, point.weights, fresh, fractions, dt, out, time,
-            tables,
-        )  # fmt: skip
-        if not bad:
-            point.x = out
-        return bad
-
-    def stage(
-        self,
-        x: FloatArray,
-        v0: FloatArray,
-        v: FloatArray,
-        work: FloatArray,
-        kick: float,
-        force: FloatArray,
-        weights: FloatArray,
-        fresh: bool,
-        fractions: FloatArray,
-        dt: float,
-        out: FloatArray,
-        time: float,
-        tables: tuple[Any, ...],
-    ) -> str:
-        """A kick of `v0` by kick M^-1 force, then flights from `x` on; the last ends in `out`.
+    def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> Flights | None:
+        """For the rows of `motion`, or None if they are too many, move, or hold anything but distances.
 
         Parameters
         ----------
-        x, v0 : ndarray, shape (n_atoms, 3)
-        v : ndarray, shape (n_atoms, 3)
-            The velocities in the end; may be `v0`.
-        work : ndarray, shape (3, n_atoms, 3) or (0, 0, 3)
-            That of `Point`.
-        kick, force
-            As for `Point.kick`.
+        motion : Motion
         weights : ndarray, shape (n_atoms, 3)
             1/m.
-        fresh : bool
-            Whether `work` holds nothing yet.
-        fractions : ndarray, shape (n_flights,)
-            Of `dt`. One only where nothing is added up.
-        dt : float
-        out : ndarray, shape (n_atoms, 3)
-        time : float
-            For messages: nothing that is held here moves.
-        tables : tuple
-            From `tables`, in this step.
+        held : ndarray of int
+            Atoms none of which is far from the first where the system is near the origin; empty if it is never far.
+        far : float
+            The system is far if the first is this many times farther from the origin than from any other.
+        """
+        found = _packed(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
+        return None if found is None else cls(motion, found)
+
+    def tables(self) -> FloatArray:
+        """What the kernels need to know, for one step: the rows, and the cell as it is now."""
+        lattice = self._cell()
+        if lattice is not self._lattice:
+            self._lattice = lattice
+            set_lattice(self._tables, lattice)
+        return self._tables
+
+    def known(self, *arrays: FloatArray) -> Iterator[FloatArray]:
+        """Arrays as the kernels were compiled for, or copies: read-only ones would have all compiled once more."""
+        return (a if a.flags.carray else np.array(a, dtype=np.float64, order="C") for a in arrays)
+
+    def move(
+        self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: FloatArray
+    ) -> str:
+        """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.
 
         Returns
         -------
@@ -127,57 +100,87 @@ class Flights:
         ConvergenceError
             As a flight by the engine.
         """
-        # For other arrays, such as read-only ones, everything would be compiled once more.
-        x, v0, force = (a if a.flags.carray else np.array(a, dtype=np.float64, order="C") for a in (x, v0, force))
-        status, at, iterations = _stage(fractions, dt, 0, x, v0, v, work, kick, force, weights, fresh, out, *tables)
-        while status == _ENGINE:
-            ends, starts = out, x
-            if len(fractions) > 1:
-                spare = work[2]
-                ends, starts = (out, spare) if (len(fractions) - at) % 2 else (spare, out)
-            h = float(fractions[at]) * dt
-            push = work[1] if len(work) else v
-            self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
-            status, at, iterations = _stage(
-                fractions, dt, at + 1, x, v, v, work, 0.0, weights, weights, False, out, *tables
-            )
-        if status == _DONE:
-            if iterations >= 0:
-                self.motion.took(iterations)
-            return ""
-        return _WHAT[status]
+        kick, force = point.take_kick()
+        x, before, fresh = point.x, point.v, point.fresh
+        x, before, force = self.known(x, before, force)
+        if fresh:
+            point.v = np.empty_like(before)
+            if point.x_low is None:
+                point.push = point.v
+            point.fresh = False
+        v, work = point.v, point.work
+        if len(work):
+            found = many_flights(fractions, dt, 0, x, before, v, work, kick, force, fresh, out, tables)
+        else:
+            found = one_flight(dt, x, before, v, kick, force, out, tables)
+        bad = self.landed(found, fractions, dt, x, v, work, force, out, time, tables)
+        if not bad:
+            point.x = out
+        return bad
 
-    def end(
+    def landed(
         self,
+        found: int,
+        fractions: FloatArray,
+        dt: float,
         x: FloatArray,
         v: FloatArray,
         work: FloatArray,
-        kick: float,
         force: FloatArray,
-        weights: FloatArray,
+        out: FloatArray,
         time: float,
-        tables: tuple[Any, ...],
+        tables: FloatArray,
     ) -> str:
-        """A kick, and the velocities projected, after a stage.
+        """What `one_flight` or `many_flights` left to do, from what it reports and the rest of what it was given.
+
+        Parameters
+        ----------
+        time : float
+            For messages: nothing that is held here moves.
+
+        Returns, Raises
+        ---------------
+        As `move`.
+        """
+        while found < 0:
+            if found == _FORCE:
+                return "force"
+            at = _ENGINE - found
+            ends, starts, push, h = out, x, v, dt
+            if len(work):
+                spare, push, h = work[2], work[1], float(fractions[at]) * dt
+                ends, starts = (out, spare) if (len(fractions) - at) % 2 else (spare, out)
+            self.took = -1
+            self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
+            if at + 1 == len(fractions):
+                return ""
+            found = many_flights(fractions, dt, at + 1, x, v, v, work, 0.0, force, False, out, tables)
+        if found != self.took:
+            self.took = found
+            self.motion.took(found)
+        return ""
+
+    def ended(self, found: int, x: FloatArray, v: FloatArray, time: float, tables: FloatArray) -> str:
+        """What `end_step` left to do, from what it reports and what it was given.
 
         Returns
         -------
         str
-            Empty, or what is not finite: "force", "position" or "velocity".
+            Empty; what is not finite ("force", "position" or "velocity"); or "far", if all is well but so far from
+            the origin that the next step is made relative to an atom.
 
         Raises
         ------
         ConvergenceError
             As `Motion.project_velocities`.
         """
-        status = _end(x, v, work, kick, force, weights, *tables)
-        if status == _ENGINE:
+        if found < 0:
             self.motion.project_velocities(x, v, time=time, out=v)
-            status = _DONE if all_finite(v) else _VELOCITY
-        return _WHAT[status]
+            found = _after(x, v, tables)
+        return _WHAT[found]
 
 
-def _packed(motion: Motion) -> Packed | None:
+def _packed(motion: Motion, *more: NDArray[Any]) -> FloatArray | None:
     """The tables of all rows; None where there are rows that the kernels do not know."""
     plan, held = motion.plan, motion.constraint_set
     if plan.driven or held.moving or plan.loose is not None:
@@ -203,56 +206,86 @@ def _packed(motion: Motion) -> Packed | None:
         return None
     pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
     lengths = held.target(0.0)[others]
-    return packed(triangles, pairs, lengths, inverse_masses, pinned, plan.pinned_targets(None))
-
-
-# The tables are those of `Flights.tables`: lattice, kind, and what `kcons.solvers.packed` takes.
+    return packed(triangles, pairs, lengths, inverse_masses, pinned, plan.pinned_targets(None), *more)
 
 
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
-    if work.shape[0] == 0:
-        push = v
-        sound = fly_once(x, v0, kick, force, weights, h, v, out)
+    if fresh:
+        sound = fly_first(x, work[0], v0, v, work[1], kick, force, weights, h, out)
     else:
-        push = work[1]
-        if fresh:
-            sound = fly_first(x, work[0], v0, v, push, kick, force, weights, h, out)
-        else:
-            sound = fly(x, work[0], v, push, kick, force, weights, h, out)
-    if not sound:
-        return -2
-    return packed_positions(out, x, push, 1.0 / h, lattice, kind, numbers, whole, small)
+        sound = fly(x, work[0], v, work[1], kick, force, weights, h, out)
+    return packed_positions(out, x, work[1], 1.0 / h, tables) if sound else -2
 
 
 @numba.njit(cache=True, nogil=True)
-def _stage(fractions, dt, first, x, v0, v, work, kick, force, weights, fresh, out, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Flights from number `first` on; they end in `out` and in work[2] by turns, the last one in `out`."""
+def one_flight(h, x, v0, v, kick, force, out, tables):  # type: ignore[no-untyped-def]
+    """A kick of `v0` by kick M^-1 force, then a flight of `h` from `x` to `out` that adds up no remainders.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n_atoms, 3)
+        The velocities in the end; may be `v0`.
+    tables : ndarray
+        From `Flights.tables`, in this step.
+
+    Returns
+    -------
+    int
+        Iterations, or what `Flights.landed` has to do.
+    """
+    weights = piece(tables, tables.view(np.int64), MORE)
+    if not fly_once(x, v0, kick, force, weights, h, v, out):
+        return _FORCE
+    took = packed_positions(out, x, v, 1.0 / h, tables)
+    return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
+
+
+@numba.njit(cache=True, nogil=True)
+def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, tables):  # type: ignore[no-untyped-def]
+    """The same in flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
+
+    `work` is that of `Point`, `fresh` whether it holds nothing yet.
+    """
+    weights = piece(tables, tables.view(np.int64), MORE)
     n, took = fractions.size, -1
     for i in range(first, n):
-        h = fractions[i] * dt
-        start, end = (work[2], out) if (n - i) % 2 == 1 else (out, work[2])
-        if i == 0:
-            start = x
-        else:
-            kick, fresh = 0.0, False
-        took = _flight(start, v0 if i == 0 else v, v, work, kick, force, weights, fresh, h, end,
-            lattice, kind, numbers, whole, small,
-        )  # fmt: skip
+        # They end in `out` and in work[2] by turns.
+        start, end = x, out
+        if (n - i) % 2 == 0:
+            end = work[2]
+        if i > 0:
+            start = out if (n - i) % 2 == 0 else work[2]
+            v0, kick, fresh = v, 0.0, False
+        took = _flight(start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables)
         if not 0 <= took <= MANY_ITERATIONS:
-            return (_FORCE if took == -2 else _ENGINE), i, took
-    return _DONE, n, took
+            return _FORCE if took == -2 else _ENGINE - i
+    return took
 
 
 @numba.njit(cache=True, nogil=True)
-def _end(x, v, work, kick, force, weights, lattice, kind, numbers, whole, small):  # type: ignore[no-untyped-def]
-    """A kick, then the velocities projected."""
+def end_step(x, v, work, kick, force, tables):  # type: ignore[no-untyped-def]
+    """A kick, then the velocities projected.
+
+    Returns
+    -------
+    int
+        0, or what `Flights.ended` has to do.
+    """
+    weights = piece(tables, tables.view(np.int64), MORE)
     sound = add_kick(v, kick, force, weights) if work.shape[0] == 0 else land(v, work[1], kick, force, weights)
     if not sound:
-        return _FORCE
+        return 1
     if not all_finite(x):
-        return _POSITION
-    if not packed_tangents(x, v, lattice, kind, numbers, whole, small):
-        return _ENGINE
-    return _DONE if all_finite(v) else _VELOCITY
+        return 2
+    return _after(x, v, tables) if packed_tangents(x, v, tables) else -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _after(x, v, tables):  # type: ignore[no-untyped-def]
+    if not all_finite(v):
+        return 3
+    header = tables.view(np.int64)
+    held, far = piece(tables.view(np.uint32), header, MORE + 1), piece(tables, header, MORE + 2)
+    return 4 if held.size and beyond(x, held, held[0], far[0]) else 0

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.steppers.drifts import Drift
-from kcons.steppers.flights import Flights
+from kcons.steppers.flights import Flights, end_step, many_flights, one_flight
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import NO_WORK, Point
@@ -71,6 +71,8 @@ class Splitting:
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` where the stepper may not be used: here, nowhere."""
 
+    # As a decorator this costs half of a `with`. What overflows is looked for, and named with the step's number.
+    @np.errstate(over="ignore", invalid="ignore")
     def step(self, system: System, state: State, dt: float) -> State:
         """Advance by `dt`; negative steps go back, 0 changes nothing.
 
@@ -86,7 +88,7 @@ class Splitting:
             The stepper may not be used with this system.
         """
         self.check(system)
-        still = stays(state, dt)
+        still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
         start = system.with_forces(state) if self.kick_first and state.forces is None else state
@@ -97,8 +99,6 @@ class Splitting:
             return self._piecewise(system, start, dt)
         return self._compiled(system, start, dt, flights)
 
-    # Overflow is looked for, and named with the step's number. As a decorator this costs half of a `with`.
-    @np.errstate(over="ignore", invalid="ignore")
     def _piecewise(self, system: System, start: State, dt: float) -> State:
         step = _Step(system, start, dt, self._many, self.exact_flight)
         stages = self._whole_stages if step.exact else self._stages
@@ -120,54 +120,64 @@ class Splitting:
             raise
         return step.end()
 
-    @np.errstate(over="ignore", invalid="ignore")
     def _compiled(self, system: System, start: State, dt: float, flights: Flights) -> State:
         """K D K ... D K in few calls, each of which costs as much as its work on a few molecules."""
-        x, before = start.positions, start.velocities
-        shape, number, now = x.shape, start.step + 1, start.time
+        x, before, forces = start.positions, start.velocities, start.forces
+        shape, number = x.shape, start.step + 1
         time, time_remainder = start.later(dt)
         shift: FloatArray | None = None
         if start.remainder is not None:
             shift = x[system.anchor]
             x = (x - shift) + start.remainder
-        weights, tables = system.weights, flights.tables()
-        v, work = np.empty(shape), np.empty((3, *shape)) if self._many else NO_WORK
-        kicks, forces = self._no_kicks, start.forces
-        f = weights
-        if system.force is not None and forces is not None:
-            kicks, f = self.kicks, forces
+        force, kicks, f = system.force, self.kicks, forces
+        if force is None or f is None:
+            kicks, f = self._no_kicks, system.weights
+        if start is not flights.last:
+            x, before, f = flights.known(x, before, f)
+        v, work, many, tables = np.empty(shape), NO_WORK, self._many, flights.tables()
+        if many:
+            work = np.empty((3, *shape))
         out, left = x, len(self._stages)
         try:
             for kick, stage, fractions in zip(kicks, self._stages, self._fractions, strict=False):
                 left -= 1
                 out = np.empty(shape)
                 now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else time
-                bad = flights.stage(
-                    x, before, v, work, kick * dt, f, weights, before is not v, fractions, dt, out, now, tables
-                )
-                if bad:
-                    check_finite(f, bad, number)
+                if many:
+                    found = many_flights(
+                        fractions, dt, 0, x, before, v, work, kick * dt, f, before is not v, out, tables
+                    )
+                else:
+                    found = one_flight(dt, x, before, v, kick * dt, f, out, tables)
+                if found != flights.took:
+                    bad = flights.landed(found, fractions, dt, x, v, work, f, out, now, tables)
+                    if bad:
+                        check_finite(f, bad, number)
                 x, before = out, v
-                if system.force is not None:
-                    f = system.forces(x if shift is None else x + shift, v, now, number, copy=not left, finite=False)
-            bad = flights.end(x, v, work, kicks[-1] * dt, f, weights, now, tables)
-            if bad:
-                check_finite(f if bad == "force" else x if bad == "position" else v, bad, number)
+                if force is not None:
+                    f = system.accepted(force(x if shift is None else x + shift, now), number, not left)
+            bad = ""
+            found = end_step(x, v, work, kicks[-1] * dt, f, tables)
+            if found:
+                bad = flights.ended(found, x, v, time, tables)
+                if bad and bad != "far":
+                    check_finite(f if bad == "force" else x if bad == "position" else v, bad, number)
         except ConvergenceError as error:
             raise explained(error, system, start, dt, number) from error
         except InputError:
-            for array, item in ((out, "position"), (v, "velocity"), (work[1] if self._many else v, "velocity")):
+            for array, item in ((out, "position"), (v, "velocity"), (work[1] if many else v, "velocity")):
                 check_finite(array, item, number)
             raise
-        if system.force is not None:
+        if force is not None:
             forces = f
         remainder = None
         if shift is not None:
             out = x + shift
             remainder = x - (out - shift)
-        elif system.is_far(x):  # by now: from here on relative to one atom
-            remainder = work[0].copy() if self._many else np.zeros(shape)
-        return State(out, v, time, forces, number, remainder, time_remainder)
+        elif bad:  # far by now: from here on relative to one atom
+            remainder = work[0].copy() if many else np.zeros(shape)
+        last = flights.last = State(out, v, time, forces, number, remainder, time_remainder)
+        return last
 
 
 class Stage(NamedTuple):
@@ -200,7 +210,7 @@ class _Step:
         #: Where stages are compiled: the fractions of the step that their flights take, and what the kernels need.
         self.flights = None if self.exact else system.flights
         self.fractions: Sequence[FloatArray] = ()
-        self.tables: tuple[Any, ...] = ()
+        self.tables: FloatArray = NO_WORK
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
         x = start.positions
@@ -311,8 +321,9 @@ class _Step:
         point = self.point
         if self.flights is not None:
             kick, force = point.take_kick()
-            bad = self.flights.end(point.x, point.v, point.work, kick, force, point.weights, self.now, self.tables)
-            if bad:
+            found = end_step(point.x, point.v, point.work, kick, force, self.tables)
+            bad = self.flights.ended(found, point.x, point.v, self.now, self.tables)
+            if bad and bad != "far":
                 self.refuse(bad)
             return
         point.land()

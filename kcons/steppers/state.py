@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import BinaryIO
 from zipfile import BadZipFile
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,7 +20,7 @@ from kcons.errors import InputError, NonFiniteError, OverdeterminedError
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.flights import Flights
-from kcons.steppers.summation import all_finite
+from kcons.steppers.summation import all_finite, beyond
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -33,7 +32,7 @@ START_TOLERANCE = 1e-9
 _FLOAT = np.dtype(np.float64)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class State:
     """Where a system is.
 
@@ -64,6 +63,28 @@ class State:
     remainder: FloatArray | None = None
     time_remainder: float = 0.0
     thermostat: FloatArray | None = None
+
+    def __init__(
+        self,
+        positions: FloatArray,
+        velocities: FloatArray,
+        time: float = 0.0,
+        forces: FloatArray | None = None,
+        step: int = 0,
+        remainder: FloatArray | None = None,
+        time_remainder: float = 0.0,
+        thermostat: FloatArray | None = None,
+    ) -> None:
+        # Written out, since a step makes one: what dataclass writes takes three times as long.
+        own = vars(self)
+        own["positions"] = positions
+        own["velocities"] = velocities
+        own["time"] = time
+        own["forces"] = forces
+        own["step"] = step
+        own["remainder"] = remainder
+        own["time_remainder"] = time_remainder
+        own["thermostat"] = thermostat
 
     def later(self, dt: float) -> tuple[float, float]:
         """Time after `dt`, and what its rounding leaves over (Knuth's exact sum)."""
@@ -158,6 +179,7 @@ class System:
         self.potential = potential
         self.velocity_dependent = velocity_dependent and force is not None
         self.n_atoms = motion.n_atoms
+        self._shape = (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
         fixed = _fixed_atoms(motion)
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))
@@ -275,27 +297,28 @@ class System:
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
         raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
-        if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.flags.c_contiguous:
-            f: FloatArray = raw.copy() if copy else raw
-        else:
-            f = self._force_array(raw, copy, step)
-        if f.shape != (self.n_atoms, 3):
-            raise InputError(
-                f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
-                item="forces",
-            )
+        f = self.accepted(raw, step, copy)
         if finite:
             check_finite(f, "force", step)
         return f
 
-    @staticmethod
-    def _force_array(raw: ArrayLike, copy: bool, step: int) -> FloatArray:
+    def accepted(self, raw: ArrayLike, step: int, copy: bool) -> FloatArray:
+        """What the force function returned, as an array of doubles."""
+        # Most often it is one already; each question costs a part of a percent of a step of few atoms.
+        if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.shape == self._shape and raw.flags.carray:
+            return raw.copy() if copy else raw
         try:
-            return (np.array if copy else np.asarray)(raw, dtype=np.float64, order="C")
+            f = np.array(raw, dtype=np.float64, order="C")
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"the force function returned no array of numbers at step {step}: {error}", item="forces"
             ) from None
+        if f.shape != self._shape:
+            raise InputError(
+                f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
+                item="forces",
+            )
+        return f
 
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
@@ -329,7 +352,9 @@ class System:
     @cached_property
     def flights(self) -> Flights | None:
         """Compiled stages for the same flight; None where `drift` does it piece by piece."""
-        return Flights.of(self.motion)
+        held = self._free_of_origin
+        atoms = np.zeros(0, dtype=np.int64) if held is None else np.append(self.anchor, held)
+        return Flights.of(self.motion, self.weights, atoms, self.far)
 
     @cached_property
     def great_circles(self) -> GreatCircles | None:
@@ -352,7 +377,7 @@ class System:
     def is_far(self, x: FloatArray) -> bool:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""
         atoms = self._free_of_origin
-        return atoms is not None and bool(_beyond(x, atoms, self.anchor, self.far))
+        return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
         try:
@@ -385,14 +410,3 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
         atom=atom,
         step=step,
     )
-
-
-@numba.njit(cache=True, nogil=True)
-def _beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
-    """Whether the anchor is farther from the origin than `ratio` times any atom is from the anchor."""
-    far = max(abs(x[anchor, 0]), abs(x[anchor, 1]), abs(x[anchor, 2])) / ratio
-    for i in atoms:
-        for k in range(3):
-            if not abs(x[i, k] - x[anchor, k]) < far:
-                return False
-    return True

@@ -11,6 +11,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.solvers.borrowed import bits, flat
 
 #: Stands for the work arrays where a step adds up nothing.
 NO_WORK = np.empty((0, 0, 3))
@@ -114,17 +115,17 @@ class Point:
 def all_finite(values):  # type: ignore[no-untyped-def]
     """Whether no number is NaN or infinite."""
     # The largest exponent is that of NaN and infinities; integers, so that the loop becomes vector instructions.
-    bits = values.ravel().view(np.int64)
+    numbers = bits(values)
     worst = np.int64(0)
-    for i in range(bits.size):
-        worst = max(worst, bits[i] & 0x7FF0000000000000)
+    for i in range(numbers.size):
+        worst = max(worst, numbers[i] & 0x7FF0000000000000)
     return worst != 0x7FF0000000000000
 
 
 @numba.njit(cache=True, nogil=True)
 def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
-    b, g, w = v.ravel(), f.ravel(), weights.ravel()
+    b, g, w = flat(v), flat(f), flat(weights)
     for i in range(b.size):
         b[i] += kick * w[i] * g[i]
     return sound
@@ -133,7 +134,7 @@ def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def land(v, push, kick, f, weights):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
-    b, p, g, w = v.ravel(), push.ravel(), f.ravel(), weights.ravel()
+    b, p, g, w = flat(v), flat(push), flat(f), flat(weights)
     for i in range(b.size):
         b[i] += p[i] + kick * w[i] * g[i]
         p[i] = 0.0
@@ -148,8 +149,8 @@ def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped
     of the rounding of the change, not of the coordinate.
     """
     sound = kick == 0.0 or all_finite(f)
-    a, a_low, b, p, c = x.ravel(), x_low.ravel(), v.ravel(), push.ravel(), out.ravel()
-    g, w = f.ravel(), weights.ravel()
+    a, a_low, b, p, c = flat(x), flat(x_low), flat(v), flat(push), flat(out)
+    g, w = flat(f), flat(weights)
     for i in range(a.size):
         change = p[i] + kick * w[i] * g[i]
         total = b[i] + change
@@ -167,8 +168,8 @@ def fly(x, x_low, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped
 def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[no-untyped-def]
     """The same from a start without remainders; `x_low`, `v` and `push` are only written to."""
     sound = kick == 0.0 or all_finite(f)
-    a, a_low, b0, b, p, c = x.ravel(), x_low.ravel(), v0.ravel(), v.ravel(), push.ravel(), out.ravel()
-    g, w = f.ravel(), weights.ravel()
+    a, a_low, b0, b, p, c = flat(x), flat(x_low), flat(v0), flat(v), flat(push), flat(out)
+    g, w = flat(f), flat(weights)
     for i in range(a.size):
         change = kick * w[i] * g[i]
         total = b0[i] + change
@@ -185,8 +186,19 @@ def fly_first(x, x_low, v0, v, push, kick, f, weights, h, out):  # type: ignore[
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def fly_once(x, v0, kick, f, weights, h, v, out):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
-    a, b0, b, c, g, w = x.ravel(), v0.ravel(), v.ravel(), out.ravel(), f.ravel(), weights.ravel()
+    a, b0, b, c, g, w = flat(x), flat(v0), flat(v), flat(out), flat(f), flat(weights)
     for i in range(a.size):
         b[i] = b0[i] + kick * w[i] * g[i]
         c[i] = a[i] + h * b[i]
     return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def beyond(x, atoms, anchor, ratio):  # type: ignore[no-untyped-def]
+    """Whether the anchor is farther from the origin than `ratio` times any atom is from the anchor."""
+    far = max(abs(x[anchor, 0]), abs(x[anchor, 1]), abs(x[anchor, 2])) / ratio
+    for i in atoms:
+        for k in range(3):
+            if not abs(x[i, k] - x[anchor, k]) < far:
+                return False
+    return True

@@ -1,0 +1,82 @@
+"""Views of arrays inside kernels that are not counted among the arrays' users.
+
+Numba counts the users of an array in memory that threads share; for each view that takes as long as a held bond does.
+What is borrowed here is good only as long as something else holds the array, as its caller does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, overload
+
+
+def _view(context: Any, builder: Any, kind: Any, data: Any, size: Any) -> Any:
+    result = context.make_array(kind)(context, builder)
+    step = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    pointer = builder.bitcast(data, result.data.type)
+    context.populate_array(result, data=pointer, shape=[size], strides=[step], itemsize=step, meminfo=None)
+    return result._getvalue()
+
+
+@intrinsic
+def _piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
+    kind = types.Array(room.dtype, 1, "C")
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        numbers, cuts = (
+            context.make_array(t)(context, builder, a) for t, a in zip(sig.args[:2], args[:2], strict=True)
+        )
+        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
+        start = builder.load(builder.gep(cuts.data, [at]))
+        end = builder.load(builder.gep(cuts.data, [builder.add(at, ir.Constant(at.type, 1))]))
+        return _view(context, builder, kind, builder.gep(numbers.data, [start]), builder.sub(end, start))
+
+    return kind(room, header, types.int64), codegen
+
+
+#: ``room[header[2 k] : header[2 k + 1]]`` of flat contiguous arrays, `header` of int64.
+piece: Any = _piece
+
+
+def _flat(dtype: Any) -> Any:
+    @intrinsic
+    def function(typingctx, array):  # type: ignore[no-untyped-def]
+        kind = types.Array(dtype or array.dtype, 1, "C", readonly=not array.mutable)
+
+        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            source = context.make_array(sig.args[0])(context, builder, args[0])
+            return _view(context, builder, sig.return_type, source.data, source.nitems)
+
+        return kind(array), codegen
+
+    return function
+
+
+_numbers, _integers = _flat(None), _flat(types.int64)
+
+
+def flat(array: Any) -> Any:
+    """All numbers of an array of any shape, in a row."""
+    return array.ravel()
+
+
+def bits(array: Any) -> Any:
+    """The same as integers of eight bytes."""
+    return array.ravel().view("int64")
+
+
+@overload(flat, inline="always")
+def _overload_flat(array):  # type: ignore[no-untyped-def]
+    if array.layout == "C":
+        return lambda array: _numbers(array)
+    return lambda array: array.ravel()
+
+
+@overload(bits, inline="always")
+def _overload_bits(array):  # type: ignore[no-untyped-def]
+    if array.layout == "C":
+        return lambda array: _integers(array)
+    return lambda array: array.ravel().view(types.int64)
