@@ -30,6 +30,8 @@ MOST_ROWS = 128
 #: What a kernel reports of a stage besides iterations: the force is not finite; the engine has to do a flight (less the
 #: number of the flight).
 _FORCE, _ENGINE = -1, -2
+#: No number of iterations.
+_UNKNOWN = 1000
 #: What it reports of the end of a step; less than 0 where the engine has to do it.
 _WHAT = ("", "force", "position", "velocity", "far")
 
@@ -52,7 +54,7 @@ class Flights:
         #: The state that the last step ended in, whose arrays need no `known`.
         self.last: object = None
         #: Iterations that the engine has been told of.
-        self.took = -1
+        self.took = _UNKNOWN
         self._lattice = motion.lattice
         set_lattice(tables, self._lattice)
 
@@ -150,7 +152,7 @@ class Flights:
             if len(work):
                 spare, push, h = work[2], work[1], float(fractions[at]) * dt
                 ends, starts = (out, spare) if (len(fractions) - at) % 2 else (spare, out)
-            self.took = -1
+            self.took = _UNKNOWN
             self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
             if at + 1 == len(fractions):
                 return ""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import Distance, FixedAtoms, MovingTarget
-from kcons.errors import ConvergenceError, KconsError, NonFiniteError
+from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget, Plane
+from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.steppers import (
     BlanesMoan4,
@@ -21,6 +21,7 @@ from kcons.steppers import (
     System,
     run,
 )
+from kcons.steppers.flights import MOST_ROWS
 
 STEPPERS = [Rattle(), Geodesic(4), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
 PAIRS = [[0, 1], [0, 2], [1, 2]]
@@ -47,6 +48,209 @@ def triangles(
     if piecewise:
         system.flights = None
     return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
+
+
+#: Pairs and masses of one molecule of each kind, and where its atoms are.
+KINDS = {
+    "dumbbells": ([[0, 1]], [1.0, 2.0]),
+    "methylene": ([[0, 1], [0, 2]], [12.0, 1.0, 1.0]),
+    "methyl": ([[0, 1], [0, 2], [0, 3]], [12.0, 1.0, 1.0, 1.0]),
+    "chain": ([[k, k + 1] for k in range(9)], [14.0] * 10),
+    "long": ([[k, k + 1] for k in range(59)], [14.0] * 60),
+    "ring": ([[k, (k + 1) % 6] for k in range(6)] + [[0, 6]], [12.0] * 6 + [1.0]),
+    "tetrahedron": ([[i, j] for i in range(4) for j in range(i)], [1.0, 2.0, 3.0, 4.0]),
+    "triangles": (PAIRS, [16.0, 1.0, 1.0]),
+    "heavy triangles": (PAIRS, [16.0, 2.0, 2.0]),
+}
+
+
+def molecules(
+    *names: str,
+    ions: int = 2,
+    fixed: tuple[int, ...] = (),
+    at: float = 0.0,
+    force=springs,
+    piecewise: bool = False,
+    scatter: bool = False,
+    **options,
+) -> tuple[System, State]:
+    """Molecules of some kinds one after another, in places of their own, and free atoms after them."""
+    rng = np.random.default_rng(7)
+    x, pairs, masses = [], [], []
+    for number, name in enumerate(names):
+        rows, m = KINDS[name]
+        pairs.append(np.array(rows) + sum(map(len, masses)))
+        masses.append(m)
+        k = np.arange(len(m))
+        shape = np.stack([np.cos(k), np.sin(k), 0.1 * k], axis=1)
+        if name not in ("chain", "long"):
+            shape = rng.normal(size=(len(m), 3))
+        x.append(shape + 0.2 * number)
+    x.append(rng.normal(size=(ions, 3)))
+    x = np.concatenate(x) + at
+    if scatter:
+        x = x + rng.integers(-1, 2, size=x.shape) * np.diag(options["cell"])
+    m = np.concatenate([*masses, np.full(ions, 23.0)])
+    rows = [Distance(np.concatenate(pairs))] if pairs else []
+    if fixed:
+        rows.append(FixedAtoms(list(fixed)))
+    system = System(Motion(ConstraintSet(rows, x, m, **options), x), force)
+    if piecewise:
+        system.flights = None
+    return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
+
+
+GROUPS = ["methyl", "methylene", "dumbbells", "methyl", "dumbbells"]
+SYSTEMS = {
+    "dumbbells": (["dumbbells"] * 2, {"ions": 0}),
+    "many dumbbells": (["dumbbells"] * 30, {}),
+    "hydrogens": (GROUPS, {}),
+    "chains": (["chain", "long", "dumbbells"], {}),
+    "rings": (["ring", "tetrahedron"], {}),
+    "water in two kinds, and more": ([*["triangles"] * 9, "heavy triangles", "methyl", "chain"], {}),
+    "few held among many": (["methyl", "triangles"], {"ions": 30}),
+    "fixed atoms": (["chain", "methyl", "triangles", "dumbbells"], {"fixed": (0, 3, 10, 11, 14, 20)}),
+    "fixed among many": (["dumbbells", "methyl"], {"fixed": (0, 9), "ions": 30}),
+    "fixed and nothing else": ([], {"fixed": (1,), "ions": 4}),
+    "nothing": ([], {"ions": 4}),
+    "no force": (GROUPS, {"force": None}),
+    "periodic": ([*GROUPS, "triangles"], {"cell": np.diag([19.0, 18.0, 17.0]), "pbc": True, "scatter": True}),
+    "skewed": (
+        [*GROUPS, "triangles"],
+        {"cell": np.array([[19.0, 0, 0], [2.0, 18.0, 0], [1.0, -3.0, 17.0]]), "pbc": True},
+    ),
+    "far": (GROUPS, {"at": 1e5, "force": None}),
+    "far, forced": ([*GROUPS, "triangles"], {"at": 1e4, "force": lambda x, t: -0.1 * (x - x.mean(axis=0))}),
+}
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_few_rows_of_any_shape(stepper, name) -> None:
+    names, options = SYSTEMS[name]
+    (system, state), (other, _) = molecules(*names, **options), molecules(*names, piecewise=True, **options)
+    assert system.flights is not None and other.flights is None
+    calls = []
+    for call in ("project_positions", "project_velocities"):
+        setattr(system.motion, call, calls.append)
+    rounding = float(np.spacing(np.abs(state.positions).max()))
+    assert (state.remainder is not None) == name.startswith("far")
+    for dt in (0.02, -0.01, 0.015):
+        following, expected = stepper.step(system, state, dt), stepper.step(other, state, dt)
+        assert distance(following, expected) <= 2e-14 + 8 * rounding
+        assert distance(following, state) > 1e-4
+        assert (following.remainder is None) == (expected.remainder is None)
+        if following.remainder is not None:
+            there, here = (each.positions - state.positions + each.remainder for each in (following, expected))
+            assert np.abs(there - here).max() <= 2e-14
+        state = following
+    if not system.motion.constraint_set.n_rows:
+        return
+    assert not calls
+    shift = state.positions[0] if state.remainder is not None and name.startswith("far") else np.zeros(3)
+    x = state.positions - shift + (0.0 if state.remainder is None else state.remainder)
+    held = system.motion.constraint_set
+    assert np.all(np.abs(held.value(x)) <= 1e-14 * held.scale)
+    rates = held.jacobian(x) @ state.velocities.ravel()
+    assert np.abs(rates).max() <= 1e-14 * np.abs(state.velocities).max()
+    fixed = list(options.get("fixed", ()))
+    assert not state.velocities[fixed].any()
+
+
+@pytest.mark.parametrize("names", [GROUPS, ["chain"], ["triangles", "methyl"]], ids="-".join)
+def test_steps_without_solution_are_the_engines(names) -> None:
+    """The same error, for the same row, after which a usual step is what it would have been."""
+    taken = failed = 0
+    for stepper in STEPPERS:
+        for dt in np.geomspace(0.5, 20.0, 12):
+            pair = [molecules(*names, force=None, piecewise=p) for p in (False, True)]
+            outcomes = []
+            for system, state in pair:
+                before = state.positions.copy(), state.velocities.copy()
+                try:
+                    outcomes.append(stepper.step(system, state, float(dt)))
+                except KconsError as error:
+                    outcomes.append(error)
+                assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+            one, two = outcomes
+            if isinstance(two, State) and isinstance(one, State):
+                held = pair[0][0].motion.constraint_set
+                assert np.abs(held.value(one.positions)).max() <= 1e-13
+                taken += 1
+            elif isinstance(one, KconsError) and isinstance(two, KconsError):
+                assert type(one) is type(two) and one.row == two.row and one.atoms == two.atoms and one.step == 1
+                failed += 1
+            (system, state), (other, _) = pair
+            assert distance(stepper.step(system, state, 0.02), stepper.step(other, state, 0.02)) <= 2e-14
+    assert taken >= 5 and failed >= 5
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_the_first_force_of_all_is_not_finite(bad) -> None:
+    for stepper in STEPPERS:
+        system, state = molecules(*GROUPS)
+        forces = np.zeros_like(state.positions)
+        forces[2, 1] = bad
+        state = State(state.positions, state.velocities, forces=forces)
+        with pytest.raises(NonFiniteError, match="non-finite force at step 1 on atom 2"):
+            if stepper.kick_first:
+                stepper.step(system, state, 0.01)
+            else:
+                system.force = lambda x, t, forces=forces: forces
+                stepper.step(system, state, 0.01)
+
+
+def test_wrong_forces_are_refused() -> None:
+    system, state = molecules(*GROUPS)
+    for wrong, message in (
+        (lambda x, t: np.zeros(3), "returned shape \\(3,\\) at step 1"),
+        (lambda x, t: "none", "no array of numbers at step 1"),
+    ):
+        start = system.with_forces(state)
+        system.force = wrong
+        with pytest.raises(InputError, match=message):
+            Rattle().step(system, start, 0.01)
+        system.force = springs
+
+
+@pytest.mark.parametrize(
+    "made",
+    [lambda f: f.tolist(), lambda f: f.astype(np.float32), lambda f: np.asfortranarray(f), lambda f: f[::-1][::-1]],
+    ids=["list", "single", "columns", "reversed"],
+)
+def test_forces_of_other_kinds(made) -> None:
+    system, state = molecules(*GROUPS)
+    other, _ = molecules(*GROUPS)
+    other.force = lambda x, t: made(springs(x, t))
+    system.force = lambda x, t: np.array(made(springs(x, t)), dtype=float)
+    for stepper in STEPPERS:
+        one, two = stepper.step(system, state, 0.02), stepper.step(other, state, 0.02)
+        assert distance(one, two) == 0.0
+
+
+def test_what_a_force_function_reuses_is_copied() -> None:
+    room = None
+
+    def force(x, t):
+        nonlocal room
+        room = np.empty_like(x) if room is None else room
+        room[:] = springs(x, t)
+        return room
+
+    system, state = molecules(*GROUPS, force=force)
+    one = Rattle().step(system, state, 0.02)
+    kept = one.forces.copy()
+    Rattle().step(system, one, 0.02)
+    assert np.array_equal(one.forces, kept)
+
+
+def test_a_state_that_moves_far_away() -> None:
+    system, state = molecules(*GROUPS, force=None)
+    state = State(state.positions, state.velocities + 1e5)
+    for stepper in (Rattle(), Suzuki4()):
+        end = stepper.step(system, state, 0.02)
+        assert end.remainder is not None
+        assert np.all(np.abs(end.remainder) <= np.spacing(np.abs(end.positions)))
 
 
 def distance(a: State, b: State) -> float:
@@ -199,7 +403,7 @@ def test_the_engine_takes_over_in_the_middle_of_a_stage() -> None:
     assert taken >= 5 and failed >= 5
 
 
-def test_only_for_triangles_at_rest() -> None:
+def test_what_is_left_to_the_engine() -> None:
     x = SHAPE + 0.0
     m = np.array([16.0, 1.0, 1.0])
 
@@ -207,14 +411,18 @@ def test_only_for_triangles_at_rest() -> None:
         return System(Motion(ConstraintSet(rows, x, m), x)).flights
 
     assert flights(Distance(PAIRS)) is not None
-    assert flights(Distance(PAIRS[:2])) is None
-    assert flights(Distance(PAIRS), FixedAtoms([0])) is None
+    assert flights(Distance(PAIRS[:2])) is not None
+    assert flights(Distance(PAIRS[:2]), FixedAtoms([0])) is not None
+    assert flights() is not None
     lengths = np.linalg.norm(x[[0, 0, 1]] - x[[1, 2, 2]], axis=1)
     moving = MovingTarget(lambda t: lengths + 0.1 * t)
     assert flights(Distance(PAIRS, moving)) is None
-    many = np.concatenate([x, np.arange(30.0).reshape(10, 3)])
-    assert flights(Distance(PAIRS), x=many, m=np.ones(13)) is None
-    assert flights(x=x) is None
+    assert flights(Distance([[0, 1]]), Angle([[1, 0, 2]])) is None
+    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0])) is None
+    many = np.arange(6.0 * (MOST_ROWS + 1)).reshape(-1, 3)
+    pairs = np.arange(2 * MOST_ROWS + 2).reshape(-1, 2)
+    assert flights(Distance(pairs), x=many, m=np.ones(len(many))) is None
+    assert flights(Distance(pairs[1:]), x=many, m=np.ones(len(many))) is not None
 
 
 def test_a_new_cell_is_seen() -> None:
