@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.elimination import FAST, UIntArray, make_pattern
+from kcons.solvers.elimination import FAST, UIntArray, make_pattern, make_small_pattern
 from kcons.solvers.lattice import NO_LATTICE, nearest_image
 from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
 from kcons.solvers.narrow import (
@@ -58,27 +58,32 @@ class SparseDistances:
     lengths : ndarray, shape (n_rows,)
     inverse_masses : ndarray, shape (n_atoms,)
         0 for atoms of infinite mass.
+    small : bool
+        Whether to find order and pattern by what need not be compiled, for few rows.
     """
 
     name = "sparse"
 
-    def __init__(self, rows: IntArray, pairs: IntArray, lengths: FloatArray, inverse_masses: FloatArray) -> None:
+    def __init__(
+        self, rows: IntArray, pairs: IntArray, lengths: FloatArray, inverse_masses: FloatArray, *, small: bool = False
+    ) -> None:
         atoms, local = np.unique(pairs, return_inverse=True)
         local = local.reshape(pairs.shape)
         movable = inverse_masses[atoms] > 0
         keep = movable[local]
         row_start = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
-        pattern = make_pattern(row_start, local[keep].astype(np.int64), len(atoms))
+        row_atoms = local[keep].astype(np.int64)
+        pattern = make_small_pattern(row_start, row_atoms) if small else make_pattern(row_start, row_atoms, len(atoms))
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
         self.lengths = lengths[pattern.order].copy()
         self._clusters = pattern.clusters
-        self._atoms, self._atom_start, ends = _number_atoms(pairs, pattern.clusters, len(inverse_masses))
+        self._atoms, self._atom_start, ends = _plain(_number_atoms, small)(pairs, pattern.clusters, len(inverse_masses))
         self._w = inverse_masses[self._atoms]
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
         weights = self._w[ends].sum(axis=1)
-        couplings = _couplings(pattern.start, pattern.columns, ends, self._w)
+        couplings = _plain(_couplings, small)(pattern.start, pattern.columns, ends, self._w)
         self._tables = (self._clusters, self._atoms, self._atom_start, self._w, links.ravel(),
             pattern.columns, pattern.targets, couplings, weights,
         )  # fmt: skip
@@ -155,6 +160,11 @@ class SparseDistances:
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
+
+
+def _plain(kernel: Any, plain: bool) -> Any:
+    """A compiled function, or what it was made of."""
+    return kernel.py_func if plain else kernel
 
 
 def lengths_resolved(x: FloatArray, pairs: UIntArray, lengths: FloatArray, lattice: FloatArray | None) -> bool:

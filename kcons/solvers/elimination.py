@@ -96,6 +96,52 @@ def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Patt
     return Pattern(order, clusters, start, columns, target_start, targets)
 
 
+def make_small_pattern(row_start: IntArray, row_atoms: IntArray) -> Pattern:
+    """The same for few rows, without anything to compile: sets in Python."""
+    n = len(row_start) - 1
+    members: dict[int, list[int]] = {}
+    for k in range(n):
+        for atom in row_atoms[row_start[k] : row_start[k + 1]].tolist():
+            members.setdefault(atom, []).append(k)
+    coupled: list[set[int]] = [{k} for k in range(n)]
+    for rows in members.values():
+        for k in rows:
+            coupled[k].update(rows)
+    cluster = list(range(n))
+    later: list[set[int]] = [set()] * n
+    remaining, eliminated = set(range(n)), []
+    while remaining:
+        k = min(remaining, key=lambda row: (len(coupled[row]), row))
+        remaining.discard(k)
+        eliminated.append(k)
+        later[k] = coupled[k] - {k}
+        for other in later[k]:
+            coupled[other] |= later[k]
+            coupled[other].discard(k)
+    # From the last row back: whoever comes before another of its cluster belongs to that.
+    for k in reversed(eliminated):
+        if later[k]:
+            cluster[k] = cluster[next(iter(later[k]))]
+    order = sorted(eliminated, key=lambda row: cluster[row])
+    position = {k: place for place, k in enumerate(order)}
+    columns = [sorted(position[other] for other in later[k]) for k in order]
+    start = np.cumsum([0, *map(len, columns)])
+    targets, counts = [], [0]
+    for mine in columns:
+        for p, one in enumerate(mine):
+            targets += [int(start[one]) + columns[one].index(two) for two in mine[p + 1 :]]
+        counts.append(len(targets))
+    cuts = [place for place in range(n) if place == 0 or cluster[order[place]] != cluster[order[place - 1]]]
+    return Pattern(
+        np.array(order, dtype=np.int64),
+        np.array([*cuts, n], dtype=np.int64),
+        start.astype(np.int64),
+        np.array([column for mine in columns for column in mine], dtype=np.uint32),
+        np.array(counts, dtype=np.int64),
+        np.array(targets, dtype=np.uint32),
+    )
+
+
 @nb.njit(cache=True)
 def _minimum_degree(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-def]
     """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""

@@ -32,6 +32,8 @@ _ALIGNMENT = LINE // 8
 _LENGTHS, _PAIRS, _ATOMS, _MOVES = 0, 1, 3, 16
 _CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, MORE = range(20, 30)
 
+Packed = tuple[FloatArray, int | None, int | None]
+
 
 def packed(
     triangles: RigidTriangles | None,
@@ -41,7 +43,7 @@ def packed(
     pinned: IntArray,
     places: FloatArray,
     *more: NDArray[Any],
-) -> FloatArray:
+) -> Packed:
     """What `packed_positions` and `packed_tangents` need to know.
 
     Parameters
@@ -60,12 +62,14 @@ def packed(
 
     Returns
     -------
-    ndarray of float64
+    tables : ndarray of float64
         Begins with where each piece starts and ends, as integers.
+    triangles, others : int or None
+        Whether there are rows of either kind: 1, or None.
     """
     pieces: list[NDArray[Any]]
     if len(pairs):
-        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses)
+        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses, small=True)
         tables, rooms = solver.tables()
         pieces = [solver.lengths, pairs[solver.rows].astype(np.uint32).ravel(), *tables, *rooms]
     else:
@@ -88,7 +92,7 @@ def packed(
     room.view(np.int64)[: cuts.size] = cuts.ravel()
     for part, (first, last) in zip(pieces, cuts, strict=True):
         room.view(part.dtype)[first:last] = part
-    return room
+    return room, None if triangles is None else 1, 1 if len(pairs) else None
 
 
 def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
@@ -99,20 +103,17 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
     header[header[2 * _KIND]] = kind
 
 
-@nb.njit(cache=True, inline="always")
-def _solve(x, x_ref, lattice, periodic, t, u, h):  # type: ignore[no-untyped-def]
-    """Newton's method for all rows but those of triangles; nothing changes but the rooms."""
-    return distances.solve_positions(
-        False, x, x_ref, piece(t, h, 0), lattice, periodic, piece(h, h, 2), piece(u, h, 3), piece(h, h, 4),
-        piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10),
-        piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, 16),
-        piece(t, h, 17), piece(t, h, 18), piece(t, h, 19),
-    )  # fmt: skip
+# What is None is pruned before compilation: systems without triangles, or with nothing else, do not wait for the other.
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
+
+    Parameters
+    ----------
+    tables, triangles, others
+        From `packed`.
 
     Returns
     -------
@@ -125,36 +126,38 @@ def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-de
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
-    atoms, slots = piece(u, h, _ATOMS), piece(u, h, _SLOTS)
+    # Nothing is written before all is solved, except that triangles undo what they wrote.
     most = 0
-    if atoms.size:
-        failed, _, most, _ = _solve(x, x_ref, lattice, kind != OPEN, t, u, h)
-        if failed:
-            return -1
-    if slots.size:
-        landed, _, iterations, _ = triangle_positions(
-            x, x_ref, v, inv_dt, piece(u, h, _CORNERS), slots, piece(t, h, _SIDES).reshape(-1, 3),
-            piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO),
-        )  # fmt: skip
-        if not landed:
-            return -1
-        most = max(most, iterations)
-    if atoms.size:
-        moves, pairs, lengths = piece(t, h, _MOVES), piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS)
-        distances.apply_both(x, v, inv_dt, atoms, moves)
-        rounds = 0
-        # Large multipliers have a rounding that shows in the positions; another round takes it away.
-        while rounds < _MAX_ROUNDS and not distances.resolved(x, pairs, lengths, lattice, kind != OPEN):
-            failed, _, _, _ = _solve(x, x_ref, lattice, kind != OPEN, t, u, h)
+    for turn in range(_MAX_ROUNDS + 1):
+        if others is not None:
+            failed, _, iterations, _ = distances.solve_positions(
+                False, x, x_ref, piece(t, h, 0), lattice, kind != OPEN, piece(h, h, 2), piece(u, h, 3),
+                piece(h, h, 4), piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9),
+                piece(t, h, 10), piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15),
+                piece(t, h, 16), piece(t, h, 17), piece(t, h, 18), piece(t, h, 19),
+            )  # fmt: skip
             if failed:
-                break
-            distances.apply_both(x, v, inv_dt, atoms, moves)
-            rounds += 1
+                return most if turn else -1
+            most = max(most, iterations)
+        if triangles is not None and turn == 0:
+            landed, _, iterations, _ = triangle_positions(
+                x, x_ref, v, inv_dt, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _SIDES).reshape(-1, 3),
+                piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO),
+            )  # fmt: skip
+            if not landed:
+                return -1
+            most = max(most, iterations)
+        if others is None:
+            break
+        distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
+        # Large multipliers have a rounding that shows in the positions; another round takes it away.
+        if distances.resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, kind != OPEN):
+            break
     return most
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables, triangles, others):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
     lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
@@ -162,22 +165,21 @@ def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     for k in range(pinned.size):
         for axis in range(3):
             v[pinned[k], axis] = 0.0
-    atoms, slots, moves = piece(u, h, _ATOMS), piece(u, h, _SLOTS), piece(t, h, _MOVES)
-    if atoms.size:
+    if others is not None:
         failed, _, _, _ = distances.solve_tangents(
-            x, v, t, False, lattice, kind != OPEN, piece(h, h, 2), atoms, piece(h, h, 4),
-            piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10),
-            piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), moves,
-            piece(t, h, 17),
+            x, v, t, False, lattice, kind != OPEN, piece(h, h, 2), piece(u, h, 3), piece(h, h, 4), piece(t, h, 5),
+            piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10), piece(t, h, 11),
+            piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, 16), piece(t, h, 17),
         )  # fmt: skip
         if failed:
             return False
-    if slots.size:
+    if triangles is not None:
         converged, _, _, _ = triangle_tangents(
-            x, v, piece(u, h, _CORNERS), slots, t[:0], piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO)
-        )
+            x, v, piece(u, h, _CORNERS), piece(u, h, _SLOTS), t[:0], piece(t, h, _WEIGHTS), lattice, kind, t[:0],
+            piece(t, h, _UNDO),
+        )  # fmt: skip
         if not converged:
             return False
-    if atoms.size:
-        distances.apply(v, atoms, moves)
+    if others is not None:
+        distances.apply(v, piece(u, h, _ATOMS), piece(t, h, _MOVES))
     return True

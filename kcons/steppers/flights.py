@@ -20,7 +20,7 @@ from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.plan import DistanceClusters
 from kcons.solvers.borrowed import piece
-from kcons.solvers.packed import MORE, packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.packed import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.water import RigidTriangles
 from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
@@ -42,21 +42,21 @@ class Flights:
     Parameters
     ----------
     motion : Motion
-    tables : ndarray
+    found : tuple
         All its rows, from `kcons.solvers.packed`, 1/m for each coordinate, the atoms that show whether the system is
         far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
     """
 
-    def __init__(self, motion: Motion, tables: FloatArray) -> None:
+    def __init__(self, motion: Motion, found: Packed) -> None:
         self.motion = motion
-        self._tables = tables
+        self._tables = found
         self._cell = motion.cell
         #: The state that the last step ended in, whose arrays need no `known`.
         self.last: object = None
         #: Iterations that the engine has been told of.
         self.took = _UNKNOWN
         self._lattice = motion.lattice
-        set_lattice(tables, self._lattice)
+        set_lattice(found[0], self._lattice)
 
     @classmethod
     def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> Flights | None:
@@ -75,21 +75,19 @@ class Flights:
         found = _packed(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
         return None if found is None else cls(motion, found)
 
-    def tables(self) -> FloatArray:
+    def tables(self) -> Packed:
         """What the kernels need to know, for one step: the rows, and the cell as it is now."""
         lattice = self._cell()
         if lattice is not self._lattice:
             self._lattice = lattice
-            set_lattice(self._tables, lattice)
+            set_lattice(self._tables[0], lattice)
         return self._tables
 
     def known(self, *arrays: FloatArray) -> Iterator[FloatArray]:
         """Arrays as the kernels were compiled for, or copies: read-only ones would have all compiled once more."""
         return (a if a.flags.carray else np.array(a, dtype=np.float64, order="C") for a in arrays)
 
-    def move(
-        self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: FloatArray
-    ) -> str:
+    def move(self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: Packed) -> str:
         """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.
 
         Returns
@@ -112,9 +110,9 @@ class Flights:
             point.fresh = False
         v, work = point.v, point.work
         if len(work):
-            found = many_flights(fractions, dt, 0, x, before, v, work, kick, force, fresh, out, tables)
+            found = many_flights(fractions, dt, 0, x, before, v, work, kick, force, fresh, out, *tables)
         else:
-            found = one_flight(dt, x, before, v, kick, force, out, tables)
+            found = one_flight(dt, x, before, v, kick, force, out, *tables)
         bad = self.landed(found, fractions, dt, x, v, work, force, out, time, tables)
         if not bad:
             point.x = out
@@ -131,7 +129,7 @@ class Flights:
         force: FloatArray,
         out: FloatArray,
         time: float,
-        tables: FloatArray,
+        tables: Packed,
     ) -> str:
         """What `one_flight` or `many_flights` left to do, from what it reports and the rest of what it was given.
 
@@ -156,13 +154,13 @@ class Flights:
             self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
             if at + 1 == len(fractions):
                 return ""
-            found = many_flights(fractions, dt, at + 1, x, v, v, work, 0.0, force, False, out, tables)
+            found = many_flights(fractions, dt, at + 1, x, v, v, work, 0.0, force, False, out, *tables)
         if found != self.took:
             self.took = found
             self.motion.took(found)
         return ""
 
-    def ended(self, found: int, x: FloatArray, v: FloatArray, time: float, tables: FloatArray) -> str:
+    def ended(self, found: int, x: FloatArray, v: FloatArray, time: float, tables: Packed) -> str:
         """What `end_step` left to do, from what it reports and what it was given.
 
         Returns
@@ -178,11 +176,11 @@ class Flights:
         """
         if found < 0:
             self.motion.project_velocities(x, v, time=time, out=v)
-            found = _after(x, v, tables)
+            found = _after(x, v, tables[0])
         return _WHAT[found]
 
 
-def _packed(motion: Motion, *more: NDArray[Any]) -> FloatArray | None:
+def _packed(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     """The tables of all rows; None where there are rows that the kernels do not know."""
     plan, held = motion.plan, motion.constraint_set
     if plan.driven or held.moving or plan.loose is not None:
@@ -212,24 +210,24 @@ def _packed(motion: Motion, *more: NDArray[Any]) -> FloatArray | None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     if fresh:
         sound = fly_first(x, work[0], v0, v, work[1], kick, force, weights, h, out)
     else:
         sound = fly(x, work[0], v, work[1], kick, force, weights, h, out)
-    return packed_positions(out, x, work[1], 1.0 / h, tables) if sound else -2
+    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others) if sound else -2
 
 
 @numba.njit(cache=True, nogil=True)
-def one_flight(h, x, v0, v, kick, force, out, tables):  # type: ignore[no-untyped-def]
+def one_flight(h, x, v0, v, kick, force, out, tables, triangles, others):  # type: ignore[no-untyped-def]
     """A kick of `v0` by kick M^-1 force, then a flight of `h` from `x` to `out` that adds up no remainders.
 
     Parameters
     ----------
     v : ndarray, shape (n_atoms, 3)
         The velocities in the end; may be `v0`.
-    tables : ndarray
+    tables, triangles, others
         From `Flights.tables`, in this step.
 
     Returns
@@ -240,12 +238,12 @@ def one_flight(h, x, v0, v, kick, force, out, tables):  # type: ignore[no-untype
     weights = piece(tables, tables.view(np.int64), MORE)
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
-    took = packed_positions(out, x, v, 1.0 / h, tables)
+    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others)
     return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
 
 
 @numba.njit(cache=True, nogil=True)
-def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, tables):  # type: ignore[no-untyped-def]
+def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, tables, triangles, others):  # type: ignore[no-untyped-def]
     """The same in flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
 
     `work` is that of `Point`, `fresh` whether it holds nothing yet.
@@ -260,14 +258,16 @@ def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, 
         if i > 0:
             start = out if (n - i) % 2 == 0 else work[2]
             v0, kick, fresh = v, 0.0, False
-        took = _flight(start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables)
+        took = _flight(
+            start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables, triangles, others
+        )
         if not 0 <= took <= MANY_ITERATIONS:
             return _FORCE if took == -2 else _ENGINE - i
     return took
 
 
 @numba.njit(cache=True, nogil=True)
-def end_step(x, v, work, kick, force, tables):  # type: ignore[no-untyped-def]
+def end_step(x, v, work, kick, force, tables, triangles, others):  # type: ignore[no-untyped-def]
     """A kick, then the velocities projected.
 
     Returns
@@ -281,7 +281,7 @@ def end_step(x, v, work, kick, force, tables):  # type: ignore[no-untyped-def]
         return 1
     if not all_finite(x):
         return 2
-    return _after(x, v, tables) if packed_tangents(x, v, tables) else -1
+    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others) else -1
 
 
 @numba.njit(cache=True, nogil=True)

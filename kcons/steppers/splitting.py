@@ -15,6 +15,7 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import Flights, end_step, many_flights, one_flight
 from kcons.steppers.state import State, System, check_finite
@@ -145,10 +146,10 @@ class Splitting:
                 now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else time
                 if many:
                     found = many_flights(
-                        fractions, dt, 0, x, before, v, work, kick * dt, f, before is not v, out, tables
+                        fractions, dt, 0, x, before, v, work, kick * dt, f, before is not v, out, *tables
                     )
                 else:
-                    found = one_flight(dt, x, before, v, kick * dt, f, out, tables)
+                    found = one_flight(dt, x, before, v, kick * dt, f, out, *tables)
                 if found != flights.took:
                     bad = flights.landed(found, fractions, dt, x, v, work, f, out, now, tables)
                     if bad:
@@ -157,7 +158,7 @@ class Splitting:
                 if force is not None:
                     f = system.accepted(force(x if shift is None else x + shift, now), number, not left)
             bad = ""
-            found = end_step(x, v, work, kicks[-1] * dt, f, tables)
+            found = end_step(x, v, work, kicks[-1] * dt, f, *tables)
             if found:
                 bad = flights.ended(found, x, v, time, tables)
                 if bad and bad != "far":
@@ -210,7 +211,7 @@ class _Step:
         #: Where stages are compiled: the fractions of the step that their flights take, and what the kernels need.
         self.flights = None if self.exact else system.flights
         self.fractions: Sequence[FloatArray] = ()
-        self.tables: FloatArray = NO_WORK
+        self.tables: Packed = (NO_WORK, None, None)
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
         x = start.positions
@@ -321,7 +322,7 @@ class _Step:
         point = self.point
         if self.flights is not None:
             kick, force = point.take_kick()
-            found = end_step(point.x, point.v, point.work, kick, force, self.tables)
+            found = end_step(point.x, point.v, point.work, kick, force, *self.tables)
             bad = self.flights.ended(found, point.x, point.v, self.now, self.tables)
             if bad and bad != "far":
                 self.refuse(bad)
