@@ -74,7 +74,7 @@ class _CoreRun(Run):
         self._state = self._stepper.step(self._system, self._state, self._dt)
         self._done += 1
         self.time = self._done * self._dt
-        # Rigid water takes a step in one kernel, in which the engine is not called.
+        # Rigid water and few distances take a step in kernels that do not call the engine.
         self.divided = self.constraints.seconds > 0.0
 
     def rewind(self) -> None:

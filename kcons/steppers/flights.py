@@ -25,7 +25,7 @@ from kcons.solvers.water import RigidTriangles
 from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
-MOST_ROWS = 128
+MOST_ROWS = 96
 
 #: What a kernel reports of a stage besides iterations: the force is not finite; the engine has to do a flight (less the
 #: number of the flight).
