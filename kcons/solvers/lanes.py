@@ -119,7 +119,7 @@ def _move(bonds, directions, step, coupling, n):
 
 
 @functools.cache
-def lane_kernels(n_rows: int) -> tuple[Any, Any]:
+def _kernels(n_rows: int) -> tuple[Any, Any]:
     """Kernels for clusters of `n_rows` rows; the closed-over number unrolls their loops."""
     n, n_square, n_coordinates = n_rows, n_rows * n_rows, 3 * n_rows
     n_shifts = 3 * (n_rows + 1)
@@ -407,11 +407,6 @@ class SmallClusters:
             self._undo = aligned(6 * len(self._atoms))
         return self._undo
 
-    def tables(self) -> tuple[NDArray[Any], ...]:
-        """What the kernels for this number of rows need, for those that call them: see `RigidTriangles.tables`."""
-        graph = self._ends, self._weights, self._couplings
-        return self._atoms, self._slots, *graph, self.lengths, self._undo_room()
-
     def _outcome(self, ok: bool, residual: float, iterations: int, row: int) -> Outcome:
         # Rows of lanes that repeat the last cluster are that cluster's rows.
         beyond = max(row - len(self.rows) + self._n_rows, 0) // self._n_rows
@@ -449,7 +444,7 @@ class SmallClusters:
         """
         cell, kind = lattice_kind(lattice)
         return self._outcome(
-            *lane_kernels(self._n_rows)[0](
+            *_kernels(self._n_rows)[0](
                 x_new,
                 x_ref,
                 NO_POINTS if velocities is None else velocities,
@@ -488,7 +483,7 @@ class SmallClusters:
         """
         cell, kind = lattice_kind(lattice)
         return self._outcome(
-            *lane_kernels(self._n_rows)[1](
+            *_kernels(self._n_rows)[1](
                 x,
                 y,
                 self._atoms,

@@ -72,7 +72,7 @@ class Flights:
         far : float
             The system is far if the first is this many times farther from the origin than from any other.
         """
-        found = _packed(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
+        found = packed_rows(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
         return None if found is None else cls(motion, found)
 
     def tables(self) -> Packed:
@@ -180,8 +180,8 @@ class Flights:
         return _WHAT[found]
 
 
-def _packed(motion: Motion, *more: NDArray[Any]) -> Packed | None:
-    """The tables of all rows; None where there are rows that the kernels do not know."""
+def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
+    """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
     if plan.driven or held.moving or plan.loose is not None:
         return None

@@ -27,7 +27,7 @@ from kcons.thermostats.freedom import (
     positive,
     warn_of_conserved_momenta,
 )
-from kcons.thermostats.isokinetic_step import SMALLEST, IsokineticStep, Share, left_for, split
+from kcons.thermostats.isokinetic_step import SMALLEST, IsokineticStep, Share, compiled_step, left_for, split
 
 Convention = Literal["exact", "notes"]
 
@@ -141,6 +141,7 @@ class Isokinetic(Splitting):
         self.atoms = None if atoms is None else np.asarray(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
+        self._one_flight = len(self.drifts) == len(self.flight) == 1
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -179,14 +180,14 @@ class Isokinetic(Splitting):
             A row couples the thermostatted atoms to others.
         """
         self.check(system)
-        share = self._share(system)
         if carried(state, 4, "Isokinetic"):
             if state.forces is None and state.thermostat is not None:
                 state = system.with_forces(state)
                 variables = np.array(state.thermostat)
-                variables[2] = share.push_square(system, state)
+                variables[2] = self._share(system).push_square(system, state)
                 state = replace(state, thermostat=variables)
             return state
+        share = self._share(system)
         state = system.with_forces(state)
         assert state.forces is not None
         drive, rest = split(system, state.positions, state.velocities, state.time)
@@ -241,16 +242,19 @@ class Isokinetic(Splitting):
         ConvergenceError, NonFiniteError, InputError, UnsupportedError
             As for all splittings, and at the start of a run as for `start`.
         """
-        still = stays(state, dt)
+        still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
-        begin = self.start(system, state)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
-            run = IsokineticStep(system, self._share(system), begin, dt)
-            try:
-                return run.through(self.kicks, self._stages)
-            except ConvergenceError as error:
-                raise explained(error, system, state, dt, run.number) from error
+        begin, share = self.start(system, state), self._share(system)
+        try:
+            if share.stages is not None and self._one_flight:
+                after = compiled_step(system, share, begin, dt, self.kicks, self._stages[0])
+                if after is not None:
+                    return after
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
+                return IsokineticStep(system, share, begin, dt).through(self.kicks, self._stages)
+        except ConvergenceError as error:
+            raise explained(error, system, state, dt, begin.step + 1) from error
 
     # -- what can be read -----------------------------------------------------------------------
 

@@ -7,18 +7,15 @@ and of the closed form, with all of their checks; what they cannot do is left to
 
 from __future__ import annotations
 
-import functools
-from typing import Any
-
 import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS
-from kcons.plan import DistanceClusters
-from kcons.solvers.compiled import Tables, kind_and_tables, land, level
-from kcons.solvers.groups import lattice_kind
+from kcons.solvers.borrowed import piece
+from kcons.solvers.packed import MORE, Packed, packed_positions, packed_tangents, set_lattice
 from kcons.steppers import System
+from kcons.steppers.flights import packed_rows
 from kcons.steppers.summation import all_finite
 from kcons.thermostats.kick import after_drift, before_drift
 
@@ -35,44 +32,40 @@ class IsokineticStages:
     Parameters
     ----------
     system : System
-    kind : int
-        Kind of the solver of all its rows, see `kcons.solvers.compiled`.
-    tables : tuple of ndarray
-        Those of the solver.
-    masses : ndarray, shape (n_atoms, 3)
-        Masses of the thermostatted atoms; 0 for the others.
-    others : bool
-        Whether any of the others move.
+    found : tuple
+        All its rows, from `kcons.solvers.packed`; then 1/m for each coordinate, the masses of the thermostatted atoms,
+        and whether others move.
     """
 
-    def __init__(self, system: System, kind: int, tables: Tables, masses: FloatArray, others: bool) -> None:
+    def __init__(self, system: System, found: Packed) -> None:
         self._motion, self._shape = system.motion, (system.n_atoms, 3)
-        self._before, self._after = _kernels(kind)
-        self._atoms = system.weights, masses, others
-        self._solver = tables
-        self._lattice: FloatArray | None = None
-        self._tables = (*self._atoms, *lattice_kind(None), *tables)
+        self._tables = found
+        self._lattice = system.motion.lattice
+        set_lattice(found[0], self._lattice)
 
     @classmethod
     def of(cls, system: System, masses: FloatArray, others: bool) -> IsokineticStages | None:
-        """For `system`, or None if its rows need more than one compiled solver, move, or leave most atoms alone."""
-        motion = system.motion
-        plan = motion.plan
-        if system.force is None or motion.constraint_set.moving or plan.driven or len(plan.pinned):
-            return None
-        if plan.constraint_set is not motion.constraint_set or len(plan.solvers) != 1:
-            return None
-        solver = plan.solvers[0]
-        # Exactly this class: those derived from it do more than their solver.
-        found = kind_and_tables(solver.solver) if type(solver) is DistanceClusters else None
-        return None if found is None else cls(system, *found, masses, others)
+        """For `system`, or None if its rows are too many, move, or hold anything but distances.
 
-    def tables(self) -> tuple[Any, ...]:
-        """What the kernels need to know, for one step: masses, the cell as it is now, the tables of the solver."""
-        lattice = self._motion.lattice
+        Parameters
+        ----------
+        system : System
+        masses : ndarray, shape (n_atoms, 3)
+            Masses of the thermostatted atoms; 0 for the others.
+        others : bool
+            Whether any of the others move.
+        """
+        if system.force is None:
+            return None
+        found = packed_rows(system.motion, system.weights.ravel(), masses.ravel(), np.array([float(others)]))
+        return None if found is None else cls(system, found)
+
+    def tables(self) -> Packed:
+        """What the kernels need to know, for one step: the rows, masses, and the cell as it is now."""
+        lattice = self._motion.cell()
         if lattice is not self._lattice:
             self._lattice = lattice
-            self._tables = (*self._atoms, *lattice_kind(lattice), *self._solver)
+            set_lattice(self._tables[0], lattice)
         return self._tables
 
     def before(
@@ -84,7 +77,7 @@ class IsokineticStages:
         twice: float,
         t: float,
         h: float,
-        tables: tuple[Any, ...],
+        tables: Packed,
     ) -> tuple[int, FloatArray, FloatArray, float]:
         """The kick over t before a flight over h, and the flight, which ends on the constraints.
 
@@ -100,21 +93,21 @@ class IsokineticStages:
         Returns
         -------
         status : int
-            DONE, POSITION, KICK (nothing was done: the kick needs the projected forces), or ENGINE (the kick was done;
-            the positions are those before they are brought onto the constraints).
+            DONE; POSITION (those returned are not finite); KICK (it needs the projected forces) or ENGINE (no landing),
+            where nothing was done.
         positions, velocities : ndarray, shape (n_atoms, 3)
             The velocities are to be projected.
         log_growth : float
             The integral of alpha over the kick.
         """
         place, speed = np.empty(self._shape), np.empty(self._shape)
-        status, log_growth, iterations = self._before(x, u, f, square, twice, t, h, speed, place, *tables)
+        status, log_growth, iterations = kick_and_fly(x, u, f, square, twice, t, h, speed, place, *tables)
         if status == DONE:
             self._motion.took(iterations)
         return status, place, speed, log_growth
 
     def after(
-        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float, tables: tuple[Any, ...]
+        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float, tables: Packed
     ) -> tuple[int, FloatArray, FloatArray, float, float, float]:
         """Velocities and forces projected at x, and the kick over t.
 
@@ -138,7 +131,7 @@ class IsokineticStages:
             f.M_par^+ f, by what u is brought to its length, and the integral of alpha.
         """
         speed, pace = np.empty(self._shape), np.empty(self._shape)
-        status, square, factor, log_growth = self._after(x, u, f, twice, t, speed, pace, *tables)
+        status, square, factor, log_growth = project_and_kick(x, u, f, twice, t, speed, pace, *tables)
         return status, speed, pace, square, factor, log_growth
 
 
@@ -165,43 +158,49 @@ def _accelerations(f, weights, out):  # type: ignore[no-untyped-def]
         c[i] = w[i] * a[i]
 
 
-@functools.cache
-def _kernels(kind: int) -> tuple[Any, Any]:
-    """Kernels around the solver of one kind, a constant to them."""
-    solver = kind
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest):  # type: ignore[no-untyped-def]
+    """`IsokineticStages.before`; status, log of the growth, and iterations."""
+    header = tables.view(np.int64)
+    weights, masses, apart = (
+        piece(tables, header, MORE),
+        piece(tables, header, MORE + 1),
+        piece(tables, header, MORE + 2),
+    )
+    log_growth, done = before_drift(u0, f, weights, masses, square, twice, t, MANY, u)
+    if not done:
+        return KICK, 0.0, 0
+    if apart[0] != 0:
+        _accelerations(f, weights, out)
+        _push_others(u0, out, t, weights, masses, u)
+    _fly(x, u, h, out)
+    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest)
+    if not all_finite(out):
+        return POSITION, log_growth, 0
+    return (DONE if 0 <= iterations <= MANY_ITERATIONS else ENGINE), log_growth, iterations
 
-    @numba.njit(cache=True, nogil=True, error_model="numpy")
-    def before(  # type: ignore[no-untyped-def]
-        x, u0, f, square, twice, t, h, u, out, weights, masses, others, lattice, image, *tables
-    ):
-        log_growth, done = before_drift(u0, f, weights, masses, square, twice, t, MANY, u)
-        if not done:
-            return KICK, 0.0, 0
-        if others:
-            _accelerations(f, weights, out)
-            _push_others(u0, out, t, weights, masses, u)
-        _fly(x, u, h, out)
-        iterations = land(solver, out, x, u, 1.0 / h, lattice, image, tables)
-        if not 0 <= iterations <= MANY_ITERATIONS:
-            return ENGINE, log_growth, 0
-        return (DONE if all_finite(out) else POSITION), log_growth, iterations
 
-    @numba.njit(cache=True, nogil=True, error_model="numpy")
-    def after(  # type: ignore[no-untyped-def]
-        x, u, f, twice, t, out, pace, weights, masses, others, lattice, image, *tables
-    ):
-        if not all_finite(f):
-            return FORCE, 0.0, 0.0, 0.0
-        if not all_finite(x):
-            return POSITION, 0.0, 0.0, 0.0
-        _accelerations(f, weights, pace)
-        if not (level(solver, x, u, lattice, image, tables) and level(solver, x, pace, lattice, image, tables)):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest):  # type: ignore[no-untyped-def]
+    """`IsokineticStages.after`; status, f.M_par^+ f, factor, and log of the growth."""
+    header = tables.view(np.int64)
+    weights, masses, apart = (
+        piece(tables, header, MORE),
+        piece(tables, header, MORE + 1),
+        piece(tables, header, MORE + 2),
+    )
+    if not all_finite(f):
+        return FORCE, 0.0, 0.0, 0.0
+    if not all_finite(x):
+        return POSITION, 0.0, 0.0, 0.0
+    _accelerations(f, weights, pace)
+    # One call site, which is compiled once.
+    for y in (u, pace):
+        if not packed_tangents(x, y, tables, triangles, rest):
             return ENGINE, 0.0, 0.0, 0.0
-        square, factor, log_growth, done = after_drift(u, pace, masses, twice, t, out)
-        if not done:
-            return KICK, square, factor, log_growth
-        if others:
-            _push_others(u, pace, t, weights, masses, out)
-        return (DONE if all_finite(out) else VELOCITY), square, factor, log_growth
-
-    return before, after
+    square, factor, log_growth, done = after_drift(u, pace, masses, twice, t, out)
+    if not done:
+        return KICK, square, factor, log_growth
+    if apart[0] != 0:
+        _push_others(u, pace, t, weights, masses, out)
+    return (DONE if all_finite(out) else VELOCITY), square, factor, log_growth
