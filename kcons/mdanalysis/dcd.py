@@ -101,7 +101,8 @@ class PlainDcd:
             for end in ends.tolist():
                 while done < end:
                     n = min(at_once, end - done)
-                    got = os.preadv(file.fileno(), [words[:n].data], self._begin + int(frames[done]) * self.size)
+                    file.seek(self._begin + int(frames[done]) * self.size)
+                    got = file.readinto(words[:n].data)
                     read = words[: got // self.size]
                     whole = (read[:, self._around] == self._lengths).all(axis=1)
                     n_whole = len(read) if whole.all() else int(np.argmin(whole))
