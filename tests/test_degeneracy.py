@@ -1,4 +1,4 @@
-"""Second-order-singular rows: what is recognised, what it becomes, what is left alone, what is refused."""
+"""Groups that are flat or straight: which are converted, left alone, refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from flat_groups import BENZENE, CO2, CONVERTED, FORMATE, Array, converted, counts, pairs_of, rank_of, ring, turned
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
@@ -27,86 +27,15 @@ from kcons.degeneracy import without_second_order_rows
 from kcons.errors import SingularGeometryError
 from kcons.motion import Motion
 
-Array = NDArray[np.float64]
-
-
-def pairs_of(n: int) -> list[tuple[int, int]]:
-    return list(combinations(range(n), 2))
-
-
-def turned(x: Sequence[Sequence[float]] | Array, seed: int = 3) -> Array:
-    """The same points in a general orientation and place."""
-    rng = np.random.default_rng(seed)
-    q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    return np.asarray(x, dtype=float) @ q + rng.standard_normal(3)
-
-
-def ring(n: int, radius: float = 1.4, phase: float = 0.0) -> Array:
-    angle = 2 * np.pi * np.arange(n) / n + phase
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
-
-
 TETRAHEDRON = 0.63 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 METHANE = np.vstack([np.zeros((1, 3)), TETRAHEDRON])
-BENZENE = np.vstack([ring(6, 1.39), ring(6, 2.48)])
-FORMATE = np.array([[0.0, 0, 0], [0, 1.1, 0], [1.1, -0.6, 0], [-1.1, -0.6, 0]])
 ETHYLENE = np.array([[0.0, 0, 0], [1.34, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [1.84, 0.9, 0], [1.84, -0.9, 0]])
-CO2 = np.array([[-1.16, 0.0, 0.0], [0.0, 0.0, 0.0], [1.16, 0.0, 0.0]])
-HEXAGON_12 = [p for p in pairs_of(6) if p[1] - p[0] != 3]
 ETHYLENE_BONDS = [(0, 1), (0, 2), (0, 3), (1, 4), (1, 5)]
 ETHYLENE_ANGLES = [(1, 0, 2), (1, 0, 3), (2, 0, 3), (0, 1, 4), (0, 1, 5), (4, 1, 5)]
 BENZENE_BONDS = [(i, (i + 1) % 6) for i in range(6)] + [(i, i + 6) for i in range(6)]
 BENZENE_ANGLES = [
     t for i in range(6) for t in (((i - 1) % 6, i, (i + 1) % 6), ((i - 1) % 6, i, i + 6), ((i + 1) % 6, i, i + 6))
 ]
-
-
-def converted(rows: Constraint | Sequence[Constraint], x: Array, **options: object) -> ConstraintSet:
-    given = ConstraintSet(rows, x, np.ones(len(x)), **options)  # type: ignore[arg-type]
-    return without_second_order_rows(given, x, 0.0, convert=True)
-
-
-def rank_of(held: ConstraintSet, x: Array) -> int:
-    a = held.jacobian(x).toarray()
-    return int(np.linalg.matrix_rank(a / np.linalg.norm(a, axis=1, keepdims=True), tol=1e-6))
-
-
-def counts(held: ConstraintSet) -> tuple[int, int]:
-    """(distances, rows of linear relations)."""
-    of = {"Distance": 0, "LinearRelation": 0}
-    for item in held.constraints:
-        of[item.family] += item.n_rows
-    return of["Distance"], of["LinearRelation"]
-
-
-CONVERTED = {
-    "CO2 by 3": (CO2, pairs_of(3), (1, 3), 5),
-    "OCS by 3": ([[0, 0, 0], [1.16, 0, 0], [2.72, 0, 0]], pairs_of(3), (1, 3), 5),
-    "C3O2 by 10": ([[0, 0, 0], [1.16, 0, 0], [2.45, 0, 0], [3.74, 0, 0], [4.9, 0, 0]], pairs_of(5), (1, 9), 5),
-    "two triples of a line": (
-        [[0, 0, 0], [1, 0, 0], [2.1, 0, 0], [3.3, 0, 0]],
-        [*pairs_of(3), (1, 3), (2, 3)],
-        (1, 6),
-        5,
-    ),
-    "square by 6": (ring(4), pairs_of(4), (3, 3), 6),
-    "formate by 6": (FORMATE, pairs_of(4), (3, 3), 6),
-    "hexagon by 15": (ring(6), pairs_of(6), (3, 9), 6),
-    "hexagon by 12": (ring(6), HEXAGON_12, (3, 9), 6),
-    "benzene by 66": (BENZENE, pairs_of(12), (3, 27), 6),
-    "two squares with a common edge": (
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]],
-        [p for p in pairs_of(6) if set(p) <= {0, 1, 2, 3} or set(p) <= {1, 2, 4, 5}],
-        (5, 6),
-        7,
-    ),
-    "hexagon with an atom above three of it": (
-        np.vstack([ring(6), [[0.2, 0.1, 1.3]]]),
-        [*pairs_of(6), (0, 6), (1, 6), (2, 6)],
-        (6, 9),
-        6,
-    ),
-}
 
 
 @pytest.mark.parametrize("case", CONVERTED)
@@ -249,140 +178,6 @@ def test_smallest_singular_value_at_179_9_degrees() -> None:
     x = np.array([[1, 0, 0], [0, 0, 0], [np.cos(a), np.sin(a), 0]])
     rows = ConstraintSet(Distance(pairs_of(3)), x, np.ones(3)).jacobian(x).toarray() / np.sqrt(2)
     assert np.linalg.svd(rows, compute_uv=False)[-1] == pytest.approx(8.7266e-4, rel=1e-4)
-
-
-# -- what the converted rows do ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "case", ["CO2 by 3", "OCS by 3", "hexagon by 15", "formate by 6", "benzene by 66", "two squares with a common edge"]
-)
-def test_all_distances_hold_over_2000_steps(case: str) -> None:
-    """RATTLE steps by hand with forces in all directions; every original distance to 1e-14."""
-    shape, pairs, _, _ = CONVERTED[case]
-    x = turned(shape) * 1.0
-    x -= x.mean(axis=0)
-    masses = np.random.default_rng(5).uniform(1.0, 16.0, len(x))
-    given = ConstraintSet(Distance(pairs), x, masses)
-    motion = Motion(given, x)
-    rng = np.random.default_rng(6)
-    pull = rng.standard_normal((len(x), 3))
-    m = masses[:, None]
-    dt, worst = 0.02, 0.0
-    v = motion.project_velocities(x, 0.3 * rng.standard_normal(x.shape))
-    lengths = given.target()
-
-    def force(x: Array) -> Array:
-        return pull - 0.5 * x
-
-    for _ in range(2000):
-        v += 0.5 * dt * force(x) / m
-        x = motion.project_positions(x + dt * v, x, velocities=v, dt=dt)
-        v += 0.5 * dt * force(x) / m
-        v = motion.project_velocities(x, v)
-        worst = max(worst, float(np.max(np.abs(given.value(x)) / lengths)))
-    assert worst <= 1e-14
-
-
-def test_out_of_plane_force_turns_the_ring_as_a_rigid_body() -> None:
-    """Accelerations of the converted hexagon are those of Euler's rigid body, to rounding."""
-    rng = np.random.default_rng(2)
-    x = turned(ring(6))
-    masses = rng.uniform(1, 20, 6)
-    motion = Motion(ConstraintSet(Distance(pairs_of(6)), x, masses), x)
-    f = rng.standard_normal((6, 3))
-    f[2] += 3.0
-    a = motion.acceleration(x, np.zeros_like(x), f)
-    m = masses[:, None]
-    centre = (m * x).sum(axis=0) / masses.sum()
-    d = x - centre
-    inertia = np.sum(
-        masses[:, None, None]
-        * (np.einsum("ij,ij->i", d, d)[:, None, None] * np.eye(3) - d[:, :, None] * d[:, None, :]),
-        axis=0,
-    )
-    expected = f.sum(axis=0) / masses.sum() + np.cross(np.linalg.solve(inertia, np.cross(d, f).sum(axis=0)), d)
-    np.testing.assert_allclose(a, expected, atol=1e-13 * np.abs(expected).max())
-
-
-def test_targets_of_base_distances_are_kept_to_the_last_bit() -> None:
-    lengths = np.array([1.1600000000000001, 2.3299999999999996, 1.17])
-    held = converted(Distance(pairs_of(3), lengths), turned([[0, 0, 0], [1.16, 0, 0], [2.33, 0, 0]]))
-    assert held.target()[0] == lengths[1]
-
-
-def test_weights_follow_the_targets_and_not_a_stretched_start() -> None:
-    for shape, pairs in ((1.2 * CO2, pairs_of(3)), (1.2 * ring(6), pairs_of(6))):
-        x = turned(shape)
-        proper = CO2 if len(x) == 3 else ring(6)
-        lengths = ConstraintSet(Distance(pairs), proper, np.ones(len(x))).target()
-        given = ConstraintSet(Distance(pairs, lengths), x, np.ones(len(x)))
-        motion = Motion(given, x)
-        restored = motion.restore_positions(x)
-        assert motion.rank == 3 * len(x) - (5 if len(x) == 3 else 6)
-        assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
-
-
-@pytest.mark.parametrize("noise", [1e-7, 1e-4, 1e-3])
-def test_puckered_start_with_planar_targets_is_held_as_planar(noise: float) -> None:
-    x0 = turned(ring(6))
-    lengths = ConstraintSet(Distance(pairs_of(6)), x0, np.ones(6)).target()
-    x = x0 + noise * np.random.default_rng(4).standard_normal(x0.shape)
-    given = ConstraintSet(Distance(pairs_of(6), lengths), x, np.ones(6))
-    motion = Motion(given, x)
-    assert motion.rank == motion.constraint_set.n_rows == 12
-    restored = motion.restore_positions(x)
-    assert np.max(np.abs(given.value(restored)) / lengths) < 1e-14
-
-
-def test_many_puckered_rings_are_all_found() -> None:
-    """More of them than regular blocks are sampled; noise of 1e-3 on planar targets."""
-    rng = np.random.default_rng(0)
-    flat = np.vstack([turned(ring(4), seed=k) + 20 * rng.standard_normal(3) for k in range(150)])
-    pairs = np.vstack([np.array(pairs_of(4)) + 4 * k for k in range(150)])
-    lengths = ConstraintSet(Distance(pairs), flat, np.ones(600)).target()
-    held = converted(Distance(pairs, lengths), flat + 1e-3 * rng.standard_normal(flat.shape))
-    assert counts(held) == (450, 450)
-
-
-def test_bent_start_with_flat_targets_is_held_as_linear() -> None:
-    x = turned([[-1.16, 0, 0], [0, 0.02, 0], [1.16, 0, 0]])
-    given = ConstraintSet(Distance(pairs_of(3), [1.16, 2.32, 1.16]), x, np.ones(3))
-    motion = Motion(given, x)
-    assert motion.degrees_of_freedom == 5
-    assert np.max(np.abs(given.value(motion.restore_positions(x)))) < 1e-15 * 4
-
-
-def test_group_across_a_periodic_boundary() -> None:
-    x = np.mod(ring(6) + np.array([3.0, 0.2, 9.9]), 10.0)
-    held = converted(Distance(pairs_of(6)), x, cell=[10.0, 10.0, 10.0])
-    assert counts(held) == (3, 9)
-    assert np.abs(held.value(x)).max() < 1e-14
-
-
-def test_only_the_rows_of_the_flat_group_change() -> None:
-    """A rigid water and a flexible tail beside and on the ring stay as they were."""
-    water = np.array([[5.0, 5, 5], [5.96, 5, 5], [4.76, 5.93, 5]])
-    x = np.vstack([ring(6), [[2.9, 0, 0.3], [3.3, 1.4, 0.1]], water])
-    rows = [Distance([(0, 6), (6, 7), *pairs_of(6)]), Distance([(8, 9), (8, 10), (9, 10)])]
-    held = converted(rows, x)
-    assert [(c.family, c.n_rows) for c in held.constraints] == [
-        ("Distance", 2),
-        ("Distance", 3),
-        ("Distance", 3),
-        ("LinearRelation", 9),
-    ]
-    assert held.constraints[0].atoms.tolist() == [[0, 6], [6, 7]]
-    assert rank_of(held, x) == held.n_rows == 17
-
-
-def test_fixed_atoms_become_bases() -> None:
-    x = ring(6)
-    held = converted([Distance(pairs_of(6)), FixedAtoms([2])], x)
-    motion = Motion(held, x)
-    assert motion.degrees_of_freedom == 3
-    relation = held.constraints[-1]
-    assert relation.family == "LinearRelation" and (relation.atoms[:, 1:] == 2).any(axis=1).all()
 
 
 # -- refusals ---------------------------------------------------------------------------------------------

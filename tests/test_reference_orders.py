@@ -14,44 +14,15 @@ import numpy as np
 import pytest
 from reference import cases
 from reference.cases import Case, Snapshot
+from steppers.systems import EVERY
 
 from kcons.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
-from kcons.steppers import (
-    Baumgarte,
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
-    Rattle,
-    State,
-    Stepper,
-    Suzuki4,
-    System,
-    Yoshida4,
-    run,
-)
+from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, State, Stepper, System, run
 
 EPS = float(np.finfo(float).eps)
-STEPPERS: list[Stepper] = [
-    Rattle(),
-    Geodesic(4),
-    Suzuki4(),
-    Yoshida4(),
-    KahanLi6(),
-    BlanesMoan4(),
-    BlanesMoan6(),
-    BlanesMoan6a(),
-    ProjectedVerlet(),
-    ProjectedVerlet(project=True),
-    ProjectedRungeKutta4(),
-    ProjectedRungeKutta4(project=True),
-    Baumgarte(1.0),
-]
+STEPPERS: list[Stepper] = EVERY
 #: Run on all cases by every test run; all steppers by the long one.
 USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesMoan4()", "BlanesMoan6()"}
 #: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.

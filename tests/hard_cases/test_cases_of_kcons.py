@@ -7,7 +7,7 @@ import pytest
 from kcons.hard_cases import OURS, all_cases, run_cell
 
 CASES = all_cases()
-#: Costly judges: the same numbers are tested in test_hard_cases.py of the core.
+#: Costly judges: the same numbers are tested in test_hard_cases_*.py of the core.
 SLOW = {"H16", "H35", "H33", "X42"}
 
 

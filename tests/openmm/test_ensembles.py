@@ -1,11 +1,11 @@
-"""Isokinetic and Langevin ensembles in OpenMM."""
+"""Isokinetic motion in OpenMM: trajectories, constants, and what is held."""
 
 import copy
-import pickle
 
 import numpy as np
 import openmm
 import pytest
+from ensemble_runs import run, twice_kinetic
 from openmm import unit
 from openmm_systems import (
     alanine,
@@ -14,7 +14,6 @@ from openmm_systems import (
     forces_at,
     loose_alanine,
     masses_of,
-    potential_energy,
     started,
     state_of,
     water_box,
@@ -23,32 +22,15 @@ from openmm_systems import (
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
 from kcons.constraints import Angle, Distance, Sphere
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
-from kcons.openmm import (
-    CollectiveRows,
-    Isokinetic,
-    Langevin,
-    ProjectedIntegrator,
-    Row,
-    SurfaceIntegrator,
-    hold,
-    surface_parts,
-)
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import CollectiveRows, Isokinetic, ProjectedIntegrator, Row, SurfaceIntegrator, hold, surface_parts
 from kcons.openmm.isokinetic import GAS_CONSTANT
 from kcons.thermostats import Isokinetic as CoreIsokinetic
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
+
 ORDERS = {"rattle": 2, "isokinetic4": 4, "isokinetic6": 6}
-
-
-def twice_kinetic(system, v):
-    return float(masses_of(system) @ np.einsum("ij,ij->i", v, v))
-
-
-def run(system, integrator, x, v, steps, platform="Reference"):
-    context = started(system, integrator, x, v, platform)
-    integrator.step(steps)
-    return context
 
 
 # -- isokinetic: trajectories -------------------------------------------------------------------------
@@ -368,188 +350,3 @@ def test_a_part_of_the_particles():
     assert np.abs(state_of(both)[0][:12] - state_of(start)[0][:12]).max() > 1e-9
     with pytest.raises(UnsupportedError, match="couples"):
         run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, atoms=[0, 1])), x, v, 1)
-
-
-# -- isokinetic: g, refusals, settings -----------------------------------------------------------------
-
-
-def test_momenta_that_are_conserved_are_found():
-    system, x, v = dumbbell()
-    ensemble = Isokinetic(300.0)
-    run(system, ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
-    assert ensemble.count == 5  # the field stands in space
-    field = system.getForce(0)
-    field.setEnergyFunction("k*x^2+c*0")
-    ensemble = Isokinetic(300.0)
-    with pytest.warns(UserWarning, match="total momentum is not zero"):
-        run(system, ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
-    assert ensemble.count == 3  # along y and z nothing acts
-    free = Isokinetic(300.0, momentum="free")
-    run(system, ProjectedIntegrator(1e-4, ensemble=free), x, v, 1)
-    assert free.count == 5
-
-
-def test_a_free_cluster_is_warned_of():
-    system, x, v = loose_alanine()
-    masses = masses_of(system)
-    with pytest.warns(UserWarning, match="no torque"):
-        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, v - masses @ v / masses.sum(), 1)
-
-
-@pytest.mark.filterwarnings("ignore:total momentum")
-def test_what_cannot_be_thermostatted_is_refused():
-    for arguments, match in (
-        ({"temperature": 0.0}, "temperature"),
-        ({"temperature": float("nan")}, "temperature"),
-        ({"kinetic_energy": -1.0}, "kinetic_energy"),
-        ({"temperature": 300.0, "kinetic_energy": 1.0}, "not both"),
-        ({"convention": "other"}, "convention"),
-        ({"momentum": "maybe"}, "momentum"),
-    ):
-        with pytest.raises(InputError, match=match):
-            Isokinetic(**arguments)
-    for scheme in ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6"):
-        with pytest.raises(UnsupportedError, match="isokinetic4"):
-            ProjectedIntegrator(1e-3, scheme, ensemble=Isokinetic(300.0))
-    system, x, v = dumbbell()
-    with pytest.raises(InputError, match="non-zero kinetic energy"):
-        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, 0 * v, 1)
-    one = openmm.System()
-    for m in (1.0, 0.0):
-        one.addParticle(m)
-    planes = CollectiveRows(one, [Row(_plane("x"), 0.0), Row(_plane("y"), 0.0)])
-    integrator = ProjectedIntegrator(1e-3, parts=[planes], ensemble=Isokinetic(300.0))
-    with pytest.raises(OverdeterminedError, match="g - 1 = 0"):
-        run(one, integrator, np.zeros((2, 3)), [[0, 0, 1.0], [0, 0, 0]], 1)
-
-
-def _plane(name):
-    force = openmm.CustomExternalForce(name)
-    force.addParticle(0, [])
-    return force
-
-
-def test_moving_targets_are_refused_and_held_by_langevin():
-    for ensemble in (Isokinetic(300.0), Langevin(300.0, 5.0)):
-        system, x, v = dumbbell()
-        x = np.vstack([x, x[:1] + np.array([0.2, 0.1, 0.0])])
-        v = np.vstack([v, [[0.1, 0, 0]]])
-        system.addParticle(14.0)
-        part = hold(system, [Distance([[0, 2]], lambda t: 0.2236 + 0.5 * t)], positions=x)
-        integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=ensemble)
-        context = context_of(system, integrator)
-        context.setPositions(x)
-        integrator.applyConstraints(context)
-        integrator.setVelocitiesToTemperature(context, 300, 2)
-        if isinstance(ensemble, Isokinetic):
-            with pytest.raises(UnsupportedError, match="targets that rest"):
-                integrator.step(1)
-            continue
-        for _ in range(4):
-            integrator.step(10)
-            context.getState(energy=True, forces=True)  # evaluates all groups between steps
-            r, u = state_of(context)
-            d = r[2] - r[0]
-            now = context.getTime().value_in_unit(unit.picosecond)
-            assert abs(np.linalg.norm(d) - (0.2236 + 0.5 * now)) < 1e-12
-            assert abs(d @ (u[2] - u[0]) / np.linalg.norm(d) - 0.5) < 1e-9
-
-
-@pytest.mark.parametrize("ensemble", [Isokinetic(300.0, convention="notes"), Langevin(300.0, 1.0)], ids=repr)
-def test_copies_files_and_temperatures(ensemble):
-    system, x, v = alanine()
-    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-    integrator.setRandomNumberSeed(5)
-    twins = [copy.copy(integrator), pickle.loads(pickle.dumps(integrator))]
-    text = openmm.XmlSerializer.serialize(integrator)
-    twins.append(ProjectedIntegrator.from_xml(text, ensemble=copy.copy(ensemble)))
-    context = run(system, integrator, x, v, 20)
-    first = state_of(context)
-    for twin in twins:
-        assert repr(twin.ensemble) == repr(ensemble)
-        assert np.array_equal(state_of(run(system, twin, x, v, 20)), first)
-    integrator.setTemperature(350 * unit.kelvin)
-    integrator.step(2)
-    assert repr(integrator.ensemble).count("350 K") == 1
-    if isinstance(ensemble, Isokinetic):
-        k = twice_kinetic(system, state_of(context)[1])
-        assert abs(k / (66 * GAS_CONSTANT * 350) - 1) <= 1e-13
-    with pytest.raises(UnsupportedError, match="ensemble"):
-        ProjectedIntegrator(1e-3).setTemperature(300)
-
-
-def test_checkpoints_continue_bit_for_bit():
-    system, x, v = alanine()
-    for ensemble in (Isokinetic(300.0), Langevin(300.0, 1.0)):
-        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
-        integrator.setRandomNumberSeed(3)
-        context = run(system, integrator, x, v, 10)
-        kept = context.createCheckpoint()
-        integrator.step(10)
-        after = state_of(context)
-        context.loadCheckpoint(kept)
-        integrator.step(10)
-        assert np.array_equal(state_of(context), after)
-
-
-# -- Langevin ------------------------------------------------------------------------------------------
-
-
-def test_langevin_without_friction_is_the_drift_in_two_halves():
-    """Order 2, and no noise."""
-    system, x, v = alanine()
-    exact = state_of(run(system, ProjectedIntegrator(2.5e-4, "blanes-moan6", tolerance=1e-13), x, v, 64))[0]
-    errors = []
-    for n in (16, 32, 64):
-        integrator = ProjectedIntegrator(0.016 / n, tolerance=1e-13, ensemble=Langevin(300.0, 0.0))
-        errors.append(np.abs(state_of(run(system, integrator, x, v, n))[0] - exact).max())
-    slope = np.polyfit(np.log([4, 2, 1]), np.log(errors), 1)[0]
-    assert slope == pytest.approx(2, abs=0.15)
-
-
-def test_langevin_is_refused_where_it_cannot_be():
-    for scheme in ("leapfrog", "geodesic", "suzuki4", "blanes-moan4", "isokinetic4"):
-        if scheme == "geodesic":  # the same splitting of OpenMM's program
-            continue
-        with pytest.raises(UnsupportedError):
-            ProjectedIntegrator(1e-3, scheme, ensemble=Langevin(300.0, 1.0))
-    with pytest.raises(InputError, match="friction"):
-        Langevin(300.0, -1.0)
-    with pytest.raises(InputError, match="temperature"):
-        Langevin(-300.0, 1.0)
-
-
-def test_langevin_velocities_have_the_temperature_of_the_tangent_plane():
-    """A chain of rigid waters without forces: <v A> = 0 exactly, and <2K> = g kT within three standard errors."""
-    system, x = water_box()
-    system.removeForce(0)
-    integrator = ProjectedIntegrator(2e-3, ensemble=Langevin(300.0, 200.0))
-    integrator.setRandomNumberSeed(11)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 7)
-    values = []
-    for _ in range(400):
-        integrator.step(5)  # friction x time = 2: independent draws
-        values.append(twice_kinetic(system, state_of(context)[1]) / GAS_CONSTANT / (6 * 27))
-    error = np.std(values) / 20
-    assert abs(np.mean(values) - 300) <= 3 * error
-    # The variance of a chi-square distribution with g degrees of freedom.
-    assert np.var(values) == pytest.approx(300**2 * 2 / (6 * 27), rel=0.3)
-
-
-def test_langevin_with_parts():
-    system, x, _ = loose_alanine()
-    carried = hold(system, [], positions=x, take="all")
-    integrator = ProjectedIntegrator(2e-3, parts=[carried], ensemble=Langevin(300.0, 5.0))
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
-    integrator.step(200)
-    report = carried.report(context)
-    r, u = state_of(context)
-    assert np.abs(carried.motion.constraint_set.value(r, 0.0)).max() < 1e-13
-    assert np.abs(carried.motion.constraint_set.jacobian(r, 0.0) @ u.ravel()).max() < 1e-11
-    assert report is not None
-    assert 100 < integrator.computeSystemTemperature().value_in_unit(unit.kelvin) < 700
-    assert np.isfinite(potential_energy(context))
