@@ -389,3 +389,12 @@ def selected_numbers(select: Any, n: int) -> IntArray:
     if given.min() < 0 or given.max() >= n:
         raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
     return given.astype(np.int64)
+
+
+def selected_atoms(select: Any, n: int) -> BoolArray | None:
+    """Which of n atoms `selected_numbers` names, shape (n,); None for 'all'."""
+    if isinstance(select, str) and select == "all":
+        return None
+    mask = np.zeros(n, dtype=bool)
+    mask[selected_numbers(select, n)] = True
+    return mask

@@ -16,10 +16,10 @@ from kcons.errors import InputError
 from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
 from kcons.topology import (
     MASSES,
-    BoolArray,
     Snapshot,
     Topology,
     elements_of,
+    selected_atoms,
     selected_numbers,
     sorted_pairs,
     split_residues,
@@ -84,7 +84,7 @@ def constraints_of(
         rigid_residues=rigid_residues,
         rigid_bodies=rigid_bodies,
         on=as_makers(on, lambda key: selected_numbers(key, len(atoms))),
-        selected=None if isinstance(select, str) and select == "all" else _mask(select, len(atoms)),
+        selected=selected_atoms(select, len(atoms)),
         angles=angles,
         guess=guess_bonds,
         remedy=_REMEDY,
@@ -213,9 +213,3 @@ def _mended(
 def _as_integers(ids: NDArray[np.str_]) -> IntArray:
     digits = [("".join(c for c in text if c.isdigit() or c == "-") or "0") for text in ids.tolist()]
     return np.array([int(d) for d in digits] or [], dtype=np.int64)
-
-
-def _mask(select: Any, n: int) -> BoolArray:
-    mask = np.zeros(n, dtype=bool)
-    mask[selected_numbers(select, n)] = True
-    return mask

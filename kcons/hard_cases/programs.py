@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,15 @@ def together(*watches: Watch) -> Watch:
 
 class NotIntactError(AssertionError):
     """A call that failed has changed its input."""
+
+
+class Course(NamedTuple):
+    """How a run is made, see `Program.run`."""
+
+    every: int
+    project: bool
+    wrap: bool
+    stepper: Stepper | None
 
 
 class Program:
@@ -96,6 +105,10 @@ class Program:
         stepper : Stepper, optional
             For the core only.
         """
+        return self.go(problem, dt, steps, watch, Course(every, project, wrap, stepper))
+
+    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
+        """What `run` does."""
         raise NotImplementedError
 
     def degrees_of_freedom(self, problem: Problem) -> int:
@@ -117,26 +130,15 @@ class Core(Program):
             potential=(lambda x, t: problem.potential(x)) if problem.has_forces else None,
         )
 
-    def run(
-        self,
-        problem: Problem,
-        dt: float,
-        steps: int,
-        watch: Watch | None = None,
-        *,
-        every: int = 1,
-        project: bool = False,
-        wrap: bool = False,
-        stepper: Stepper | None = None,
-    ) -> Frame:
+    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
         given = (np.asarray(problem.positions), np.asarray(problem.masses))
         before = [a.tobytes() for a in given]
         state: State | None = None
         try:
             system = self.system(problem)
-            stepper = Rattle() if stepper is None else stepper
+            stepper = Rattle() if course.stepper is None else course.stepper
             stepper.check(system)
-            state = system.initial_state(problem.x, problem.v, project=project)
+            state = system.initial_state(problem.x, problem.v, project=course.project)
 
             def frame(state: State) -> Frame:
                 kinetic = system.kinetic_energy(state.velocities)
@@ -153,9 +155,9 @@ class Core(Program):
                     if kept and (x.tobytes(), v.tobytes()) != kept:
                         raise NotIntactError(f"the state before step {k} was changed") from error
                     raise
-                if wrap:
+                if course.wrap:
                     state = replace(state, positions=wrapped(state.positions, problem.cell))
-                if watch and k % every == 0:
+                if watch and k % course.every == 0:
                     watch(frame(state))
             return frame(state)
         finally:
@@ -230,21 +232,10 @@ class PlainAse(Program):
         atoms.set_positions(atoms.get_positions())
         atoms.set_momenta(atoms.get_momenta())
 
-    def run(
-        self,
-        problem: Problem,
-        dt: float,
-        steps: int,
-        watch: Watch | None = None,
-        *,
-        every: int = 1,
-        project: bool = False,
-        wrap: bool = False,
-        stepper: Stepper | None = None,
-    ) -> Frame:
-        if stepper is not None:
+    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
+        if course.stepper is not None:
             raise CannotExpressError("one scheme only")
-        atoms = self.atoms(problem, project=project)
+        atoms = self.atoms(problem, project=course.project)
         dynamics = self.dynamics(atoms, dt)
 
         def frame() -> Frame:
@@ -255,10 +246,10 @@ class PlainAse(Program):
             watch(frame())
         for k in range(1, steps + 1):
             dynamics.run(1)
-            if wrap:
+            if course.wrap:
                 # As atoms.wrap() does it: not through the constraints.
                 atoms.arrays["positions"][:] = wrapped(atoms.arrays["positions"], problem.cell)
-            if watch and k % every == 0:
+            if watch and k % course.every == 0:
                 watch(seen := frame())
                 if not np.all(np.isfinite(seen.x)):
                     return seen
@@ -390,27 +381,16 @@ class PlainOpenMM(Program):
                 back = np.zeros_like(v)
             context.setVelocities(v - back)
 
-    def run(
-        self,
-        problem: Problem,
-        dt: float,
-        steps: int,
-        watch: Watch | None = None,
-        *,
-        every: int = 1,
-        project: bool = False,
-        wrap: bool = False,
-        stepper: Stepper | None = None,
-    ) -> Frame:
+    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
         from openmm import unit
 
-        if stepper is not None:
+        if course.stepper is not None:
             raise CannotExpressError("one scheme only")
         if dt <= 0:
             raise CannotExpressError("OpenMM takes no steps back and none of zero length")
         system, integrator, part = self.build(problem, dt)
         context = self.context(system, integrator)
-        self.start(problem, context, part, dt, project)
+        self.start(problem, context, part, dt, course.project)
         nm, speed, energy = unit.nanometer, unit.nanometer / unit.picosecond, unit.kilojoule_per_mole
 
         def frame() -> Frame:
@@ -424,12 +404,12 @@ class PlainOpenMM(Program):
             watch(frame())
         done = 0
         while done < steps:
-            block = 1 if wrap else min(every, steps - done)
+            block = 1 if course.wrap else min(course.every, steps - done)
             integrator.step(block)
             done += block
-            if wrap:
+            if course.wrap:
                 context.setPositions(wrapped(frame().x, problem.cell))
-            if watch and done % every == 0:
+            if watch and done % course.every == 0:
                 watch(seen := frame())
                 if not np.all(np.isfinite(seen.x)):
                     return seen

@@ -14,7 +14,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import Snapshot, Topology, selected_numbers, sorted_pairs
+from kcons.topology import Snapshot, Topology, selected_atoms, selected_numbers, sorted_pairs
 
 __all__ = ["constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -68,10 +68,6 @@ def constraints_of(
     """
     snapshot = snapshot_of(topology, positions, system=system)
     n = snapshot.topology.n_atoms
-    selected = None
-    if not (isinstance(select, str) and select == "all"):
-        selected = np.zeros(n, dtype=bool)
-        selected[selected_numbers(select, n)] = True
     return held_rows(
         snapshot,
         constrain,
@@ -81,7 +77,7 @@ def constraints_of(
         rigid_residues=rigid_residues,
         rigid_bodies=rigid_bodies,
         on=as_makers(on, lambda key: selected_numbers(key, n)),
-        selected=selected,
+        selected=selected_atoms(select, n),
         angles=angles,
         guess=guess_bonds,
         remedy=_REMEDY,
