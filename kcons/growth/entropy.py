@@ -271,8 +271,9 @@ class EntropyRow(Row):
         # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
         error = np.maximum(1.0, np.abs(p.log_x))
         slope = np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * EPSILON * error) * error, axis=0)
-        # Far from equilibrium the excess cancels, see Mixture.excess_over.
-        return np.minimum(np.abs(self.law_excess(p.time)), self.mixture.kT * self._total(p)) + slope
+        # Far from equilibrium the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
+        terms = np.minimum(np.abs(self.law_excess(p.time)), self.mixture.kT * self._total(p))
+        return np.maximum(4.0 * terms, slope)
 
     def bind(self, p: Populations) -> EntropyRow:
         bound = copy.copy(self)
