@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 BUDGET_TOLERANCE = 1e-9
 #: Excess, as a part of the largest there is, that rounding leaves of none (it is quadratic in x - x_eq).
 AT_EQUILIBRIUM = 1e-29
+#: Slope of the excess, as a part of the excess, below which the populations cannot mend its round-off.
+FADED = 1e-2
 
 
 class EntropyLaw(ABC):
@@ -271,9 +273,11 @@ class EntropyRow(Row):
         # ln x carries an error of some 1e-16 of itself, which enters through the gradient; squared where there is none.
         error = np.maximum(1.0, np.abs(p.log_x))
         slope = np.sum(p.x * np.maximum(np.abs(self.gradient(p)), 4.0 * EPSILON * error) * error, axis=0)
-        # Far from equilibrium the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
-        terms = np.minimum(np.abs(self.law_excess(p.time)), self.mixture.kT * self._total(p))
-        return np.maximum(4.0 * terms, slope)
+        excess = np.abs(self.law_excess(p.time))
+        # Where one species is nearly alone, no ln x must be moved to mend what the rounding of sum x does here.
+        slope = np.where(slope < FADED * excess, excess, slope)
+        # Elsewhere the excess cancels, see Mixture.excess_over; terms of some kT sum x are left.
+        return np.maximum(4.0 * np.minimum(excess, self.mixture.kT * self._total(p)), slope)
 
     def bind(self, p: Populations) -> EntropyRow:
         bound = copy.copy(self)
