@@ -109,10 +109,10 @@ PLAN: tuple[Item, ...] = (
     Item("pendulum", "Planar pendulum from 179.9°", "pendulum", every_stepper=True, seconds=15, quick_seconds=5),
     Item("triple-pendulum", "Triple pendulum", "triple-pendulum", every_stepper=True, seconds=15, quick_seconds=5),
     Item("rotor", "Asymmetric top", "rotor", every_stepper=True, seconds=25, quick_seconds=6),
-    Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=25, quick_seconds=6),
+    Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=100, quick_seconds=6),
     Item("fekete", "Fekete points on a sphere", "fekete", every_stepper=True, seconds=20),
     Item("ethanol", "Ethanol, GFN2-xTB", "ethanol", needs="tblite", seconds=60, quick_seconds=20, budget=20),
-    Item("water-216", "Water, 216 molecules", "water", 216, seconds=90, quick_seconds=16, quick_size=8, budget=20),
+    Item("water-216", "Water, 216 molecules", "water", 216, seconds=300, quick_seconds=16, quick_size=8, budget=20),
     Item(
         "water-900",
         "Water, 900 molecules",
@@ -137,8 +137,8 @@ PLAN: tuple[Item, ...] = (
         quick_seconds=0,
         budget=15,
     ),
-    Item("chain-1e2", "Chain of 10² bonds", "chain", 100, every_stepper=True, seconds=60, quick_seconds=14),
-    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, seconds=60, quick_seconds=14),
+    Item("chain-1e2", "Chain of 10² bonds", "chain", 100, every_stepper=True, seconds=75, quick_seconds=14),
+    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, seconds=120, quick_seconds=14),
     Item(
         "chain-1e4",
         "Chain of 10⁴ bonds",
@@ -146,7 +146,7 @@ PLAN: tuple[Item, ...] = (
         10_000,
         without=("ase-internals",),
         why="a step takes longer than the whole budget; 10³ bonds show it",
-        seconds=60,
+        seconds=300,
         quick_seconds=0,
         budget=10,
     ),
@@ -181,7 +181,7 @@ PLAN: tuple[Item, ...] = (
         for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"), ("hangles", "HAngles"))
     ),
     *(
-        _molecule("dhfr", "DHFR", constrain, title, seconds=90, quick_seconds=0, budget=15)
+        _molecule("dhfr", "DHFR", constrain, title, seconds=350, quick_seconds=0, budget=15)
         for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"))
     ),
     _molecule(
