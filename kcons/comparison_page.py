@@ -175,7 +175,10 @@ def winners(parts: Sequence[Part]) -> PageTable:
 
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
-PICTURES = ("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol")
+PICTURES = (
+    *("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol"),
+    *("solver-precision", "scaling"),
+)
 #: Columns of the table of winners that go there.
 SHORT = (0, 1, 2, 3, 4, 5)
 
@@ -196,9 +199,10 @@ def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
     written = [path]
     pictures = []
     for part in parts:
-        if part.key in PICTURES and "comparison" in part.data:
+        figure = shown(part)[0] if part.key in PICTURES else None
+        if figure is not None:
             target = path.parent / "figures" / f"report-{part.key}.png"
-            report.figure(Comparison.from_dict(part.data["comparison"])).savefig(target, dpi=75)
+            figure.savefig(target, dpi=75)
             pictures.append(f"![{part.heading}](figures/{target.name})")
             written.append(target)
     path.write_text(f"{before}{BEGIN}\n{results(parts)}\n" + "\n".join(pictures) + f"\n{END}{after}", encoding="utf-8")
