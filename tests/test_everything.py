@@ -276,7 +276,7 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     for structure in ("alanine", "dhfr"):
         for constrain in ("hbonds", "allbonds", "hangles"):
             assert plan[f"{structure}-{constrain}"].options == {"constrain": constrain}
-    assert sum(item.seconds for item in plan.values()) <= 3600
+    assert sum(item.seconds for item in plan.values()) <= 5400  # "an hour and a half" (docs/report.md)
     assert sum(item.quick_seconds for item in plan.values()) <= everything.QUICK_SECONDS
     assert [item.key for item in everything.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
 
