@@ -56,7 +56,7 @@ class Ends(ProjectedIntegrator):
 
 
 class RattleIntegrator(openmm.CompoundIntegrator):
-    """Velocity Verlet on the constraints of the System, to order 2, as fast as openmm.VerletIntegrator.
+    """Velocity Verlet on the constraints of the System, to order 2, about as fast as openmm.VerletIntegrator.
 
     The motion is that of ``ProjectedIntegrator(timestep, "rattle")``, up to rounding and the tolerance: positions and
     velocities belong to the same time, velocities are tangent, all is checked. Within a call of `step` there are

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
+import statistics
 from pathlib import Path
 
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.schemes import SCHEMES
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "openmm.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = (DOCS / "openmm.md").read_text(encoding="utf-8")
 
 
 def test_listing_on_the_page_is_that_of_the_integrator():
@@ -33,3 +36,20 @@ def test_table_of_costs():
         counts = ProjectedIntegrator(0.002, name).counts()
         found = [counts.passes, counts.constraint_solves, counts.force_evaluations]
         assert [int(n) for n in numbers] == found, name
+
+
+def test_costs_of_compiled_steps_are_those_of_the_committed_comparison():
+    def shown(part, method):
+        found = json.loads((DOCS / "results" / "report" / f"{part}.json").read_text("utf-8"))["comparison"]
+        rows = [dict(zip(found["columns"], m, strict=True)) for m in found["measurements"]]
+        shared = {m["setting"] for m in rows if m["method"] == "openmm-verlet"}
+        value = statistics.median(
+            m["step_seconds"] * 1e6 for m in rows if m["method"] == method and m["setting"] in shared
+        )
+        return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+    for part, title in (("dumbbells", "two dumbbells"), ("chain-1e3", "chain of 1000 bonds")):
+        for tolerance, suffix in (("1e-12", ""), ("1e-4", "-1e-4")):
+            third = "" if suffix else shown(part, "openmm-kcons-rattle")
+            first, second = shown(part, f"openmm-verlet-{tolerance}"), shown(part, f"openmm-rattle{suffix}")
+            assert f"| {title}, tolerance {tolerance} | {first} | {second} | {third} |" in PAGE
