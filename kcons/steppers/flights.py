@@ -27,11 +27,15 @@ from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, f
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 96
 
-#: What a kernel reports of a stage besides iterations: the force is not finite; the engine has to do a flight (less the
-#: number of the flight).
-_FORCE, _ENGINE = -1, -2
+#: What a kernel is to do: end the last step, begin the next stage, or both.
+END, FLY, BOTH = 1, 2, 3
+#: What a kernel reports of a stage besides iterations: the step before could not be ended; the force is not finite; the
+#: engine has to do a flight (less the number of the flight).
+UNENDED, _FORCE, _ENGINE = -1, -2, -3
 #: No number of iterations.
 _UNKNOWN = 1000
+#: Of a stage that is not flown.
+NO_FRACTIONS = np.empty(0)
 #: What it reports of the end of a step; less than 0 where the engine has to do it.
 _WHAT = ("", "force", "position", "velocity", "far")
 
@@ -110,9 +114,9 @@ class Flights:
             point.fresh = False
         v, work = point.v, point.work
         if len(work):
-            found = many_flights(fractions, dt, 0, x, before, v, work, kick, force, fresh, out, *tables)
+            found = many_flights(FLY, fractions, dt, 0, x, before, v, work, 0.0, kick, force, fresh, out, *tables)
         else:
-            found = one_flight(dt, x, before, v, kick, force, out, *tables)
+            found = one_flight(FLY, dt, x, before, v, 0.0, kick, force, out, *tables)
         bad = self.landed(found, fractions, dt, x, v, work, force, out, time, tables)
         if not bad:
             point.x = out
@@ -154,14 +158,22 @@ class Flights:
             self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
             if at + 1 == len(fractions):
                 return ""
-            found = many_flights(fractions, dt, at + 1, x, v, v, work, 0.0, force, False, out, *tables)
+            found = many_flights(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, *tables)
         if found != self.took:
             self.took = found
             self.motion.took(found)
         return ""
 
+    def end(
+        self, dt: float, x: FloatArray, v: FloatArray, work: FloatArray, kick: float, force: FloatArray, tables: Packed
+    ) -> int:
+        """The last kick of a step, and its velocities projected; 0, or what `ended` has to do."""
+        if len(work):
+            return int(many_flights(END, NO_FRACTIONS, dt, 0, x, v, v, work, kick, 0.0, force, False, x, *tables))
+        return int(one_flight(END, dt, x, v, v, kick, 0.0, force, x, *tables))
+
     def ended(self, found: int, x: FloatArray, v: FloatArray, time: float, tables: Packed) -> str:
-        """What `end_step` left to do, from what it reports and what it was given.
+        """What `end` left to do, from what it reports and what it was given.
 
         Returns
         -------
@@ -220,22 +232,34 @@ def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangl
 
 
 @numba.njit(cache=True, nogil=True)
-def one_flight(h, x, v0, v, kick, force, out, tables, triangles, others):  # type: ignore[no-untyped-def]
-    """A kick of `v0` by kick M^-1 force, then a flight of `h` from `x` to `out` that adds up no remainders.
+def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others):  # type: ignore[no-untyped-def]
+    """The end of a step, the first stage of the next, or both, where nothing adds up remainders.
 
     Parameters
     ----------
+    what : int
+        `END`: `v0` takes last_kick M^-1 force and is projected at `x`. `FLY`: a kick of `v0` by kick M^-1 force, then
+        a flight of `h` from `x` to `out`. `BOTH`: one after the other.
     v : ndarray, shape (n_atoms, 3)
-        The velocities in the end; may be `v0`.
+        The velocities after the flight; may be `v0`.
     tables, triangles, others
         From `Flights.tables`, in this step.
 
     Returns
     -------
     int
-        Iterations, or what `Flights.landed` has to do.
+        Of an end alone 0, or what `Flights.ended` has to do. Otherwise iterations, or what `Flights.landed` has to do,
+        or `UNENDED`.
     """
     weights = piece(tables, tables.view(np.int64), MORE)
+    if what != FLY:
+        if not add_kick(v0, last_kick, force, weights):
+            return 1 if what == END else UNENDED
+        found = _ended(x, v0, tables, triangles, others)
+        if what == END:
+            return found
+        if found != 0:
+            return UNENDED
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
     took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others)
@@ -243,12 +267,23 @@ def one_flight(h, x, v0, v, kick, force, out, tables, triangles, others):  # typ
 
 
 @numba.njit(cache=True, nogil=True)
-def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, tables, triangles, others):  # type: ignore[no-untyped-def]
-    """The same in flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
+def many_flights(  # type: ignore[no-untyped-def]
+    what, fractions, dt, first, x, v0, v, work, last_kick, kick, force, fresh, out, tables, triangles, others
+):
+    """The same with a stage of flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
 
     `work` is that of `Point`, `fresh` whether it holds nothing yet.
     """
     weights = piece(tables, tables.view(np.int64), MORE)
+    if what != FLY:
+        if not land(v0, work[1], last_kick, force, weights):
+            return 1 if what == END else UNENDED
+        found = _ended(x, v0, tables, triangles, others)
+        if what == END:
+            return found
+        if found != 0:
+            return UNENDED
+        fresh = True
     n, took = fractions.size, -1
     for i in range(first, n):
         # They end in `out` and in work[2] by turns.
@@ -267,18 +302,8 @@ def many_flights(fractions, dt, first, x, v0, v, work, kick, force, fresh, out, 
 
 
 @numba.njit(cache=True, nogil=True)
-def end_step(x, v, work, kick, force, tables, triangles, others):  # type: ignore[no-untyped-def]
-    """A kick, then the velocities projected.
-
-    Returns
-    -------
-    int
-        0, or what `Flights.ended` has to do.
-    """
-    weights = piece(tables, tables.view(np.int64), MORE)
-    sound = add_kick(v, kick, force, weights) if work.shape[0] == 0 else land(v, work[1], kick, force, weights)
-    if not sound:
-        return 1
+def _ended(x, v, tables, triangles, others):  # type: ignore[no-untyped-def]
+    """Velocities projected; 0, or what `Flights.ended` has to do."""
     if not all_finite(x):
         return 2
     return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others) else -1

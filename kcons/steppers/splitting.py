@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
-from kcons.steppers.flights import Flights, end_step, many_flights, one_flight
+from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights, many_flights, one_flight
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import NO_WORK, Point
@@ -93,12 +93,106 @@ class Splitting:
         if still is not None:
             return still
         start = system.with_forces(state) if self.kick_first and state.forces is None else state
+        flights = self._flights(system)
+        return self._piecewise(system, start, dt) if flights is None else self._compiled(system, start, dt, flights)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def march(self, system: System, state: State, dt: float, steps: int) -> State:
+        """The state after so many steps, the same to the last bit as by `step`.
+
+        Nobody looks at the states between: where all is compiled, the end of a step and the beginning of the next are
+        one call.
+
+        Raises
+        ------
+        KconsError
+            As `step`; `error.step` says which one.
+        """
+        self.check(system)
+        flights = None
+        if type(self).step is Splitting.step and dt != 0 and math.isfinite(dt):
+            flights = self._flights(system)
+        while steps > 0:
+            if flights is not None and steps > 1 and state.remainder is None:
+                state, made = self._marched(system, system.with_forces(state), dt, steps, flights)
+                steps -= made
+            if steps > 0:
+                # What is out of the ordinary: here it is done, or said what it is.
+                state = self.step(system, state, dt)
+                steps -= 1
+        return state
+
+    def _flights(self, system: System) -> Flights | None:
+        """Compiled stages, where steps are made of them."""
         flights = system.flights
         if flights is None or system.velocity_dependent or not self.kick_first:
-            return self._piecewise(system, start, dt)
-        if self.exact_flight and system.great_circles is not None:
-            return self._piecewise(system, start, dt)
-        return self._compiled(system, start, dt, flights)
+            return None
+        return None if self.exact_flight and system.great_circles is not None else flights
+
+    def _marched(self, system: System, start: State, dt: float, steps: int, flights: Flights) -> tuple[State, int]:
+        """As many of the steps as the kernels can do without the engine: the state after them, and their number."""
+        force, kicks, number = system.force, self.kicks, start.step
+        x, v, f = start.positions, start.velocities, start.forces
+        if force is None or f is None:
+            kicks, f = self._no_kicks, system.weights
+        if start is not flights.last:
+            x, v, f = flights.known(x, v, f)
+        shape, first, last = x.shape, kicks[0] * dt, kicks[-1] * dt
+        work, fractions = np.empty((3, *shape)), self._fractions[0]
+        later = list(zip(kicks[1:], self._stages, self._fractions[1:], strict=False)) if self._many else None
+        time, left_over, what, found = start.time, start.time_remainder, FLY, 0
+        # Where this step begins and where the last one did. Nobody else knows their velocities, so that the arrays are
+        # used again.
+        here = before = x, v, time, left_over
+        u, spare, next_spare = np.empty(shape), np.empty(shape), np.empty(shape)
+        # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
+        new, tables_now = np.empty, flights.tables
+        try:
+            for made in range(steps):
+                tables, triangles, others = tables_now()
+                out = new(shape)
+                if later is None:
+                    found = one_flight(what, dt, x, v, u, last, first, f, out, tables, triangles, others)
+                else:
+                    found = many_flights(
+                        what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, tables, triangles, others
+                    )
+                if found == UNENDED:
+                    return _at(before, start, made - 1), made - 1
+                here = x, v, time, left_over
+                if later is not None:
+                    for kick, stage, its_fractions in later:
+                        if found < 0:
+                            break
+                        if force is not None:
+                            now = time + (stage.ends[-1] * dt + left_over)
+                            f = system.accepted(force(out, now), number + made + 1, False)
+                        x, out = out, new(shape)
+                        found = many_flights(
+                            FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, tables, triangles,
+                            others,
+                        )  # fmt: skip
+                if found < 0:
+                    return _at(here, start, made), made
+                # As State.later.
+                change = dt + left_over
+                then = time + change
+                part = then - time
+                left_over = (time - (then - part)) + (change - part)
+                time = then
+                if force is not None:
+                    f = system.accepted(force(out, time), number + made + 1, False)
+                x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
+        except InputError:
+            return _at(here, start, made), made
+        if flights.end(dt, x, v, work if self._many else NO_WORK, last, f, flights.tables()):
+            return _at(before, start, steps - 1), steps - 1
+        if found != flights.took:
+            flights.took = found
+            flights.motion.took(found)
+        forces = start.forces if force is None else f.copy()
+        state = flights.last = State(x, v, time, forces, number + steps, None, left_over)
+        return state, steps
 
     def _piecewise(self, system: System, start: State, dt: float) -> State:
         step = _Step(system, start, dt, self._many, self.exact_flight)
@@ -146,10 +240,10 @@ class Splitting:
                 now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else time
                 if many:
                     found = many_flights(
-                        fractions, dt, 0, x, before, v, work, kick * dt, f, before is not v, out, *tables
+                        FLY, fractions, dt, 0, x, before, v, work, 0.0, kick * dt, f, before is not v, out, *tables
                     )
                 else:
-                    found = one_flight(dt, x, before, v, kick * dt, f, out, *tables)
+                    found = one_flight(FLY, dt, x, before, v, 0.0, kick * dt, f, out, *tables)
                 if found != flights.took:
                     bad = flights.landed(found, fractions, dt, x, v, work, f, out, now, tables)
                     if bad:
@@ -158,7 +252,7 @@ class Splitting:
                 if force is not None:
                     f = system.accepted(force(x if shift is None else x + shift, now), number, not left)
             bad = ""
-            found = end_step(x, v, work, kicks[-1] * dt, f, *tables)
+            found = flights.end(dt, x, v, work, kicks[-1] * dt, f, tables)
             if found:
                 bad = flights.ended(found, x, v, time, tables)
                 if bad and bad != "far":
@@ -179,6 +273,12 @@ class Splitting:
             remainder = work[0].copy() if many else np.zeros(shape)
         last = flights.last = State(out, v, time, forces, number, remainder, time_remainder)
         return last
+
+
+def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: int) -> State:
+    """Where a step began, `made` steps after `start`; its forces have been forgotten since."""
+    x, v, time, left_over = begin
+    return State(x, v.copy(), time, None, start.step + made, None, left_over) if made else start
 
 
 class Stage(NamedTuple):
@@ -322,7 +422,7 @@ class _Step:
         point = self.point
         if self.flights is not None:
             kick, force = point.take_kick()
-            found = end_step(point.x, point.v, point.work, kick, force, *self.tables)
+            found = self.flights.end(self.dt, point.x, point.v, point.work, kick, force, self.tables)
             bad = self.flights.ended(found, point.x, point.v, self.now, self.tables)
             if bad and bad != "far":
                 self.refuse(bad)

@@ -183,9 +183,18 @@ def run(
     watching = tuple(observers)
     for observer in watching:
         observer(state)
-    for k in range(1, steps + 1):
-        state = stepper.step(system, state, dt)
-        if k % every == 0:
+    march = getattr(stepper, "march", None)
+    done = 0
+    while done < steps:
+        # Until somebody looks.
+        n = min(every, steps - done) if watching else steps
+        if march is not None:
+            state = march(system, state, dt, n)
+        else:
+            for _ in range(n):
+                state = stepper.step(system, state, dt)
+        done += n
+        if done % every == 0:
             for observer in watching:
                 observer(state)
     return state
