@@ -1,5 +1,7 @@
 """Open chains of held distances, of any length; `sweeps` says how they are solved."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -55,8 +57,10 @@ class Chains:
         lanes = [strip[0].size for strip in strips]
         self._starts = np.concatenate([[0], np.cumsum(lanes)]).astype(np.int64)
         self._atoms = (3 * path[place]).astype(np.uint32)
-        self._owned = owned
-        self._full = owned.reshape(-1, WIDTH).all(axis=1)
+        # Numbers of one byte, which can be views of other arrays.
+        self._owned = owned.astype(np.uint8)
+        self._full = owned.reshape(-1, WIDTH).all(axis=1).astype(np.uint8)
+        self._bonds = np.column_stack((np.delete(path, bounds[1:] - 1), np.delete(path, bounds[:-1]))).astype(np.uint32)
         self._rows = row.astype(np.uint32)
         self._present, self._weights = aligned(len(place)), aligned(len(place))
         self._present[:] = present
@@ -65,6 +69,32 @@ class Chains:
         self._longest = max(lanes) // WIDTH
         self._work = NO_NUMBERS
         self._undo = NO_NUMBERS
+
+    def tables(self, numbers: NDArray[np.int64] | None = None) -> tuple[NDArray[Any], ...]:
+        """What kernels that call `sweeps.project` need.
+
+        Parameters
+        ----------
+        numbers : ndarray of int, optional
+            What the atoms are called there, by what they are called here.
+
+        Returns
+        -------
+        tuple of ndarray
+            What `project` is given of the rows, flat, from `starts` to `wholes`; lengths; atoms of each row, flat;
+            the rooms `work` and `undo`, of which only the sizes count.
+        """
+        atoms, bonds = self._atoms, self._bonds.ravel()
+        if numbers is not None:
+            atoms, bonds = (3 * numbers[atoms // 3]).astype(np.uint32), numbers[bonds].astype(np.uint32)
+        return (
+            self._starts, atoms, self._owned, self._full, self._rows, self._present, self._weights, self._wholes,
+            self.lengths, bonds, *(np.broadcast_to(0.0, n) for n in self._rooms()),
+        )  # fmt: skip
+
+    def _rooms(self) -> tuple[int, int]:
+        """Numbers to work with, and to undo with: the last strip is written once everything is known."""
+        return self._longest * SLOT, 6 * int(self._starts[-2])
 
     def _run(
         self,
@@ -78,9 +108,7 @@ class Chains:
         multipliers: NDArray[np.float64] | None,
     ) -> Outcome:
         if not len(self._work):
-            self._work = aligned(self._longest * SLOT)
-            # The last strip is written once everything is known: it needs no undoing.
-            self._undo = aligned(6 * int(self._starts[-2]))
+            self._work, self._undo = (aligned(n) for n in self._rooms())
         cell, kind = lattice_kind(lattice)
         return Outcome(
             *project(

@@ -2,8 +2,8 @@
 
 A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
 compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
-time (`kcons.solvers.water`), and whatever else is held by sparse elimination (`kcons.solvers.distances`), which knows
-every shape and is the fastest for few rows of many shapes.
+time (`kcons.solvers.water`), long chains (`kcons.solvers.chain`), and whatever else is held by sparse elimination
+(`kcons.solvers.distances`), which knows every shape and is the fastest for few rows of many shapes.
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers import distances
 from kcons.solvers.borrowed import piece
+from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances
-from kcons.solvers.groups import NO_LATTICE, OPEN, lattice_kind
+from kcons.solvers.groups import NO_LATTICE, OPEN, lattice_kind, restore_points
+from kcons.solvers.simd import WIDTH
 from kcons.solvers.storage import LINE, aligned
+from kcons.solvers.sweeps import project
 from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tangents
 
 #: Rounds from where the last one ended, until the lengths are what the positions resolve.
@@ -28,27 +31,33 @@ _MAX_ROUNDS = 4
 #: Numbers in a cache line.
 _ALIGNMENT = LINE // 8
 
-#: Pieces: lengths, pairs, what `SparseDistances.tables` gives, tables of triangles, fixed atoms, the cell.
+#: Pieces: lengths, pairs, what `SparseDistances.tables` gives, tables of triangles, fixed atoms, the cell, and what
+#: `Chains.tables` gives.
 _LENGTHS, _PAIRS, _ATOMS, _MOVES = 0, 1, 3, 16
-_CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, MORE = range(20, 30)
+_CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, _CHAINS = range(20, 30)
+_CHAIN_PIECES = 12
+MORE = _CHAINS + _CHAIN_PIECES
 
-Packed = tuple[FloatArray, int | None, int | None]
+Packed = tuple[FloatArray, int | None, int | None, int | None]
 
 
 def packed(
     triangles: RigidTriangles | None,
+    chains: Chains | None,
     pairs: IntArray,
     lengths: FloatArray,
     inverse_masses: FloatArray,
     pinned: IntArray,
     places: FloatArray,
     *more: NDArray[Any],
+    numbers: IntArray | None = None,
 ) -> Packed:
     """What `packed_positions` and `packed_tangents` need to know.
 
     Parameters
     ----------
     triangles : RigidTriangles or None
+    chains : Chains or None
     pairs : ndarray of int, shape (n_rows, 2)
         The other rows, whole clusters.
     lengths : ndarray, shape (n_rows,)
@@ -59,13 +68,15 @@ def packed(
     places : ndarray, shape (n_pinned, 3)
     *more : ndarray of float64 or uint32, flat
         Pieces number `MORE` and on, for the caller's own kernels.
+    numbers : ndarray of int, optional
+        What the atoms that `chains` knows are called here; None where they are called the same.
 
     Returns
     -------
     tables : ndarray of float64
         Begins with where each piece starts and ends, as integers.
-    triangles, others : int or None
-        Whether there are rows of either kind: 1, or None.
+    triangles, others, chains : int or None
+        Whether there are rows of each kind: 1, or None.
     """
     pieces: list[NDArray[Any]]
     if len(pairs):
@@ -80,7 +91,9 @@ def packed(
     else:
         corners, slots, sides, inv_mass, undo = triangles.tables()
         pieces += [corners, slots, sides.ravel(), inv_mass, undo]
-    pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel(), *more]
+    pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()]
+    pieces += [np.zeros(0)] * _CHAIN_PIECES if chains is None else chains.tables(numbers)
+    pieces += more
     cuts = np.zeros((len(pieces), 2), dtype=np.int64)
     end = 2 * len(pieces)
     for k, part in enumerate(pieces):
@@ -91,8 +104,10 @@ def packed(
     room = aligned(end)
     room.view(np.int64)[: cuts.size] = cuts.ravel()
     for part, (first, last) in zip(pieces, cuts, strict=True):
-        room.view(part.dtype)[first:last] = part
-    return room, None if triangles is None else 1, 1 if len(pairs) else None
+        # All is 0; memory for rooms to work in is not asked for before they are used.
+        if part.strides != (0,) or part[:1].any():
+            room.view(part.dtype)[first:last] = part
+    return room, None if triangles is None else 1, 1 if len(pairs) else None, None if chains is None else 1
 
 
 def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
@@ -107,12 +122,38 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others):  # type: ignore[no-untyped-def]
+def _chains(points, references, velocities, inv_dt, tangent, given, lattice, kind, t, h, u, b):  # type: ignore[no-untyped-def]
+    """Chains as `Chains` projects them; whether it could, and iterations."""
+    landed, _, iterations, _ = project(
+        points, references, velocities, inv_dt, tangent, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
+        piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5),
+        piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7), given, lattice, kind, t[:0],
+        piece(t, h, _CHAINS + 10), piece(t, h, _CHAINS + 11),
+    )  # fmt: skip
+    return landed, iterations
+
+
+@nb.njit(cache=True, nogil=True)
+def _chain_positions(x, x_ref, v, inv_dt, lattice, kind, t, h, u):  # type: ignore[no-untyped-def]
+    """As `kcons.plan.LongChains` does it; iterations, -1 where there is no solution."""
+    lengths, pairs = piece(t, h, _CHAINS + 8), piece(u, h, _CHAINS + 9).reshape(-1, 2)
+    took = -1
+    for turn in range(_MAX_ROUNDS + 1):
+        landed, iterations = _chains(x, x_ref, v, inv_dt, None, lengths, lattice, kind, t, h, u, t.view(np.uint8))
+        if turn == 0:
+            took = iterations if landed else -1
+        if not landed or distances.resolved(x, pairs, lengths, lattice, kind != OPEN):
+            break
+    return took
+
+
+@nb.njit(cache=True, nogil=True)
+def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Parameters
     ----------
-    tables, triangles, others
+    tables, triangles, others, chains
         From `packed`.
 
     Returns
@@ -126,7 +167,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others):  # type: i
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
-    # Nothing is written before all is solved, except that triangles undo what they wrote.
+    # Nothing is written before all is solved, except that triangles and chains undo what they wrote.
     most = 0
     for turn in range(_MAX_ROUNDS + 1):
         if others is not None:
@@ -147,6 +188,15 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others):  # type: i
             if not landed:
                 return -1
             most = max(most, iterations)
+        if chains is not None and turn == 0:
+            iterations = _chain_positions(x, x_ref, v, inv_dt, lattice, kind, t, h, u)
+            if iterations < 0:
+                if triangles is not None:
+                    groups, undo = piece(u, h, _SLOTS).size // WIDTH, piece(t, h, _UNDO)
+                    restore_points(x, piece(u, h, _CORNERS), undo, groups, 3, 6, 0)
+                    restore_points(v, piece(u, h, _CORNERS), undo, groups, 3, 6, 3)
+                return -1
+            most = max(most, iterations)
         if others is None:
             break
         distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
@@ -157,7 +207,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others):  # type: i
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_tangents(x, v, tables, triangles, others):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
     lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
@@ -179,6 +229,14 @@ def packed_tangents(x, v, tables, triangles, others):  # type: ignore[no-untyped
             piece(t, h, _UNDO),
         )  # fmt: skip
         if not converged:
+            return False
+    if chains is not None:
+        none = t[:0]
+        converged, _ = _chains(v, x, none.reshape(0, 3), 0.0, True, none, lattice, kind, t, h, u, tables.view(np.uint8))
+        if not converged:
+            if triangles is not None:
+                groups = piece(u, h, _SLOTS).size // WIDTH
+                restore_points(v, piece(u, h, _CORNERS), piece(t, h, _UNDO), groups, 3, 3, 0)
             return False
     if others is not None:
         distances.apply(v, piece(u, h, _ATOMS), piece(t, h, _MOVES))

@@ -20,12 +20,15 @@ from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.plan import DistanceClusters
 from kcons.solvers.borrowed import piece
+from kcons.solvers.chain import Chains
 from kcons.solvers.packed import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.water import RigidTriangles
 from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 96
+#: Rows of chains up to which they are nothing special to that kernel.
+CHAIN_ROWS = 96
 
 #: What a kernel is to do: end the last step, begin the next stage, or both.
 END, FLY, BOTH = 1, 2, 3
@@ -205,12 +208,15 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
         inverse_masses[held.touched] = plan.inverse_masses
         pinned = held.touched[pinned]
     triangles: RigidTriangles | None = None
+    chains: Chains | None = None
     rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
     for solver in plan.solvers:
         if not isinstance(solver, DistanceClusters):
             return None
         if triangles is None and not compact and isinstance(solver.solver, RigidTriangles):
             triangles = solver.solver
+        elif chains is None and isinstance(solver.solver, Chains) and len(solver.rows) > CHAIN_ROWS:
+            chains = solver.solver
         else:
             rows.append(solver.rows)
     others = np.concatenate(rows)
@@ -218,21 +224,24 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
         return None
     pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
     lengths = held.target(0.0)[others]
-    return packed(triangles, pairs, lengths, inverse_masses, pinned, plan.pinned_targets(None), *more)
+    places, numbers = plan.pinned_targets(None), held.touched if compact else None
+    return packed(triangles, chains, pairs, lengths, inverse_masses, pinned, places, *more, numbers=numbers)
 
 
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     if fresh:
         sound = fly_first(x, work[0], v0, v, work[1], kick, force, weights, h, out)
     else:
         sound = fly(x, work[0], v, work[1], kick, force, weights, h, out)
-    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others) if sound else -2
+    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others, chains) if sound else -2
 
 
 @numba.njit(cache=True, nogil=True)
-def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others):  # type: ignore[no-untyped-def]
+def one_flight(  # type: ignore[no-untyped-def]
+    what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others, chains
+):
     """The end of a step, the first stage of the next, or both, where nothing adds up remainders.
 
     Parameters
@@ -242,7 +251,7 @@ def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables, triangles
         a flight of `h` from `x` to `out`. `BOTH`: one after the other.
     v : ndarray, shape (n_atoms, 3)
         The velocities after the flight; may be `v0`.
-    tables, triangles, others
+    tables, triangles, others, chains
         From `Flights.tables`, in this step.
 
     Returns
@@ -255,20 +264,20 @@ def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables, triangles
     if what != FLY:
         if not add_kick(v0, last_kick, force, weights):
             return 1 if what == END else UNENDED
-        found = _ended(x, v0, tables, triangles, others)
+        found = _ended(x, v0, tables, triangles, others, chains)
         if what == END:
             return found
         if found != 0:
             return UNENDED
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
-    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others)
+    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others, chains)
     return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
 
 
 @numba.njit(cache=True, nogil=True)
 def many_flights(  # type: ignore[no-untyped-def]
-    what, fractions, dt, first, x, v0, v, work, last_kick, kick, force, fresh, out, tables, triangles, others
+    what, fractions, dt, first, x, v0, v, work, last_kick, kick, force, fresh, out, tables, triangles, others, chains
 ):
     """The same with a stage of flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
 
@@ -278,7 +287,7 @@ def many_flights(  # type: ignore[no-untyped-def]
     if what != FLY:
         if not land(v0, work[1], last_kick, force, weights):
             return 1 if what == END else UNENDED
-        found = _ended(x, v0, tables, triangles, others)
+        found = _ended(x, v0, tables, triangles, others, chains)
         if what == END:
             return found
         if found != 0:
@@ -294,7 +303,7 @@ def many_flights(  # type: ignore[no-untyped-def]
             start = out if (n - i) % 2 == 0 else work[2]
             v0, kick, fresh = v, 0.0, False
         took = _flight(
-            start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables, triangles, others
+            start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables, triangles, others, chains
         )
         if not 0 <= took <= MANY_ITERATIONS:
             return _FORCE if took == -2 else _ENGINE - i
@@ -302,11 +311,11 @@ def many_flights(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _ended(x, v, tables, triangles, others):  # type: ignore[no-untyped-def]
+def _ended(x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Velocities projected; 0, or what `Flights.ended` has to do."""
     if not all_finite(x):
         return 2
-    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others) else -1
+    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains) else -1
 
 
 @numba.njit(cache=True, nogil=True)

@@ -149,14 +149,12 @@ class Splitting:
         new, tables_now = np.empty, flights.tables
         try:
             for made in range(steps):
-                tables, triangles, others = tables_now()
+                tables = tables_now()
                 out = new(shape)
                 if later is None:
-                    found = one_flight(what, dt, x, v, u, last, first, f, out, tables, triangles, others)
+                    found = one_flight(what, dt, x, v, u, last, first, f, out, *tables)
                 else:
-                    found = many_flights(
-                        what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, tables, triangles, others
-                    )
+                    found = many_flights(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
                 if found == UNENDED:
                     return _at(before, start, made - 1), made - 1
                 here = x, v, time, left_over
@@ -169,9 +167,8 @@ class Splitting:
                             f = system.accepted(force(out, now), number + made + 1, False)
                         x, out = out, new(shape)
                         found = many_flights(
-                            FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, tables, triangles,
-                            others,
-                        )  # fmt: skip
+                            FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables
+                        )
                 if found < 0:
                     return _at(here, start, made), made
                 # As State.later.
@@ -311,7 +308,7 @@ class _Step:
         #: Where stages are compiled: the fractions of the step that their flights take, and what the kernels need.
         self.flights = None if self.exact else system.flights
         self.fractions: Sequence[FloatArray] = ()
-        self.tables: Packed = (NO_WORK, None, None)
+        self.tables: Packed = (NO_WORK, None, None, None)
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
         x = start.positions

@@ -159,7 +159,7 @@ def _accelerations(f, weights, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest):  # type: ignore[no-untyped-def]
+def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest, chains):  # type: ignore[no-untyped-def]
     """`IsokineticStages.before`; status, log of the growth, and iterations."""
     header = tables.view(np.int64)
     weights, masses, apart = (
@@ -174,14 +174,14 @@ def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest)
         _accelerations(f, weights, out)
         _push_others(u0, out, t, weights, masses, u)
     _fly(x, u, h, out)
-    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest)
+    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest, chains)
     if not all_finite(out):
         return POSITION, log_growth, 0
     return (DONE if 0 <= iterations <= MANY_ITERATIONS else ENGINE), log_growth, iterations
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest):  # type: ignore[no-untyped-def]
+def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chains):  # type: ignore[no-untyped-def]
     """`IsokineticStages.after`; status, f.M_par^+ f, factor, and log of the growth."""
     header = tables.view(np.int64)
     weights, masses, apart = (
@@ -196,7 +196,7 @@ def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest):  # 
     _accelerations(f, weights, pace)
     # One call site, which is compiled once.
     for y in (u, pace):
-        if not packed_tangents(x, y, tables, triangles, rest):
+        if not packed_tangents(x, y, tables, triangles, rest, chains):
             return ENGINE, 0.0, 0.0, 0.0
     square, factor, log_growth, done = after_drift(u, pace, masses, twice, t, out)
     if not done:
