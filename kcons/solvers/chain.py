@@ -70,6 +70,11 @@ class Chains:
         self._work = NO_NUMBERS
         self._undo = NO_NUMBERS
 
+    @property
+    def slots(self) -> int:
+        """Groups of eight lanes that a sweep goes through."""
+        return int(self._starts[-1]) // WIDTH
+
     def tables(self, numbers: NDArray[np.int64] | None = None) -> tuple[NDArray[Any], ...]:
         """What kernels that call `sweeps.project` need.
 

@@ -122,32 +122,6 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _chains(points, references, velocities, inv_dt, tangent, given, lattice, kind, t, h, u, b):  # type: ignore[no-untyped-def]
-    """Chains as `Chains` projects them; whether it could, and iterations."""
-    landed, _, iterations, _ = project(
-        points, references, velocities, inv_dt, tangent, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
-        piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5),
-        piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7), given, lattice, kind, t[:0],
-        piece(t, h, _CHAINS + 10), piece(t, h, _CHAINS + 11),
-    )  # fmt: skip
-    return landed, iterations
-
-
-@nb.njit(cache=True, nogil=True)
-def _chain_positions(x, x_ref, v, inv_dt, lattice, kind, t, h, u):  # type: ignore[no-untyped-def]
-    """As `kcons.plan.LongChains` does it; iterations, -1 where there is no solution."""
-    lengths, pairs = piece(t, h, _CHAINS + 8), piece(u, h, _CHAINS + 9).reshape(-1, 2)
-    took = -1
-    for turn in range(_MAX_ROUNDS + 1):
-        landed, iterations = _chains(x, x_ref, v, inv_dt, None, lengths, lattice, kind, t, h, u, t.view(np.uint8))
-        if turn == 0:
-            took = iterations if landed else -1
-        if not landed or distances.resolved(x, pairs, lengths, lattice, kind != OPEN):
-            break
-    return took
-
-
-@nb.njit(cache=True, nogil=True)
 def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
@@ -167,6 +141,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
+    b, first = tables.view(np.uint8), True
     # Nothing is written before all is solved, except that triangles and chains undo what they wrote.
     most = 0
     for turn in range(_MAX_ROUNDS + 1):
@@ -189,14 +164,27 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
                 return -1
             most = max(most, iterations)
         if chains is not None and turn == 0:
-            iterations = _chain_positions(x, x_ref, v, inv_dt, lattice, kind, t, h, u)
-            if iterations < 0:
+            # As `kcons.plan.LongChains` does it.
+            for again in range(_MAX_ROUNDS + 1):
+                landed, _, iterations, _ = project(
+                    x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
+                    piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4),
+                    piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7),
+                    piece(t, h, _CHAINS + 8), lattice, kind, t[:0], piece(t, h, _CHAINS + 10),
+                    piece(t, h, _CHAINS + 11),
+                )  # fmt: skip
+                if again == 0:
+                    first, most = landed, max(most, iterations)
+                if not landed or distances.resolved(
+                    x, piece(u, h, _CHAINS + 9).reshape(-1, 2), piece(t, h, _CHAINS + 8), lattice, kind != OPEN
+                ):
+                    break
+            if not first:
                 if triangles is not None:
                     groups, undo = piece(u, h, _SLOTS).size // WIDTH, piece(t, h, _UNDO)
                     restore_points(x, piece(u, h, _CORNERS), undo, groups, 3, 6, 0)
                     restore_points(v, piece(u, h, _CORNERS), undo, groups, 3, 6, 3)
                 return -1
-            most = max(most, iterations)
         if others is None:
             break
         distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
@@ -231,8 +219,13 @@ def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no
         if not converged:
             return False
     if chains is not None:
-        none = t[:0]
-        converged, _ = _chains(v, x, none.reshape(0, 3), 0.0, True, none, lattice, kind, t, h, u, tables.view(np.uint8))
+        b, none = tables.view(np.uint8), t[:0]
+        converged, _, _, _ = project(
+            v, x, none.reshape(0, 3), 0.0, True, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
+            piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5),
+            piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7), none, lattice, kind, none,
+            piece(t, h, _CHAINS + 10), piece(t, h, _CHAINS + 11),
+        )  # fmt: skip
         if not converged:
             if triangles is not None:
                 groups = piece(u, h, _SLOTS).size // WIDTH

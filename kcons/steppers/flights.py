@@ -27,8 +27,9 @@ from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, f
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 96
-#: Rows of chains up to which they are nothing special to that kernel.
-CHAIN_ROWS = 96
+#: Chains have a kernel of their own, which costs as much as that for all shapes on so many rows, and so many more a
+#: slot of eight lanes; where others are held so that both are called, on more.
+CHAIN_ROWS, CHAIN_ROWS_BESIDES, ROWS_A_SLOT = 20, 40, 2
 
 #: What a kernel is to do: end the last step, begin the next stage, or both.
 END, FLY, BOTH = 1, 2, 3
@@ -215,10 +216,13 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
             return None
         if triangles is None and not compact and isinstance(solver.solver, RigidTriangles):
             triangles = solver.solver
-        elif chains is None and isinstance(solver.solver, Chains) and len(solver.rows) > CHAIN_ROWS:
+        elif chains is None and isinstance(solver.solver, Chains):
             chains = solver.solver
         else:
             rows.append(solver.rows)
+    if chains is not None and not _worth_it(chains, sum(map(len, rows))):
+        rows.append(chains.rows)
+        chains = None
     others = np.concatenate(rows)
     if len(others) > MOST_ROWS:
         return None
@@ -226,6 +230,12 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     lengths = held.target(0.0)[others]
     places, numbers = plan.pinned_targets(None), held.touched if compact else None
     return packed(triangles, chains, pairs, lengths, inverse_masses, pinned, places, *more, numbers=numbers)
+
+
+def _worth_it(chains: Chains, others: int) -> bool:
+    """Whether chains are faster by their own kernel than with other rows by that for all shapes."""
+    least = (CHAIN_ROWS_BESIDES if others else CHAIN_ROWS) + ROWS_A_SLOT * chains.slots
+    return len(chains.rows) > least or len(chains.rows) + others > MOST_ROWS
 
 
 @numba.njit(cache=True, nogil=True)
