@@ -1,35 +1,36 @@
 """Run a scene through methods and measure, for each, what error it makes for what cost.
 
 Every method starts from the same state with the same forces and is compared with the same reference
-solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded.
+solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded; with `rounds`,
+those of short runs are medians over rounds in which nobody looks on (`kcons.timing_rounds`).
 """
 
 from __future__ import annotations
 
-import signal
 import textwrap
-import threading
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from kcons import timing_rounds
 from kcons.errors import InputError, UnsupportedError
 from kcons.machine import environment, kernels_cached
 from kcons.methods import METHODS, chosen
 from kcons.results import Comparison, Measurement, Status, duration
-from kcons.runs import Method, Run
+from kcons.runs import Method, OverBudgetError, Run, first_line, interrupted_after
 from kcons.scenes import Reference, Scene
 from kcons.scenes.potential import Potential
 from kcons.steppers import Rattle, State, System
+from kcons.timing_rounds import Rounds
 
 #: A first step below this may be slow only because it is the first.
 FIRST_STEP_DOUBT = 0.5
 
-#: A run is repeated if it takes at most this part of a method's budget, and so many seconds.
+#: A run is timed again if it takes at most this part of a method's budget, and so many seconds.
 REPEAT_SHARE, REPEAT_SECONDS = 0.2, 2.0
 #: Points at which the forces are timed, and for how many seconds at most.
 FORCE_POINTS, FORCE_SECONDS = 15, 0.5
@@ -61,7 +62,7 @@ def compare(
     budget: float = 30.0,
     watcher: Watcher | None = None,
     settings: Mapping[str, Any] | None = None,
-    repeats: int = 0,
+    rounds: Rounds | None = None,
     reference: Reference | None = None,
 ) -> Comparison:
     """Run `scene` through `methods`.
@@ -78,9 +79,8 @@ def compare(
     watcher : Watcher, optional
     settings : mapping, optional
         What else to record with the result.
-    repeats : int
-        Runs that are short enough are made so often again, after all others; times are then medians of medians, and
-        how well they repeat is known.
+    rounds : Rounds, optional
+        Runs that are short enough are timed again in rounds, after all others; how well times repeat is then known.
     reference : Reference, optional
         If it is known.
 
@@ -112,7 +112,7 @@ def compare(
             measurements.append(Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason))
             continue
         measurements += _all_settings(scene, method, reference, budget, watching)
-    measurements, margin = _repeated(scene, measurements, reference, budget, repeats, watching)
+    measurements, margin = timed_again(scene, measurements, reference, budget, rounds, watching)
     unit = scene.units.time_unit
     return Comparison(
         scene={
@@ -137,7 +137,11 @@ def compare(
         remarks=list(dict.fromkeys(m.remark for m in picked if m.remark)),
         environment=environment(),
         measurements=measurements,
-        timing={"force_seconds": force_seconds(scene), "repeats": repeats, "margin": margin},
+        timing={
+            "force_seconds": force_seconds(scene),
+            "repeats": 0 if rounds is None else rounds.least,
+            "margin": margin,
+        },
     )
 
 
@@ -168,7 +172,14 @@ def _force_time(potential: Potential, x: np.ndarray) -> float:
 
 
 def measure(
-    scene: Scene, method: Method, setting: float, reference: Reference, budget: float, watcher: Watcher | None = None
+    scene: Scene,
+    method: Method,
+    setting: float,
+    reference: Reference,
+    budget: float,
+    watcher: Watcher | None = None,
+    *,
+    watched: bool = True,
 ) -> Measurement:
     """One method at one setting, a time step in internal units or a tolerance; `warm_up` comes first.
 
@@ -181,6 +192,8 @@ def measure(
     budget : float
         Seconds.
     watcher : Watcher, optional
+    watched : bool
+        Whether the constraints' part is timed, which costs a little.
     """
     watching = watcher or Watcher()
     shown = setting if method.adaptive else setting / scene.units.time_unit
@@ -190,48 +203,49 @@ def measure(
     )
     watching.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
     try:
-        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common)
+        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common, watched)
     finally:
         watching.end()
 
 
-def _repeated(
+def timed_again(
     scene: Scene,
     measurements: list[Measurement],
     reference: Reference,
     budget: float,
-    repeats: int,
-    watcher: Watcher,
+    rounds: Rounds | None,
+    watcher: Watcher | None = None,
 ) -> tuple[list[Measurement], float | None]:
-    """Medians over repeated runs, and by what fraction nine tenths of them were off at most; None without any."""
-    limit = min(REPEAT_SHARE * budget, REPEAT_SECONDS)
-    times: dict[int, list[tuple[float, float | None]]] = {}
-    for _ in range(repeats):
-        for k, m in enumerate(measurements):
-            if m.status not in ("ok", "floor") or not m.step_seconds:
-                continue
-            if m.step_seconds * m.steps + float(m.setup_seconds or 0.0) > limit:
-                continue
-            method = METHODS[m.method]
-            setting = m.setting if m.adaptive else m.setting * scene.units.time_unit
-            again = measure(scene, method, setting, reference, budget, watcher)
-            if again.step_seconds:
-                mine = times.setdefault(k, [(m.step_seconds, m.constraint_seconds)])
-                mine.append((again.step_seconds, again.constraint_seconds))
-    found = list(measurements)
-    off: list[float] = []
-    for k, pairs in times.items():
-        m = found[k]
-        step = float(np.median([pair[0] for pair in pairs]))
-        held = [pair[1] for pair in pairs if pair[1] is not None]
-        off += [abs(np.log(pair[0] / step)) for pair in pairs]
-        found[k] = replace(
-            m,
-            step_seconds=step,
-            constraint_seconds=float(np.median(held)) if held else None,
-            seconds_per_time=float(m.seconds_per_time or 0.0) * step / float(m.step_seconds or 1.0),
+    """Times of short runs from rounds that nobody observes, and how well they repeat (`kcons.timing_rounds`).
+
+    Parameters
+    ----------
+    scene : Scene
+    measurements : list of Measurement
+    reference : Reference
+    budget : float
+        Seconds for each method.
+    rounds : Rounds or None
+        None: everything stays as it is.
+    watcher : Watcher, optional
+    """
+    if rounds is None:
+        return measurements, None
+    watching = watcher or Watcher()
+    watching.begin("times of short runs, in rounds", rounds.most)
+    try:
+        return timing_rounds.timed(
+            scene,
+            measurements,
+            METHODS,
+            rounds,
+            limit=min(REPEAT_SHARE * budget, REPEAT_SECONDS),
+            patience=PATIENCE * budget,
+            whole=lambda method, setting: measure(scene, method, setting, reference, budget, watched=False),
+            told=watching.advance,
         )
-    return found, float(np.expm1(np.quantile(off, 0.9))) if off else None
+    finally:
+        watching.end()
 
 
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
@@ -299,10 +313,6 @@ class _Log:
     steps: int = 0
 
 
-class _OverBudgetError(Exception):
-    """The time is up."""
-
-
 def _measure(
     scene: Scene,
     method: Method,
@@ -312,6 +322,7 @@ def _measure(
     deadline: float,
     watcher: Watcher,
     common: dict[str, Any],
+    watched: bool = True,
 ) -> Measurement:
     log = _Log()
     note = ""
@@ -321,20 +332,21 @@ def _measure(
     setup = None
     scene.potential.forget()
     try:
-        with _interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
+        with interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
             run = method.start(scene, setting)
             setup = perf_counter() - begun
+            if not watched:
+                run.constraints.release()
             note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, watcher)
             status = "partial" if note else "ok"
-    except _OverBudgetError:
+    except OverBudgetError:
         status = "partial"
         note = f"step {log.steps + 1} was not done after {duration(perf_counter() - begun)}"
     except UnsupportedError as error:
         return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
     except Exception as error:  # whatever a peer raises is a result, and is shown
         status = "failed"
-        first = (str(error).strip().splitlines() or [""])[0]
-        note = textwrap.shorten(f"step {log.steps + 1}: {type(error).__name__}: {first}", 300)
+        note = f"step {log.steps + 1}: {first_line(error)}"
     common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
     if run is None or not log.seconds:
         return Measurement(status=status, note=note, **common)
@@ -411,6 +423,7 @@ def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str
         return {}
     # The first step pays for what a host sets up lazily.
     counted = slice(1, None) if len(log.seconds) > 1 else slice(None)
+    run.constraints.release()
     step = run.own_step_seconds() or float(np.median(log.seconds[counted]))
     elapsed = run.time / scene.units.long_time_unit
     return {
@@ -433,22 +446,3 @@ def _energy_slope(scene: Scene, log: _Log) -> tuple[float | None, float | None]:
     slope = float(t @ e / (t @ t))
     left_over = float(np.sum((e - slope * t) ** 2))
     return slope, float(np.sqrt(left_over / (len(t) - 2) / (t @ t)))
-
-
-@contextmanager
-def _interrupted_after(seconds: float) -> Iterator[None]:
-    """Raise _OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread)."""
-    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def ring(*_: Any) -> None:
-        raise _OverBudgetError
-
-    previous = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, previous)

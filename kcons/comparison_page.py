@@ -34,7 +34,7 @@ INTRODUCTION = (
 WINNERS_NOTE = (
     "gain: how many times cheaper the best method of kcons is than the cheapest other one, at the error of a point of "
     "that one, where the ratio is largest. Between points of one method, logarithms are interpolated. A method "
-    f"is ahead beyond the margin of the timings only, which repeats gave and is {100 * LEAST_MARGIN:g} % at least."
+    f"is ahead beyond the margin of the timings, to which times repeat, and by {100 * LEAST_MARGIN:g} % at least."
 )
 
 
@@ -106,7 +106,7 @@ def _notes(found: Comparison) -> list[str]:
         f"{scene['degrees_of_freedom']} degrees of freedom; horizon {scene['horizon']:g} {scene['units']['time']}.",
         f"Decided by {COSTS[judged.decides][1]}"
         + (f": forces take {duration(forces)} beyond the call" if forces is not None else "")
-        + (f"; times of repeated runs differ by up to {100 * margin:.0f} %" if margin is not None else "")
+        + (f"; times of short runs repeat to within {100 * margin:.0f} %" if margin is not None else "")
         + ".",
         *(
             f"{host} has forces of its own, and takes less than a microsecond for a step with nothing held: there "

@@ -24,12 +24,14 @@ from kcons.methods import METHODS
 from kcons.recommendation import sharpen
 from kcons.results import Comparison
 from kcons.scenes import Scene
+from kcons.timing_rounds import Rounds
 
 FORMAT = "kcons-report-1"
 #: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
 QUICK_SECONDS = 280.0
-#: Short runs are made so often again.
-REPEATS = 2
+#: Rounds in which short runs are timed again, and those of a quick run.
+ROUNDS = Rounds()
+QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002)
 
 
 @dataclass(frozen=True)
@@ -362,18 +364,19 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
     names, left_out = methods_of(item, scene, quick)
     reference = reference_of(scene, watcher)
+    rounds = QUICK_ROUNDS if quick else ROUNDS
     found = compare(
         scene,
         methods=names,
         budget=budget,
         watcher=watcher,
         reference=reference,
-        repeats=1 if quick else REPEATS,
+        rounds=rounds,
         settings={"part": item.key, "quick": quick},
     )
     remarks = [*found.remarks, f"not run: {', '.join(left_out)} ({item.why})"] if left_out else found.remarks
     found = replace(found, remarks=remarks)
-    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher)
+    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher, rounds=rounds)
 
 
 def scene_of(item: Item, quick: bool) -> Scene:

@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from ase import Atoms
@@ -77,6 +77,11 @@ class _CoreRun(Run):
         # Rigid water and few distances take a step in kernels that do not call the engine.
         self.divided = self.constraints.seconds > 0.0
 
+    def march(self, steps: int) -> None:
+        self._state = steppers.run(self._system, self._state, self._dt, steps, stepper=self._stepper)
+        self._done += steps
+        self.time = self._done * self._dt
+
     def rewind(self) -> None:
         self._state = self._start
         # The end of the last step is no longer the last point known.
@@ -107,6 +112,8 @@ class CoreStepper(Method):
         The stepper for a given time step.
     """
 
+    marches: ClassVar[bool] = True
+
     make: Callable[[float], Stepper] = lambda dt: Rattle()
     damps: bool = True
 
@@ -121,7 +128,9 @@ class CoreStepper(Method):
     def warm_up(self, scene: Scene) -> None:
         dt = min(scene.time_steps)
         system, start = System(scene.motion, scene.potential.forces), State(scene.positions, scene.velocities)
-        self.make(dt).step(system, start, dt)
+        stepper = self.make(dt)
+        stepper.step(system, start, dt)
+        steppers.run(system, start, dt, 2, stepper=stepper)
 
     def start(self, scene: Scene, setting: float) -> Run:
         # What does not keep the positions on the surface cannot have rows that depend on each other there.
@@ -134,6 +143,8 @@ class CoreStepper(Method):
 
 class CoreVerlet(Method):
     """RATTLE with nothing held: what a step costs before any constraint."""
+
+    marches = True
 
     def start(self, scene: Scene, setting: float) -> Run:
         nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
@@ -175,6 +186,7 @@ class _AseRun(Run):
         super().__init__()
         self._scene = scene
         self._atoms = scene.atoms()
+        self._momenta = self._atoms.get_momenta()
         self._atoms.set_constraint(constraints)
         # set_constraint keeps the objects themselves, so that their hooks can be timed.
         for item in self._atoms.constraints:
@@ -190,9 +202,17 @@ class _AseRun(Run):
         self._done += 1
         self.time = self._done * self._dt
 
+    def march(self, steps: int) -> None:
+        step = self._dynamics.step  # as ASE's own loop calls it
+        for _ in range(steps):
+            step()
+        self._done += steps
+        self.time = self._done * self._dt
+
     def rewind(self) -> None:
         self._atoms.positions[:] = self._scene.positions
-        self._atoms.set_velocities(self._scene.velocities)
+        # Constraints would change them by what rounding leaves.
+        self._atoms.set_momenta(self._momenta, apply_constraint=False)
         self._scene.potential.forces(self._scene.positions)
 
     @property
@@ -208,7 +228,13 @@ class _AseRun(Run):
         return np.asarray(self._atoms.get_velocities())
 
 
-class AseKcons(Method):
+class AseMethod(Method):
+    """ASE's VelocityVerlet."""
+
+    marches = True
+
+
+class AseKcons(AseMethod):
     """ASE's VelocityVerlet with `kcons.ase.Constraints`."""
 
     def start(self, scene: Scene, setting: float) -> Run:
@@ -216,14 +242,14 @@ class AseKcons(Method):
         return _AseRun(scene, setting, held)
 
 
-class AseVerlet(Method):
+class AseVerlet(AseMethod):
     """ASE's VelocityVerlet with nothing held."""
 
     def start(self, scene: Scene, setting: float) -> Run:
         return _AseRun(scene, setting)
 
 
-class AseBonds(Method):
+class AseBonds(AseMethod):
     """ASE's VelocityVerlet with FixBondLengths at its own tolerance, angles held by their end distances."""
 
     def refuses(self, scene: Scene) -> str | None:
@@ -235,7 +261,7 @@ class AseBonds(Method):
         return _AseRun(scene, setting, *_fixed(scene), FixBondLengths(scene.bonds, bondlengths=lengths))
 
 
-class AseInternals(Method):
+class AseInternals(AseMethod):
     """ASE's VelocityVerlet with FixInternals at its own tolerance."""
 
     def refuses(self, scene: Scene) -> str | None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from kcons.compare import Watcher, measure, warm_up
+from kcons.compare import Watcher, measure, timed_again, warm_up
 from kcons.errors import InputError
 from kcons.fronts import COSTS, EVERY_HOST, Cost, cost_of, floor_of, host_of, is_ours, verdict
 from kcons.methods import METHODS
@@ -20,6 +20,7 @@ from kcons.results import Comparison, Measurement, duration
 from kcons.runs import Method
 from kcons.scenes import Reference, Scene
 from kcons.snippets import code
+from kcons.timing_rounds import Rounds
 
 #: Steps are predicted for this part of the error, since the prediction may be off.
 SAFETY = 0.85
@@ -174,7 +175,13 @@ def recommend(
 
 
 def sharpen(
-    scene: Scene, comparison: Comparison, *, reference: Reference, budget: float, watcher: Watcher | None = None
+    scene: Scene,
+    comparison: Comparison,
+    *,
+    reference: Reference,
+    budget: float,
+    watcher: Watcher | None = None,
+    rounds: Rounds | None = None,
 ) -> Comparison:
     """Where another method seems to be ahead of kcons: the step of kcons that makes the same error is tried.
 
@@ -185,6 +192,8 @@ def sharpen(
     ----------
     scene, comparison, reference, budget, watcher
         As for `recommend`.
+    rounds : Rounds, optional
+        Those in which the comparison timed short runs.
     """
     floor = floor_of(comparison)
     curves = _curves(comparison)
@@ -202,6 +211,7 @@ def sharpen(
                 tried.add((best.method, target))
                 warm_up(scene, [METHODS[best.method]])
                 found += reach(scene, best, target, reference, budget, watcher or Watcher())
+    found, _ = timed_again(scene, found, reference, budget, rounds, watcher)
     return replace(comparison, measurements=_sorted([*comparison.measurements, *found]))
 
 

@@ -75,7 +75,8 @@ class Comparison:
         What a reader should know of the methods that ran.
     timing : mapping
         'force_seconds', what the forces take once beyond the least that a call from Python takes; 'repeats', how many
-        runs were made again; 'margin', by what fraction nine tenths of their times were off at most.
+        rounds of short runs were timed at least; 'margin', by what fraction the medians of odd and of even rounds
+        differed at most, for nine tenths of them.
     recommendation : mapping or None
         What `kcons.recommendation` found for an error that was asked for.
     """

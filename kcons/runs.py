@@ -5,11 +5,15 @@
 
 from __future__ import annotations
 
+import signal
+import textwrap
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import qr
@@ -36,12 +40,23 @@ class Stopwatch:
     def __init__(self) -> None:
         self.seconds = 0.0
         self._depth = 0
+        self._watched: list[tuple[Any, str, Any]] = []
 
     def watch(self, target: Any, names: Iterable[str]) -> None:
         """Replace the methods of this one object by timed ones."""
         for name in names:
             if hasattr(target, name):
+                self._watched.append((target, name, vars(target).get(name)))
                 setattr(target, name, self._timed(getattr(target, name)))
+
+    def release(self) -> None:
+        """Give the objects their methods back: to be timed costs half a microsecond a call."""
+        while self._watched:
+            target, name, own = self._watched.pop()
+            if own is None:
+                delattr(target, name)  # that of the class shows again
+            else:
+                setattr(target, name, own)
 
     def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **options: Any) -> Any:
@@ -82,6 +97,11 @@ class Run(ABC):
     @abstractmethod
     def advance(self) -> None:
         """One step, or as many as `steps` then says."""
+
+    def march(self, steps: int) -> None:
+        """So many steps that nobody looks at: `advance` as often, without what it does for onlookers."""
+        for _ in range(steps):
+            self.advance()
 
     def rewind(self) -> None:
         """Go back to the start, forces known, while time and steps go on counting."""
@@ -142,7 +162,12 @@ class Method(ABC):
         What a reader of its numbers should know.
     damps : bool
         Whether it can run scenes with friction.
+    marches : bool
+        Of the class: whether its runs can `rewind`, and make one step an `advance`, so that steps can be timed with
+        nobody looking on. Otherwise whole runs are timed.
     """
+
+    marches: ClassVar[bool] = False
 
     name: str
     title: str
@@ -195,3 +220,35 @@ def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> Constra
         if len(mine):
             pieces.append(item.select(mine))
     return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
+
+
+# -- what goes wrong --------------------------------------------------------------------------------
+
+
+class OverBudgetError(Exception):
+    """The time is up."""
+
+
+@contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Raise OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread)."""
+    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(*_: Any) -> None:
+        raise OverBudgetError(f"not done after {seconds:.3g} s")
+
+    previous = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+def first_line(error: Exception) -> str:
+    """Kind and first line of an error."""
+    first = (str(error).strip().splitlines() or [""])[0]
+    return textwrap.shorten(f"{type(error).__name__}: {first}", 280)

@@ -10,6 +10,8 @@ Ryckaert, Ciccotti and Berendsen, J. Comput. Phys. 23, 327 (1977); Andersen, J. 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
@@ -94,6 +96,36 @@ class GaussSeidel:
             x, velocities, dt, self.pairs, self.squares, self.inverse_masses, self._old, self.tolerance, MANY_SWEEPS
         )
         self._check(sweeps, "RATTLE")
+
+    def march(
+        self,
+        x: FloatArray,
+        velocities: FloatArray,
+        forces: FloatArray,
+        dt: float,
+        steps: int,
+        force: Callable[[FloatArray], FloatArray],
+        old: FloatArray,
+    ) -> FloatArray:
+        """Steps of velocity Verlet in place, two compiled calls and one for the forces each; the last forces.
+
+        Raises
+        ------
+        ConvergenceError
+        """
+        pairs, squares, w, bonds, tolerance = (
+            self.pairs, self.squares, self.inverse_masses, self._old, self.tolerance,
+        )  # fmt: skip
+        f = forces
+        for _ in range(steps):
+            sweeps = first_half(x, velocities, f, w, dt, old, pairs, squares, bonds, tolerance, MANY_SWEEPS)
+            if sweeps < 0:
+                self._check(sweeps, "SHAKE")
+            f = force(x)
+            sweeps = second_half(x, velocities, f, w, dt, pairs, squares, bonds, tolerance, MANY_SWEEPS)
+            if sweeps < 0:
+                self._check(sweeps, "RATTLE")
+        return f
 
     def _check(self, sweeps: int, what: str) -> None:
         self.sweeps = abs(sweeps)
@@ -180,3 +212,17 @@ def kick(v, f, w, dt):  # type: ignore[no-untyped-def]
     for i in range(v.shape[0]):
         for axis in range(3):
             v[i, axis] += 0.5 * dt * w[i] * f[i, axis]
+
+
+@njit(cache=True, nogil=True)
+def first_half(x, v, f, w, dt, old, pairs, squares, bonds, tolerance, most):  # type: ignore[no-untyped-def]
+    """A step up to the new positions; sweeps as `shake` counts them."""
+    kick_and_drift(x, v, f, w, dt, old)
+    return shake(x, old, v, 1.0 / dt, pairs, squares, w, bonds, tolerance, most)
+
+
+@njit(cache=True, nogil=True)
+def second_half(x, v, f, w, dt, pairs, squares, bonds, tolerance, most):  # type: ignore[no-untyped-def]
+    """The rest of a step; sweeps as `rattle` counts them."""
+    kick(v, f, w, dt)
+    return rattle(x, v, dt, pairs, squares, w, bonds, tolerance, most)

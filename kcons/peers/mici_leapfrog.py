@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class _MiciRun(Run):
         self._shape, self._dt = shape, dt
         self._share = math.exp(-0.5 * scene.friction * dt)
         self._done, self._steps = 0, round(scene.horizon / dt)
+        self._scene, self._system, self._start = scene, system, self._state.copy()
         potential.forces(scene.positions)
 
     def advance(self) -> None:
@@ -56,6 +57,24 @@ class _MiciRun(Run):
             self._state.mom = self._share * self._state.mom
         self._done += 1
         self.time = self._done * self._dt
+
+    def march(self, steps: int) -> None:
+        if self._share != 1.0:
+            super().march(steps)
+            return
+        state, step = self._state, self._integrator.step
+        for _ in range(steps):
+            state = step(state)
+        self._state = state
+        self._done += steps
+        self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._scene.potential.forces(self._scene.positions)
+        # What a state knows goes on to its copies, as it does from step to step.
+        self._system.grad_neg_log_dens(self._start)
+        self._system.inv_gram(self._start)
+        self._state = self._start.copy()
 
     @property
     def finished(self) -> bool:
@@ -79,6 +98,8 @@ class Mici(Method):
     tight : bool
         Its solver at the end of rounding instead of at its defaults.
     """
+
+    marches: ClassVar[bool] = True
 
     tight: bool = False
 

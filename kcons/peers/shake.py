@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class _ShakeRun(Run):
         self.constraints.watch(sweeps, ("positions", "velocities"))
         self._x, self._v = scene.positions.copy(), scene.velocities.copy()
         self._old = np.empty_like(self._x)
-        self._f = scene.potential.forces(self._x)
+        self._f = self._first = scene.potential.forces(self._x)
         self._done, self._steps = 0, round(scene.horizon / dt)
 
     def advance(self) -> None:
@@ -35,6 +36,17 @@ class _ShakeRun(Run):
         self._sweeps.velocities(x, v, dt)
         self._done += 1
         self.time = self._done * dt
+
+    def march(self, steps: int) -> None:
+        forces = self._scene.potential.forces
+        self._f = self._sweeps.march(self._x, self._v, self._f, self._dt, steps, forces, self._old)
+        self._done += steps
+        self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._x[:], self._v[:], self._f = self._scene.positions, self._scene.velocities, self._first
+        # The end of the last step is no longer the last point known.
+        self._scene.potential.forces(self._x)
 
     @property
     def finished(self) -> bool:
@@ -58,6 +70,8 @@ class Shake(Method):
     tolerance : float
     """
 
+    marches: ClassVar[bool] = True
+
     tolerance: float = 1e-8
 
     def refuses(self, scene: Scene) -> str | None:
@@ -72,7 +86,9 @@ class Shake(Method):
         return reason
 
     def warm_up(self, scene: Scene) -> None:
-        self.start(scene, min(scene.time_steps)).advance()
+        run = self.start(scene, min(scene.time_steps))
+        run.advance()
+        run.march(1)
 
     def start(self, scene: Scene, setting: float) -> Run:
         return _ShakeRun(scene, self._sweeps(scene), setting)
