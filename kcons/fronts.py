@@ -3,6 +3,9 @@
 Methods are judged among those of one host, which share forces and overhead. Costs are wall time and force evaluations,
 both a simulated unit of time. Where forces take less than `NO_FORCE`, wall time is that of the interpreter, and
 evaluations decide. Evaluations can be compared across hosts as well.
+
+Wall times that differ by less than the margin are the same: that by which nine tenths of the medians over odd and over
+even rounds of timing differ (`kcons.timing_rounds.margin`), and `LEAST_MARGIN` at least.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ ROUNDING = 1e-13
 SAME_ERROR = 0.05
 #: Evaluations that differ by this fraction are the same: a first evaluation more or less.
 SAME_EVALUATIONS = 0.02
-#: Wall times that differ by this fraction are the same, unless repeats say more.
+#: Wall times that differ by this fraction are the same, unless rounds of timing say more.
 LEAST_MARGIN = 0.05
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -12,7 +13,7 @@ from kcons.errors import ConvergenceError
 from kcons.peers import lammps_shake, shake
 from kcons.results import Measurement
 from kcons.runs import Run, Stopwatch
-from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, margin, marched
+from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
 SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
@@ -275,17 +276,17 @@ def test_whole_runs_are_made_again_where_steps_cannot_be(chain, monkeypatch):
 
     def noted(self, scene, setting):
         run = start(self, scene, setting)
-        runs.append(run)
+        runs.append((run, run.constraints.seconds))
         return run
 
     monkeypatch.setattr(methods.ProjectedOde, "start", noted)
     found = compare.compare(chain, methods=["dop853"], rounds=SHORT)
     settings = len(found.measurements)
     assert settings > 1 and len(runs) == 3 * settings
-    assert all(run.finished for run in runs)
-    # Only the first of each is watched.
-    assert all(run.constraints.seconds > 0 for run in runs[:settings])
-    assert all(run.constraints.seconds == 0 for run in runs[settings:])
+    assert all(run.finished for run, _ in runs)
+    # Only the first of each is watched after it was set up.
+    assert all(run.constraints.seconds > before for run, before in runs[:settings])
+    assert all(run.constraints.seconds == before for run, before in runs[settings:])
     assert found.timing["margin"] is not None
 
 
@@ -315,8 +316,8 @@ def test_a_round_that_does_not_come_back_is_interrupted(chain, monkeypatch):
             pass
 
     monkeypatch.setattr(methods._CoreRun, "march", endless)
-    found = compare.compare(chain.with_time_steps(chain.time_steps[:1]), methods=["rattle"], rounds=SHORT, budget=0.5)
-    (only,) = found.measurements
+    scene = replace(chain, time_steps=chain.time_steps[:1])
+    (only,) = compare.compare(scene, methods=["rattle"], rounds=SHORT, budget=0.5).measurements
     assert only.status == "ok"
     assert "round 1: OverBudgetError: not done after 1.5 s" in only.note
 
@@ -332,7 +333,7 @@ def test_quick_rounds_are_fewer_and_shorter():
 @pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
 def test_openmm_times_itself_in_every_round():
     scene = scenes.build("chain", 4)
-    scene = scene.with_time_steps(scene.time_steps[:1])
+    scene = replace(scene, time_steps=scene.time_steps[:1])
     found = compare.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
     assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
     assert not any(m.note for m in found.measurements)
