@@ -1,0 +1,162 @@
+"""The engine with targets that move, atoms that are fixed, and cells that are triclinic or change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_systems import TRIANGLE, WATER, ZIGZAG, steps
+
+from kcons import constraints as held
+from kcons import projection
+from kcons.constraint_set import ConstraintSet
+from kcons.motion import Motion
+
+
+def test_a_distance_that_grows() -> None:
+    """The position projection meets the target at `time` along the gradients at `x_ref`."""
+    target = held.MovingTarget(lambda t: 1.0 + 0.5 * t, lambda t: 0.5, lambda t: 0.0)
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    masses = np.array([1.0, 3.0])
+    motion = Motion(ConstraintSet(held.Distance([0, 1], target), x, masses), x)
+    lam = np.empty(1)
+    y = motion.project_positions(x, x, time=0.4, reference_time=0.0, multipliers=lam)
+    np.testing.assert_allclose(y, [[-0.15, 0, 0], [1.05, 0, 0]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(lam, 0.2 / (1 + 1 / 3), rtol=1e-14)
+    v = motion.project_velocities(x, np.zeros((2, 3)), time=0.0)
+    np.testing.assert_allclose(v, [[-0.375, 0, 0], [0.125, 0, 0]], rtol=0, atol=1e-16)
+    np.testing.assert_allclose(motion.restore_positions(x, time=1.0), [[-0.375, 0, 0], [1.125, 0, 0]], atol=1e-15)
+
+
+def test_reference_time_is_that_of_the_gradients() -> None:
+    """A plane that turns: corrections along its normal at `reference_time`, onto where it is at `time`."""
+
+    def normal(t: float) -> np.ndarray:
+        return np.array([-np.sin(t), np.cos(t), 0.0])
+
+    plane = held.ImplicitSurface(
+        [0], lambda r, t: r @ normal(t), lambda r, t: np.tile(normal(t), (len(r), 1)), time_dependent=True
+    )
+    x = np.array([[1.0, 0.0, 0.0]])
+    motion = Motion(ConstraintSet(plane, x, [2.0]), x)
+    for reference in (0.0, 0.2, None):
+        along = normal(0.3 if reference is None else reference)
+        expected = x[0] - along * (x[0] @ normal(0.3)) / (along @ normal(0.3))
+        y = motion.project_positions(x, x, time=0.3, reference_time=reference)
+        np.testing.assert_allclose(y[0], expected, rtol=0, atol=1e-14)
+    f = np.array([[1.0, 2.0, 3.0]])
+    for time in (0.0, 0.3):
+        expected = f[0] - normal(time) * (normal(time) @ f[0])
+        np.testing.assert_allclose(motion.project_forces(x, f, time=time)[0], expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("mass", [0.0, 5.0])
+def test_fixed_atoms_have_infinite_mass(mass: float) -> None:
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1.0, 0]])
+    rows = [held.FixedAtoms([0]), held.Distance([[0, 1], [1, 2]])]
+    masses = np.array([mass, 2.0, 3.0])
+    whole = ConstraintSet(rows, x, masses)
+    motion = Motion(whole, x)
+    assert motion.rank == 5 and motion.degrees_of_freedom == 4
+    y = motion.project_positions(x + 0.1, x)
+    np.testing.assert_array_equal(y[0], x[0])
+    assert np.abs(whole.value(y)).max() < 1e-15
+    v = motion.project_velocities(x, np.ones((3, 3)))
+    np.testing.assert_array_equal(v[0], 0)
+    # With a very heavy first atom, the oracle says the same of the others.
+    heavy = np.array([1e14, 2.0, 3.0])
+    A = whole.jacobian(x).toarray()
+    f, b = np.random.default_rng(0).normal(size=(3, 3)), np.zeros(len(A))
+    a = projection.acceleration(A[3:], heavy, f, b[3:])
+    found = motion.acceleration(x, np.zeros((3, 3)), f)
+    np.testing.assert_allclose(found[1:], a[1:], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found[0], 0)
+    z = motion.constraint_force(x, np.zeros((3, 3)), f)
+    np.testing.assert_allclose(f + z, masses[:, None] * found, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(motion.project_forces(x, f)[0], 0)
+    lam = motion.multipliers(x, np.zeros((3, 3)), f)
+    np.testing.assert_allclose(A.T @ lam, z.ravel(), rtol=0, atol=1e-14)
+
+
+def test_fixed_atoms_that_move_as_prescribed() -> None:
+    """A pendulum whose support shakes: Newton's second law in the frame of the support."""
+    omega, swing = 1.7, 0.3
+    support = held.MovingTarget(
+        lambda t: [0.0, swing * np.sin(omega * t), 0.0],
+        lambda t: [0.0, swing * omega * np.cos(omega * t), 0.0],
+        lambda t: [0.0, -swing * omega**2 * np.sin(omega * t), 0.0],
+    )
+    x = np.array([[0.0, 0, 0], [0.6, -0.8, 0]])
+    motion = Motion(ConstraintSet([held.FixedAtoms([0], support), held.Distance([0, 1], 1.0)], x, [0.0, 2.0]), x)
+    time = 0.9
+    place = np.array([0.0, swing * np.sin(omega * time), 0.0])
+    here = np.vstack([place, place + x[1]])
+    np.testing.assert_allclose(motion.project_positions(here - 0.01, here, time=time)[0], place, rtol=0, atol=0)
+    v = motion.project_velocities(here, np.zeros((2, 3)), time=time)
+    rate = np.array([0.0, swing * omega * np.cos(omega * time), 0.0])
+    np.testing.assert_allclose(v[0], rate, rtol=1e-15)
+    np.testing.assert_allclose(v[1], x[1] * (x[1] @ rate), rtol=0, atol=1e-15)
+    f = np.array([[0.0, 0, 0], [0.3, -9.0, 0.2]])
+    a = motion.acceleration(here, v, f, time)
+    lift = np.array([0.0, -swing * omega**2 * np.sin(omega * time), 0.0])
+    relative = v[1] - v[0]
+    along = x[1] @ (f[1] / 2.0 - lift) + relative @ relative
+    np.testing.assert_allclose(a[0], lift, rtol=1e-14)
+    np.testing.assert_allclose(a[1], f[1] / 2.0 - x[1] * along, rtol=0, atol=1e-14)
+
+
+def test_dependent_rows_on_fixed_atoms_share_their_multiplier() -> None:
+    """Two rods in line that hold one atom: of all solutions the one of least norm."""
+    x = np.array([[-1.0, 0, 0], [0, 0, 0], [1.0, 0, 0]])
+    rows = [
+        held.FixedAtoms([0, 2]),
+        held.LinearCombination([1, 0], [[1.0, 0, 0], [-1.0, 0, 0]]),
+        held.LinearCombination([1, 2], [[1.0, 0, 0], [-1.0, 0, 0]]),
+    ]
+    motion = Motion(ConstraintSet(rows, x, np.ones(3)), x)
+    f = np.array([[0.0, 0, 0], [4.0, 1, 0], [0, 0, 0]])
+    lam = motion.multipliers(x, np.zeros((3, 3)), f)
+    np.testing.assert_allclose(lam[6:], [-2.0, -2.0], rtol=1e-14)
+    np.testing.assert_allclose(motion.constraint_force(x, np.zeros((3, 3)), f).sum(axis=0), [-4.0, 0, 0], atol=1e-14)
+
+
+CELL = np.array([[9.0, 0, 0], [2.0, 8.5, 0], [-1.5, 1.0, 9.5]])
+
+
+@pytest.mark.parametrize("extra", [0, 400])
+def test_triclinic_cell(extra: int) -> None:
+    """Wrapped atoms, one by one: same corrections as in the open, for compiled and interpreted rows."""
+    rng = np.random.default_rng(2)
+    x = np.vstack([WATER, WATER[:2] + 2, ZIGZAG[:9], rng.uniform(0, 2, (3, 3)), rng.uniform(-4, 4, (extra, 3))])
+    rows = [
+        held.Distance([*TRIANGLE, (3, 4), *((k, k + 1) for k in range(5, 13)), (14, 15)]),
+        held.Angle([(14, 15, 16)]),
+        held.CenterDistance([[0, 1, 2]], [[3, 4]]),
+    ]
+    masses = rng.uniform(1, 20, len(x))
+    open_motion = Motion(ConstraintSet(rows, x, masses), x)
+    shift = rng.integers(-2, 3, x.shape) @ CELL
+    periodic = Motion(ConstraintSet(rows, x + shift, masses, cell=CELL), x + shift)
+    assert periodic.rank == open_motion.rank
+    move, v = steps(len(x), 8)
+    again = rng.integers(-1, 2, x.shape) @ CELL
+    found = periodic.project_positions(x + move + again, x + shift)
+    np.testing.assert_allclose(found - again, open_motion.project_positions(x + move, x), rtol=0, atol=1e-12)
+    expected = open_motion.project_velocities(x, v)
+    np.testing.assert_allclose(periodic.project_velocities(x + shift, v), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("extra", [0, 400])
+@pytest.mark.parametrize("row", [held.Distance([0, 1]), held.CenterDistance([[0]], [[1]])])
+def test_a_cell_that_changes(extra: int, row: held.Constraint) -> None:
+    """A barostat sets the cell of the set it gave; every solver sees it, on a compact copy as well."""
+    x = np.vstack([[[0.5, 0, 0], [9.5, 0, 0]], np.random.default_rng(0).uniform(0, 9, (extra, 3))])
+    whole = ConstraintSet(row, x, np.ones(len(x)), cell=[10.0, 10, 10])
+    motion = Motion(whole, x)
+    motion.project_positions(x, x)
+    whole.with_cell([10.5, 10, 10])
+    y = motion.project_positions(x, x)
+    np.testing.assert_allclose(y[1, 0] - y[0, 0], 9.5, rtol=0, atol=1e-14)
+    assert motion.report(y).residual < 1e-14
+    v = np.zeros_like(x)
+    v[0, 1] = 1.0
+    np.testing.assert_allclose(motion.project_velocities(y, v), v, rtol=0, atol=1e-15)
