@@ -57,13 +57,35 @@ class Rescuers:
     ----------
     local : ConstraintSet
     plan : Plan
+    numbers : ndarray of int or None
+        Global numbers of the local atoms, for messages.
     """
 
-    def __init__(self, local: ConstraintSet, plan: Plan) -> None:
-        self._local, self._plan = local, plan
+    def __init__(self, local: ConstraintSet, plan: Plan, numbers: IntArray | None) -> None:
+        self._local, self._plan, self._numbers = local, plan, numbers
         self._made: dict[int, ClusterSolver] = {}
 
     def rescue(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
+        """Do a task that `solver` failed at, or raise what says why there is no way.
+
+        Raises
+        ------
+        ConvergenceError, InputError, SingularGeometryError
+            Positions and velocities are as they were.
+        """
+        x, velocities = task.x_new, task.velocities
+        saved = x.copy(), None if velocities is None else velocities.copy()
+        error = diagnosis.unusable(self._local, self._numbers, {"x_new": x, "x_ref": task.x_ref}, outcome, solver)
+        if error is None:
+            outcome = self._damped(solver, outcome, task, multipliers)
+            if outcome.converged:
+                return outcome
+        np.copyto(x, saved[0])
+        if velocities is not None and saved[1] is not None:
+            np.copyto(velocities, saved[1])
+        raise error or diagnosis.positions_failed(self._local, self._numbers, outcome, solver, self._plan)
+
+    def _damped(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
         extra = np.zeros(self._local.n_rows)
         for _ in range(MAX_RESCUES):

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons import diagnosis
-from kcons.arrays import as_array, check_out
+from kcons.arrays import as_array, check_multipliers, check_out
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
-from kcons.errors import ContradictionError, InputError, KconsError
+from kcons.errors import InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
 from kcons.plan import Plan, make_plan
 
@@ -97,7 +97,7 @@ class Motion:
         self._moving = self._local.moving
         self._several = len(self.plan.solvers) > 1 or len(self.plan.pinned) > 0
         self._iterations = [0] * len(self.plan.solvers)
-        self._rescuers = Rescuers(self._local, self.plan)
+        self._rescuers = Rescuers(self._local, self.plan, self._atoms)
 
     @property
     def rank(self) -> int:
@@ -203,7 +203,7 @@ class Motion:
                 raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
             inv_dt = 1.0 / dt
         if multipliers is not None:
-            self._check_multipliers(multipliers)
+            check_multipliers(multipliers, self.constraint_set.n_rows)
         reference_time = time if reference_time is None else reference_time
         atoms = self._atoms
         if atoms is None:
@@ -244,38 +244,30 @@ class Motion:
         targets = self._local.target(time) if self._moving else None
         # One solver alone restores what it changed; several need a copy to go back to.
         saved = (x.copy(), None if velocities is None else velocities.copy()) if self._several else None
-        if len(plan.pinned):
-            x[plan.pinned] = plan.pinned_targets(targets)
-            if plan.loose is not None and saved is not None:
-                try:
-                    plan.check_loose_rows(x, time)
-                except ContradictionError:
-                    np.copyto(x, saved[0])
-                    raise
         found: list[FloatArray | None] = []
-        for k, solver in enumerate(plan.solvers):
-            lam = None if multipliers is None else np.empty(len(solver.rows))
-            outcome = solver.positions(x, ref, targets, lattice, velocities, inv_dt, lam, time, reference_time)
-            if not outcome.converged or outcome.iterations > MANY_ITERATIONS:
-                if saved is None:
-                    saved = (x.copy(), None if velocities is None else velocities.copy())
-                task = Task(x, ref, targets, lattice, velocities, inv_dt, time, reference_time)
-                error: KconsError | None = None
-                if not outcome.converged:
-                    arrays = {"x_new": x, "x_ref": ref}
-                    error = diagnosis.unusable(self._local, self._atoms, arrays, outcome, solver)
-                    if error is None:
+        try:
+            if len(plan.pinned):
+                x[plan.pinned] = plan.pinned_targets(targets)
+                if plan.loose is not None:
+                    plan.check_loose_rows(x, time)
+            for k, solver in enumerate(plan.solvers):
+                lam = None if multipliers is None else np.empty(len(solver.rows))
+                outcome = solver.positions(x, ref, targets, lattice, velocities, inv_dt, lam, time, reference_time)
+                if not outcome.converged or outcome.iterations > MANY_ITERATIONS:
+                    task = Task(x, ref, targets, lattice, velocities, inv_dt, time, reference_time)
+                    if not outcome.converged:
                         outcome = self._rescuers.rescue(solver, outcome, task, lam)
-                if not outcome.converged:
-                    np.copyto(x, saved[0])
-                    if velocities is not None and saved[1] is not None:
-                        np.copyto(velocities, saved[1])
-                    raise error or diagnosis.positions_failed(self._local, self._atoms, outcome, solver, plan)
-                if outcome.iterations > MANY_ITERATIONS:
-                    # A far start leaves the rounding of its size; once more from the near end removes it.
-                    task.polish(solver, lam)
-            self._iterations[k] = outcome.iterations
-            found.append(lam)
+                    if outcome.iterations > MANY_ITERATIONS:
+                        # A far start leaves the rounding of its size; once more from the near end removes it.
+                        task.polish(solver, lam)
+                self._iterations[k] = outcome.iterations
+                found.append(lam)
+        except KconsError:
+            if saved is not None:
+                np.copyto(x, saved[0])
+                if velocities is not None and saved[1] is not None:
+                    np.copyto(velocities, saved[1])
+            raise
         if multipliers is not None:
             self._collect(found, multipliers)
 
@@ -295,12 +287,6 @@ class Motion:
                 self._lattice = source.lattice
                 self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
         return self._lattice
-
-    def _check_multipliers(self, multipliers: FloatArray) -> None:
-        n = self.constraint_set.n_rows
-        good = isinstance(multipliers, np.ndarray) and multipliers.dtype == np.float64 and multipliers.shape == (n,)
-        if not good or not multipliers.flags.writeable:
-            raise InputError(f"multipliers must be a writable float64 array of shape ({n},)", item="multipliers")
 
     def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
         """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
@@ -364,7 +350,7 @@ class Motion:
         if out is not None:
             check_out(out, self._shape)
         if multipliers is not None:
-            self._check_multipliers(multipliers)
+            check_multipliers(multipliers, self.constraint_set.n_rows)
         atoms = self._atoms
         if atoms is None:
             work = y if out is v else y.copy()
