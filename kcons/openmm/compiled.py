@@ -17,6 +17,7 @@ from kcons.openmm.copies import settings_of
 from kcons.openmm.guard import Guard, velocities_of
 from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.projected import ProjectedIntegrator
+from kcons.openmm.states import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0
@@ -55,7 +56,7 @@ class Ends(ProjectedIntegrator):
             self.setGlobalVariableByName("end", _STEP)
 
 
-class RattleIntegrator(openmm.CompoundIntegrator):
+class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     """Velocity Verlet on the constraints of the System, to order 2, about as fast as openmm.VerletIntegrator.
 
     The motion is that of ``ProjectedIntegrator(timestep, "rattle")``, up to rounding and the tolerance: positions and
@@ -118,6 +119,9 @@ class RattleIntegrator(openmm.CompoundIntegrator):
     def context(self, context: openmm.Context) -> None:
         self._ends.context = context
 
+    def _watch(self, context: openmm.Context | None = None) -> Guard:
+        return self._ends._watch(context)
+
     def step(self, steps: int) -> None:
         """Make `steps` steps.
 
@@ -174,7 +178,7 @@ class RattleIntegrator(openmm.CompoundIntegrator):
         """
         self._ends.check(context)
 
-    # -- constraints, energy, temperature -------------------------------------------------------
+    # -- constraints, temperature ---------------------------------------------------------------
 
     def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
         """As `ProjectedIntegrator.applyConstraints`."""
@@ -183,29 +187,6 @@ class RattleIntegrator(openmm.CompoundIntegrator):
     def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
         """As `ProjectedIntegrator.applyVelocityConstraints`."""
         self._ends.applyVelocityConstraints(context, tolerance)
-
-    def setVelocitiesToTemperature(
-        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
-    ) -> None:
-        """Draw velocities for a temperature (K if a float) and make them tangent to all constraints."""
-        self._ends.setVelocitiesToTemperature(context, temperature, seed)
-
-    def minimizeEnergy(
-        self,
-        context: openmm.Context | None = None,
-        tolerance: unit.Quantity | float = 10.0,
-        maxIterations: int = 0,
-    ) -> None:
-        """As `ProjectedIntegrator.minimizeEnergy`."""
-        self._ends.minimizeEnergy(context, tolerance, maxIterations)
-
-    def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
-        """As `ProjectedIntegrator.degrees_of_freedom`."""
-        return self._ends.degrees_of_freedom(context)
-
-    def independent_momenta(self, context: openmm.Context | None = None) -> int:
-        """As `ProjectedIntegrator.independent_momenta`."""
-        return self._ends.independent_momenta(context)
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """Of the velocities at x; no forces are computed."""

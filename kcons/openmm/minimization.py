@@ -13,13 +13,13 @@ from kcons.errors import ConvergenceError
 from kcons.openmm.guard import positions_of, velocities_of
 
 if TYPE_CHECKING:
-    from kcons.openmm.projected import ProjectedIntegrator
+    from kcons.openmm.states import StatesOnConstraints
 
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01
 
 
-def descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance: float, iterations: int) -> None:
+def descend(integrator: StatesOnConstraints, context: openmm.Context, tolerance: float, iterations: int) -> None:
     """Fast inertial relaxation along the constraints of the System and of the parts.
 
     Velocities are the search direction in the mass metric: each step projects f/m, turns v towards it, goes, and
@@ -72,7 +72,7 @@ def descend(integrator: ProjectedIntegrator, context: openmm.Context, tolerance:
 
 
 def _move(
-    integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray, dt: float
+    integrator: StatesOnConstraints, context: openmm.Context, v: FloatArray, dt: float
 ) -> tuple[float, FloatArray]:
     x = positions_of(context)
     for _ in range(30):
@@ -88,7 +88,7 @@ def _move(
     raise ConvergenceError("the constraints cannot be kept along the descent, however short the steps")
 
 
-def _tangent(integrator: ProjectedIntegrator, context: openmm.Context, v: FloatArray) -> FloatArray:
+def _tangent(integrator: StatesOnConstraints, context: openmm.Context, v: FloatArray) -> FloatArray:
     context.setVelocities(v)
     integrator.applyVelocityConstraints(context)
     return velocities_of(context)

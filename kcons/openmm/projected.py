@@ -16,15 +16,15 @@ from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.isokinetic import kelvins
 from kcons.openmm.lean_steps import LeanStepWriter
-from kcons.openmm.minimization import descend
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
 from kcons.openmm.schemes import LEAPFROG, to_scheme
+from kcons.openmm.states import StatesOnConstraints, value_in
 from kcons.openmm.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
 
 
-class ProjectedIntegrator(openmm.CustomIntegrator):
+class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -341,55 +341,7 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         if code:
             raise self._failure(code, count)
 
-    def setVelocitiesToTemperature(
-        self, context: openmm.Context, temperature: unit.Quantity | float, seed: int | None = None
-    ) -> None:
-        """Draw velocities for a temperature (K if a float) and make them tangent to all constraints.
-
-        Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
-        """
-        arguments = (temperature,) if seed is None else (temperature, int(seed))
-        context.setVelocitiesToTemperature(*arguments)
-        self.applyVelocityConstraints(context)
-
-    def minimizeEnergy(
-        self,
-        context: openmm.Context | None = None,
-        tolerance: unit.Quantity | float = 10.0,
-        maxIterations: int = 0,
-    ) -> None:
-        """Minimise the energy with all constraints kept.
-
-        Without parts this is OpenMM's LocalEnergyMinimizer, followed by `applyConstraints`; OpenMM's minimiser knows
-        nothing of parts.
-
-        Parameters
-        ----------
-        tolerance : Quantity or float
-            Root mean square of the force components along the constraints, in kJ/mol/nm if a float.
-        maxIterations : int
-            0 for no limit.
-        """
-        context = self._watch(context).context
-        tolerance = _value(tolerance, unit.kilojoule_per_mole / unit.nanometer)
-        if self.parts:
-            descend(self, context, tolerance, maxIterations)
-        else:
-            openmm.LocalEnergyMinimizer.minimize(context, tolerance, maxIterations)
-            self.applyConstraints(context)
-
     # -- temperature ----------------------------------------------------------------------------
-
-    def degrees_of_freedom(self, context: openmm.Context | None = None) -> int:
-        """Three for each particle with a mass, less the rank of all constraints.
-
-        Also less three where a CMMotionRemover keeps the centre of mass at rest. Found at the first call.
-        """
-        return self._watch(context).degrees_of_freedom()
-
-    def independent_momenta(self, context: openmm.Context | None = None) -> int:
-        """Three for each particle with a mass, less the rank of all constraints, whatever happens to total momentum."""
-        return self._watch(context).independent_momenta()
 
     def setTemperature(self, temperature: unit.Quantity | float) -> None:
         """Change the temperature (K if a float) of the ensemble.
@@ -525,12 +477,8 @@ class ProjectedIntegrator(openmm.CustomIntegrator):
         return self.__copy__()
 
 
-def _value(quantity: Any, of: unit.Unit) -> float:
-    return float(quantity.value_in_unit(of) if unit.is_quantity(quantity) else quantity)
-
-
 def _picoseconds(timestep: Any) -> float:
-    dt = _value(timestep, unit.picosecond)
+    dt = value_in(timestep, unit.picosecond)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
             f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
