@@ -7,11 +7,9 @@ measures everything that docs/ase.md shows (minutes); ``--show FILE`` prints suc
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from ase import Atoms, units
@@ -25,6 +23,7 @@ from ase.md.md import MolecularDynamics
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
+from kcons import measuring
 from kcons.ase import ConstrainedDynamics, constrain, rigid_water
 from kcons.compare import environment
 from kcons.constraints import Distance
@@ -357,19 +356,11 @@ def show(result: dict) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="everything that the page shows; minutes")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print an earlier result and stop")
-    options = parser.parse_args()
-    if options.show:
-        show(json.loads(options.show.read_text(encoding="utf-8")))
-        return
-    pulled_bond(40)
-    result = run(options.full)
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    show(result)
+    def measure(options: argparse.Namespace) -> dict:
+        pulled_bond(40)
+        return run(options.full)
+
+    measuring.script(measuring.options(__doc__, full="everything that the page shows; minutes"), measure, show)
 
 
 if __name__ == "__main__":

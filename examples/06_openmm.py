@@ -11,10 +11,9 @@ alike: only their ratios mean something. Errors are those of positions against a
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,8 @@ import numpy as np
 import openmm
 from openmm import app, unit
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare
+from kcons import compare, measuring
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.schemes import SCHEMES
 
@@ -83,17 +81,8 @@ def race(
         context.setPositions(start)
         context.setVelocitiesToTemperature(300, 1)
         integrators[name].step(steps)
-    times: dict[str, list[float]] = {name: [] for name in contexts}
-    for _ in range(repeats):
-        for name, integrator in integrators.items():
-            begin = time.process_time()
-            integrator.step(steps)
-            times[name].append((time.process_time() - begin) / steps)
-    reference = np.array(next(iter(times.values())))
-    return {
-        name: {"ms": float(np.median(values)) * 1e3, "ratio": float(np.median(reference / np.array(values)))}
-        for name, values in times.items()
-    }
+    calls = {name: partial(integrator.step, steps) for name, integrator in integrators.items()}
+    return measuring.speeds(measuring.in_turn(calls, repeats), steps)
 
 
 def plain_water(full: bool) -> dict[str, Any]:
@@ -180,15 +169,13 @@ MEASUREMENTS: dict[str, Callable[[bool], dict[str, Any]]] = {
 def show(result: dict[str, Any], console: Console) -> None:
     for measured in result["measurements"].values():
         if "rows" in measured:
-            table = Table(title=measured["title"])
-            for heading in ("integrator", "ms a step", "steps a second, relative"):
-                table.add_column(heading, justify="left" if heading == "integrator" else "right")
+            headings = ("integrator", "ms a step", "steps a second, relative")
+            table = measuring.table(measured["title"], headings, {"integrator"})
             for name, row in measured["rows"].items():
                 table.add_row(name, f"{row['ms']:.3f}", f"{row['ratio']:.2f}")
         else:
-            table = Table(title=measured["title"])
-            for heading in ("scheme", "step/fs", "error/nm", "force evaluations/ps", "fewer than RATTLE at 5e-7 nm"):
-                table.add_column(heading, justify="left" if heading == "scheme" else "right")
+            headings = ("scheme", "step/fs", "error/nm", "force evaluations/ps", "fewer than RATTLE at 5e-7 nm")
+            table = measuring.table(measured["title"], headings, {"scheme"})
             for scheme, points in measured["schemes"].items():
                 for k, p in enumerate(points):
                     fewer = f"{measured['fewer_than_rattle'][scheme]:.1f} ×" if k == 0 else ""
@@ -203,22 +190,16 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="the sizes of the committed results")
-    parser.add_argument("--only", choices=[*MEASUREMENTS], help="one measurement")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
-    options = parser.parse_args()
     console = Console(width=120)
-    if options.show:
-        show(json.loads(options.show.read_text()), console)
-        return
-    chosen = {options.only: MEASUREMENTS[options.only]} if options.only else MEASUREMENTS
-    measured = {name: measure(options.full) for name, measure in chosen.items()}
-    result = {"machine": compare.environment(), "full": options.full, "measurements": measured}
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
-    show(result, console)
+    parser = measuring.options(__doc__, full="the sizes of the committed results")
+    parser.add_argument("--only", choices=[*MEASUREMENTS], help="one measurement")
+
+    def measure(options: argparse.Namespace) -> dict[str, Any]:
+        chosen = {options.only: MEASUREMENTS[options.only]} if options.only else MEASUREMENTS
+        measured = {name: measurement(options.full) for name, measurement in chosen.items()}
+        return {"machine": compare.environment(), "full": options.full, "measurements": measured}
+
+    measuring.script(parser, measure, lambda result: show(result, console))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import copy
 import os
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from openmm import app, unit
 from rich.console import Console
 from rich.table import Table
 
+from kcons import measuring
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -82,24 +83,18 @@ def measure_collective(full: bool = False) -> dict[str, Any]:
             part.restore(context)
         integrator.step(2)
         contexts[name] = context
-    times: dict[str, list[float]] = {name: [] for name in runs}
     steps, rounds = (50, 9) if full else (5, 3)
-    for _ in range(rounds):
-        for name, (integrator, _, _) in runs.items():
-            begin = time.process_time()
-            integrator.step(steps)
-            times[name].append((time.process_time() - begin) / steps)
-    reference = np.array(times["VerletIntegrator"])
+    calls = {name: partial(integrator.step, steps) for name, (integrator, _, _) in runs.items()}
+    found = measuring.speeds(measuring.in_turn(calls, rounds), steps)
     return {
         "title": f"Distances held in rigid water, {len(x)} atoms, PME, 2 fs",
         "atoms": len(x),
         "rows": {
             name: {
-                "ms": float(np.median(spent)) * 1e3,
-                "ratio": float(np.median(reference / np.array(spent))),
+                **found[name],
                 "residual": None if part is None else float(np.abs(part.residuals(contexts[name])).max()),
             }
-            for (name, spent), (_, _, part) in zip(times.items(), runs.values(), strict=True)
+            for name, (_, _, part) in runs.items()
         },
     }
 

@@ -18,15 +18,14 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import argparse
 import json
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import openmm
 from rich.console import Console
 
-from kcons import compare, report, scenes
+from kcons import compare, measuring, report, scenes
 from kcons.compare import Comparison, Measurement
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.progress import Bars
@@ -61,17 +60,8 @@ def steps_in_turn(scene: Scene, steps: int, turns: int) -> dict[str, dict[str, f
         contexts[name].setPositions(scene.positions * host.length)
         contexts[name].setVelocities(scene.velocities * host.speed)
         integrator.step(2)
-    spent: dict[str, list[float]] = {name: [] for name in racers}
-    for _ in range(turns):
-        for name, (_, integrator) in racers.items():
-            begun = time.process_time()
-            integrator.step(steps)
-            spent[name].append((time.process_time() - begun) / steps)
-    first = np.array(next(iter(spent.values())))
-    return {
-        name: {"ms": 1e3 * float(np.median(found)), "ratio": float(np.median(first / np.array(found)))}
-        for name, found in spent.items()
-    }
+    calls = {name: partial(integrator.step, steps) for name, (_, integrator) in racers.items()}
+    return measuring.speeds(measuring.in_turn(calls, turns), steps)
 
 
 def cheapest(result: Comparison, target: float) -> dict[str, Any]:

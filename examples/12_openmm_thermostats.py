@@ -11,11 +11,11 @@ from blocks.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,8 @@ import numpy as np
 import openmm
 from openmm import app, unit
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare
+from kcons import compare, measuring
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -110,18 +109,13 @@ def speed(full: bool) -> dict[str, Any]:
         context.setState(state)
         integrators[name].step(5)
     steps, rounds = (20, 25) if full else (5, 3)
-    times: dict[str, list[float]] = {name: [] for name in integrators}
-    for _ in range(rounds):
-        for name, integrator in integrators.items():
-            begin = time.perf_counter()
-            integrator.step(steps)
-            contexts[name].getState(positions=True)
-            times[name].append((time.perf_counter() - begin) / steps)
-    base = np.array(times["VerletIntegrator"])
-    rows = {
-        name: {"ms": 1e3 * float(np.median(t)), "ratio": float(np.median(base / np.array(t)))}
-        for name, t in times.items()
-    }
+
+    def call(name: str) -> None:
+        integrators[name].step(steps)
+        contexts[name].getState(positions=True)
+
+    calls = {name: partial(call, name) for name in integrators}
+    rows = measuring.speeds(measuring.in_turn(calls, rounds, clock=time.perf_counter), steps)
     return {"title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs", "rows": rows}
 
 
@@ -182,16 +176,14 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
 def show(result: dict[str, Any], console: Console) -> None:
     fast, sampled = (result["measurements"].get(name) for name in ("speed", "sampling"))
     if fast:
-        table = Table(title=fast["title"])
-        for heading in ("integrator", "ms a step", "steps a second, relative"):
-            table.add_column(heading, justify="left" if heading == "integrator" else "right")
+        headings = ("integrator", "ms a step", "steps a second, relative")
+        table = measuring.table(fast["title"], headings, {"integrator"})
         for name, row in fast["rows"].items():
             table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}")
         console.print(table)
     if sampled and "reference" in sampled:
-        table = Table(title=sampled["title"])
-        for heading in ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs"):
-            table.add_column(heading, justify="left" if heading == "integrator" else "right")
+        headings = ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs")
+        table = measuring.table(sampled["title"], headings, {"integrator"})
         zero = sampled["reference"]
         for name, points in sampled["sampling"].items():
             for row in points:
@@ -207,11 +199,8 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="the sizes of the committed results")
+    parser = measuring.options(__doc__, full="the sizes of the committed results")
     parser.add_argument("--only", choices=["speed", "sampling"], help="one measurement; others in --out are kept")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
     options = parser.parse_args()
     console = Console(width=120)
     if options.show:

@@ -11,23 +11,11 @@ leaves them. Each solver does both alone, warm, on one thread, at every toleranc
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare, solver_precision
-
-
-def show(result: dict, console: Console) -> None:
-    page = solver_precision.table(result)
-    table = Table(title="Constraint solvers alone: time a constraint, and what is left")
-    for heading in page.headings:
-        table.add_column(heading)
-    for row in page.rows:
-        table.add_row(*row)
-    console.print(table)
+from kcons import measuring, solver_precision
 
 
 def main() -> None:
@@ -35,19 +23,11 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="large systems")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    earlier = None
-
-    def keep(result: dict) -> None:
-        if options.out:
-            whole = {**result, "environment": compare.environment()}
-            options.out.write_text(json.dumps(whole, indent=1) + "\n")
-
-    if options.out and options.out.exists():
-        earlier = json.loads(options.out.read_text())
-    result = solver_precision.measure(quick=not options.full, keep=keep, earlier=earlier)
+    result = measuring.continued(options.out, solver_precision.measure, quick=not options.full)
     if options.out:
         solver_precision.figure(result).savefig(options.out.with_suffix(".png"), dpi=130)
-    show(result, Console(width=170))
+    page, title = solver_precision.table(result), "Constraint solvers alone: time a constraint, and what is left"
+    Console(width=170).print(measuring.table(title, page.headings, page.headings, page.rows))
 
 
 if __name__ == "__main__":

@@ -10,23 +10,11 @@ Each solver runs in a process of its own, from small to large, and is stopped wh
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare, scaling
-
-
-def show(result: dict, console: Console) -> None:
-    page = scaling.table(result)
-    table = Table(title="Cost and memory against size")
-    for heading in page.headings:
-        table.add_column(heading)
-    for row in page.rows:
-        table.add_row(*row)
-    console.print(table)
+from kcons import measuring, scaling
 
 
 def main() -> None:
@@ -34,19 +22,11 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="all sizes and solvers")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    earlier = None
-
-    def keep(result: dict) -> None:
-        if options.out:
-            whole = {**result, "environment": compare.environment()}
-            options.out.write_text(json.dumps(whole, indent=1) + "\n")
-
-    if options.out and options.out.exists():
-        earlier = json.loads(options.out.read_text())
-    result = scaling.measure(quick=not options.full, keep=keep, earlier=earlier)
+    result = measuring.continued(options.out, scaling.measure, quick=not options.full)
     if options.out:
         scaling.figure(result).savefig(options.out.with_suffix(".png"), dpi=130)
-    show(result, Console(width=150))
+    page = scaling.table(result)
+    Console(width=150).print(measuring.table("Cost and memory against size", page.headings, page.headings, page.rows))
 
 
 if __name__ == "__main__":

@@ -10,17 +10,14 @@ dynamics takes is not hidden. CPU time of this thread, in blocks of steps taken 
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator
 
-from kcons import scenes
+from kcons import measuring, scenes
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
 from kcons.machine import environment
 from kcons.scenes.fluid import Fluid
@@ -103,21 +100,14 @@ def show(result: dict[str, Any]) -> None:
     print(f"commit {computer['commit']}, {computer['date']}")
 
 
+def run(full: bool) -> dict[str, Any]:
+    repeats = 301 if full else 15
+    return {"full": full, "machine": environment(), "cost": [cost(*system, repeats) for system in SYSTEMS]}
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="as many blocks as the page shows")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print an earlier result and stop")
-    options = parser.parse_args()
-    if options.show:
-        show(json.loads(options.show.read_text(encoding="utf-8")))
-        return
-    repeats = 301 if options.full else 15
-    result: dict[str, Any] = {"full": options.full, "machine": environment()}
-    result["cost"] = [cost(*system, repeats) for system in SYSTEMS]
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    show(result)
+    parser = measuring.options(__doc__, full="as many blocks as the page shows")
+    measuring.script(parser, lambda options: run(options.full), show)
 
 
 if __name__ == "__main__":
