@@ -20,6 +20,7 @@ import itertools
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,45 +28,27 @@ import numpy as np
 import openmm
 from openmm import app, unit
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare
+from kcons import compare, measuring
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints import Constraint, Distance
+from kcons.constraints import Distance
 from kcons.errors import KconsError
+from kcons.hard_cases.rings import ring
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.carrier import CarriedConstraints
+from kcons.openmm.guard import positions_of, velocities_of
+from kcons.openmm.requirements import masses_of
 from kcons.openmm.transfer import hold, take_constraints
+from kcons.scenes.openmm_host import system_of
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 KT = 2.494  # 300 K in kJ/mol
-NM_PS = unit.nanometer / unit.picosecond
 
 
 def context_of(system: openmm.System, integrator: openmm.Integrator, platform: str = "CPU") -> openmm.Context:
     properties = {"Threads": "1"} if platform == "CPU" else {}
     return openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
-
-
-def thermal(masses: np.ndarray, seed: int = 5) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(len(masses), 3)) * np.sqrt(KT / masses)[:, None]
-
-
-def interleaved(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """Seconds of each call, taken in turn."""
-    samples: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = time.process_time()
-            call()
-            samples[name].append(time.process_time() - start)
-    return samples
-
-
-def ratio(first: list[float], second: list[float]) -> float:
-    """Median over the turns of first/second."""
-    return float(np.median(np.array(first) / np.array(second)))
 
 
 # -- systems --------------------------------------------------------------------------------------
@@ -85,15 +68,11 @@ def chain(bonds: int) -> tuple[openmm.System, np.ndarray]:
     """A freely jointed chain."""
     u = np.random.default_rng(3).normal(size=(bonds, 3))
     x = np.vstack([np.zeros(3), np.cumsum(0.153 * u / np.linalg.norm(u, axis=1)[:, None], axis=0)])
-    system = openmm.System()
-    for _ in range(bonds + 1):
-        system.addParticle(14.0)
-    for k in range(bonds):
-        system.addConstraint(k, k + 1, 0.153)
-    return system, x - x.mean(axis=0)
+    pairs = [(k, k + 1) for k in range(bonds)]
+    return system_of(np.full(bonds + 1, 14.0), pairs=pairs, lengths=0.153), x - x.mean(axis=0)
 
 
-def water(molecules: int) -> tuple[openmm.System, np.ndarray, app.Topology]:
+def water(molecules: int) -> tuple[openmm.System, np.ndarray]:
     """Rigid TIP3P water with PME."""
     field = app.ForceField("tip3p.xml")
     modeller = app.Modeller(app.Topology(), unit.Quantity([], unit.nanometer))
@@ -102,15 +81,10 @@ def water(molecules: int) -> tuple[openmm.System, np.ndarray, app.Topology]:
     system = field.createSystem(
         modeller.topology, nonbondedMethod=app.PME, nonbondedCutoff=min(0.9, 0.45 * edge), removeCMMotion=False
     )
-    x = np.array(modeller.positions.value_in_unit(unit.nanometer))
-    return system, x, modeller.topology
+    return system, np.array(modeller.positions.value_in_unit(unit.nanometer))
 
 
 # -- the solver alone -----------------------------------------------------------------------------
-
-
-def masses_of(system: openmm.System) -> np.ndarray:
-    return np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(system.getNumParticles())])
 
 
 def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, repeats: int) -> dict:
@@ -129,7 +103,7 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
     motion = Motion(held, x)
     setup = time.process_time() - start
     on = motion.restore_positions(x)
-    v = thermal(masses)
+    v = np.random.default_rng(5).normal(size=x.shape) * np.sqrt(KT / masses)[:, None]
     moved = on + 0.002 * motion.project_velocities(on, v)
     landed = motion.project_positions(moved, moved)
     work, speed = moved.copy(), v.copy()
@@ -141,36 +115,35 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
         np.copyto(speed, v)
 
     samples: dict[str, list[float]] = {key: [] for key in ("ccma_p", "ccma_v", "p", "v")}
+
+    def timed(key: str, call: Callable[[], Any]) -> None:
+        begun = time.process_time()
+        call()
+        samples[key].append((time.process_time() - begun) / held.n_rows * 1e9)
+
     for _ in range(repeats):
         reset()
-        times = [time.process_time()]
-        context.applyConstraints(tolerance)
-        times.append(time.process_time())
-        motion.project_positions(work, moved, out=work)
-        times.append(time.process_time())
+        timed("ccma_p", lambda: context.applyConstraints(tolerance))
+        timed("p", lambda: motion.project_positions(work, moved, out=work))
         context.setPositions(landed)
-        again = time.process_time()
-        context.applyVelocityConstraints(tolerance)
-        times.append(time.process_time())
-        motion.project_velocities(landed, speed, out=speed)
-        times.append(time.process_time())
-        spans = (times[1] - times[0], times[2] - times[1], times[3] - again, times[4] - times[3])
-        for key, span in zip(("ccma_p", "p", "ccma_v", "v"), spans, strict=True):
-            samples[key].append(span / held.n_rows * 1e9)
+        timed("ccma_v", lambda: context.applyVelocityConstraints(tolerance))
+        timed("v", lambda: motion.project_velocities(landed, speed, out=speed))
     rate = held.jacobian(landed)
     error = float(np.max(np.abs(held.value(work)) / held.scale))
     velocity_error = float(np.abs(rate @ speed.ravel()).max())
     reset()
     context.applyConstraints(tolerance)
-    theirs = context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+    theirs = positions_of(context)
     context.setPositions(landed)
     context.applyVelocityConstraints(tolerance)
-    tangent = context.getState(velocities=True).getVelocities(asNumpy=True).value_in_unit(NM_PS)
-    result = {"name": name, "rows": held.n_rows, "tolerance": tolerance}
-    result |= {f"{key}_ns": float(np.median(values)) for key, values in samples.items()}
-    result |= {
-        "p_ratio": ratio(samples["ccma_p"], samples["p"]),
-        "v_ratio": ratio(samples["ccma_v"], samples["v"]),
+    tangent = velocities_of(context)
+    return {
+        "name": name,
+        "rows": held.n_rows,
+        "tolerance": tolerance,
+        **{f"{key}_ns": float(np.median(values)) for key, values in samples.items()},
+        "p_ratio": measuring.ratio(samples["ccma_p"], samples["p"]),
+        "v_ratio": measuring.ratio(samples["ccma_v"], samples["v"]),
         "ccma_error": float(np.max(np.abs(held.value(theirs)) / held.scale)),
         "error": error,
         "ccma_velocity_error": float(np.abs(rate @ tangent.ravel()).max()),
@@ -178,7 +151,6 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
         "ccma_setup_s": setup_ccma,
         "setup_s": setup,
     }
-    return result
 
 
 def setup(name: str, make: Callable[[], tuple[openmm.System, np.ndarray]]) -> dict:
@@ -230,7 +202,7 @@ def speeds(name: str, times: dict[str, list[float]], steps: int) -> dict:
     return {
         "name": name,
         "ms_a_step": {label: 1e3 * float(np.median(t)) / steps for label, t in times.items()},
-        "ratio": {label: ratio(times["VerletIntegrator"], t) for label, t in times.items()},
+        "ratio": {label: measuring.ratio(times["VerletIntegrator"], t) for label, t in times.items()},
     }
 
 
@@ -249,7 +221,7 @@ def pairs_in_water(x: np.ndarray, count: int) -> list[tuple[int, int]]:
 
 
 def steps_in_water(molecules: int, rows: tuple[int, ...], steps: int, repeats: int) -> dict:
-    system, x, _ = water(molecules)
+    system, x = water(molecules)
     calls: dict[str, Callable[[], Any]] = {}
     keep = []
 
@@ -264,7 +236,7 @@ def steps_in_water(molecules: int, rows: tuple[int, ...], steps: int, repeats: i
     context.setPositions(x)
     openmm.LocalEnergyMinimizer.minimize(context, 100, 50)
     context.getIntegrator().step(100)
-    start = context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+    start = positions_of(context)
     verlet = openmm.VerletIntegrator(0.001)
     add("VerletIntegrator", verlet, openmm.XmlSerializer.clone(system))
     add("ProjectedIntegrator", ProjectedIntegrator(0.001), openmm.XmlSerializer.clone(system))
@@ -272,7 +244,7 @@ def steps_in_water(molecules: int, rows: tuple[int, ...], steps: int, repeats: i
         one = openmm.XmlSerializer.clone(system)
         part = hold(one, Distance(pairs_in_water(start, count)), start)
         add(f"{count} carried", ProjectedIntegrator(0.001, parts=[part]), one, part)
-    times = interleaved(calls, repeats)
+    times = measuring.in_turn(calls, repeats)
     for _, part in keep:
         if part is not None:
             part.check(_)
@@ -296,7 +268,7 @@ def steps_in_dhfr(name: str, tolerance: float, steps: int, repeats: int, **optio
         integrator.step(3)
         keep.append(context)
         calls[label] = lambda integrator=integrator: integrator.step(steps)
-    times = interleaved(calls, repeats)
+    times = measuring.in_turn(calls, repeats)
     part.check(keep[-1])
     return speeds(f"DHFR AllBonds, {name}, {tolerance:g}", times, steps)
 
@@ -304,9 +276,8 @@ def steps_in_dhfr(name: str, tolerance: float, steps: int, repeats: int, **optio
 # -- hard cases -----------------------------------------------------------------------------------
 
 
-def ring(n: int) -> np.ndarray:
-    angle = 2 * np.pi * np.arange(n) / n
-    return 0.14 / (2 * np.sin(np.pi / n)) * np.c_[np.cos(angle), np.sin(angle), 0 * angle]
+def polygon(n: int) -> np.ndarray:
+    return ring(n, 0.14 / (2 * np.sin(np.pi / n)))
 
 
 def honeycomb(m: int, n: int) -> tuple[np.ndarray, list[tuple[int, int]]]:
@@ -330,10 +301,8 @@ def alanine_dipeptide() -> tuple[np.ndarray, list[tuple[int, int]], np.ndarray]:
 def hard_cases() -> dict[str, tuple[np.ndarray, np.ndarray, list[tuple[int, int]], float]]:
     """Name: positions (nm), masses, pairs held at the distance they have, and how far off to start."""
     every = lambda n: list(itertools.combinations(range(n), 2))  # noqa: E731
-    tetrahedron = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.109 / np.sqrt(3)
-    methane = np.vstack([np.zeros(3), tetrahedron])
-    triangle = ring(3)
-    bipyramid = np.vstack([triangle, [[0, 0, 0.12], [0, 0, -0.12]]])
+    methane = np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.109 / np.sqrt(3)
+    bipyramid = np.vstack([polygon(3), [[0, 0, 0.12], [0, 0, -0.12]]])
     sides = [(i, (i + 1) % 6) for i in range(6)]
     meta = [tuple(sorted((i, (i + 2) % 6))) for i in range(6)]
     para = [(i, i + 3) for i in range(3)]
@@ -347,10 +316,10 @@ def hard_cases() -> dict[str, tuple[np.ndarray, np.ndarray, list[tuple[int, int]
     return {
         "methane, 10 distances": (methane, np.array([12.0, 1, 1, 1, 1]), every(5), 0.0),
         "bipyramid, 10": (bipyramid, carbon(5), every(5), 0.0),
-        "hexagon, 9 (with para)": (ring(6), carbon(6), sides + para, 0.0),
-        "hexagon, 12 (with meta)": (ring(6), carbon(6), sides + meta, 0.0),
-        "hexagon, 15": (ring(6), carbon(6), every(6), 0.0),
-        "square, 6": (ring(4), carbon(4), every(4), 0.0),
+        "hexagon, 9 (with para)": (polygon(6), carbon(6), sides + para, 0.0),
+        "hexagon, 12 (with meta)": (polygon(6), carbon(6), sides + meta, 0.0),
+        "hexagon, 15": (polygon(6), carbon(6), every(6), 0.0),
+        "square, 6": (polygon(4), carbon(4), every(4), 0.0),
         "collinear, 3": (line, np.array([16.0, 12, 16]), every(3), 0.0),
         "Martini diamond, 5": (diamond, np.full(4, 45.0), every(4)[:5], 0.0),
         "Martini diamond, 6": (diamond, np.full(4, 45.0), every(4), 0.0),
@@ -361,30 +330,29 @@ def hard_cases() -> dict[str, tuple[np.ndarray, np.ndarray, list[tuple[int, int]
     }
 
 
-def hard_system(x: np.ndarray, masses: np.ndarray, seed: int = 2) -> openmm.System:
+def hard_system(x: np.ndarray, masses: np.ndarray, **constraints: Any) -> openmm.System:
     """Each atom on a weak spring of its own, also out of planes and lines."""
-    system = openmm.System()
     force = openmm.CustomExternalForce("50*((x-a)^2+(y-b)^2+(z-c)^2)")
     for name in "abc":
         force.addPerParticleParameter(name)
-    for k, (m, away) in enumerate(zip(masses, np.random.default_rng(seed).normal(size=x.shape), strict=True)):
-        system.addParticle(float(m))
+    for k, away in enumerate(np.random.default_rng(2).normal(size=x.shape)):
         force.addParticle(k, x[k] + 0.05 * away)
-    system.addForce(force)
-    return system
+    return system_of(masses, force, **constraints)
+
+
+def lengths_of(x: np.ndarray, pairs: list) -> np.ndarray:
+    return np.array([np.linalg.norm(x[i] - x[j]) for i, j in pairs])
 
 
 def run_carried(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, steps: int = 500) -> dict:
     """Largest relative error over the run with rows of kcons, or why they were refused."""
-    lengths = np.array([np.linalg.norm(x[i] - x[j]) for i, j in pairs])
+    lengths = lengths_of(x, pairs)
     system = hard_system(x, masses)
-    rows: list[Constraint] = [Distance(pairs, lengths)]
-    started = (1 + off) * x
     try:
-        part = hold(system, rows, x)
+        part = hold(system, Distance(pairs, lengths), x)
         integrator = ProjectedIntegrator(0.001, parts=[part])
         context = context_of(system, integrator, "Reference")
-        context.setPositions(started)
+        context.setPositions((1 + off) * x)
         part.apply_positions(context)
         context.setVelocitiesToTemperature(300, 1)
         part.apply_velocities(context)
@@ -392,8 +360,7 @@ def run_carried(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, step
         worst = 0.0
         for _ in range(steps):
             integrator.step(1)
-            there = context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-            reached = np.array([np.linalg.norm(there[i] - there[j]) for i, j in pairs])
+            reached = lengths_of(positions_of(context), pairs)
             worst = max(worst, float(np.max(np.abs(reached / lengths - 1))))
         part.check(context)
     except KconsError as error:
@@ -403,25 +370,21 @@ def run_carried(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, step
 
 def run_builtin(x: np.ndarray, masses: np.ndarray, pairs: list, off: float, steps: int = 500) -> dict:
     """The same with OpenMM's own constraints and VerletIntegrator at a tolerance of 1e-10."""
-    lengths = np.array([np.linalg.norm(x[i] - x[j]) for i, j in pairs])
-    system = hard_system(x, masses)
-    for (i, j), length in zip(pairs, lengths, strict=True):
-        system.addConstraint(i, j, float(length))
-    started = (1 + off) * x
+    lengths = lengths_of(x, pairs)
+    system = hard_system(x, masses, pairs=pairs, lengths=lengths)
     integrator = openmm.VerletIntegrator(0.001)
     integrator.setConstraintTolerance(1e-10)
     done = 0
     worst = 0.0
     try:
         context = context_of(system, integrator, "Reference")
-        context.setPositions(started)
+        context.setPositions((1 + off) * x)
         context.applyConstraints(1e-10)
         context.setVelocitiesToTemperature(300, 1)
         for done in range(steps):
             integrator.step(1)
-            there = context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-            reached = np.array([np.linalg.norm(there[i] - there[j]) for i, j in pairs])
-            worst = max(worst, float(np.max(np.abs(reached / lengths - 1))))
+            there = positions_of(context)
+            worst = max(worst, float(np.max(np.abs(lengths_of(there, pairs) / lengths - 1))))
             if not np.isfinite(worst) or not np.all(np.isfinite(there)):
                 return {"error": float("inf"), "raised": "", "steps": done}
     except openmm.OpenMMException as error:
@@ -461,46 +424,27 @@ def run(full: bool, console: Console, kept: dict | None = None) -> dict:
         each("solver", solvers)
         each("setup", setups)
     if full:
-        steps = [lambda: steps_in_water(900, (1, 20), 50, 11)]
+        steps: list[Callable[[], dict]] = [lambda: steps_in_water(900, (1, 20), 50, 11)]
         vacuum = {"nonbondedMethod": app.NoCutoff}
         solvent = {"nonbondedMethod": app.CutoffNonPeriodic, "nonbondedCutoff": 2.0 * unit.nanometer, "obc": True}
         for name, options, count in (("vacuum", vacuum, 50), ("implicit solvent", solvent, 10)):
-            for tolerance in (1e-10, 1e-6):
-                steps.append(
-                    lambda name=name, tolerance=tolerance, count=count, options=options: steps_in_dhfr(  # type: ignore[misc]
-                        name, tolerance, count, 11, **options
-                    )
-                )
+            steps += [partial(steps_in_dhfr, name, tolerance, count, 11, **options) for tolerance in (1e-10, 1e-6)]
     else:
         steps = [lambda: steps_in_water(64, (1, 5), 5, 3)]
     each("steps", steps)
     if kept is not None:
         return result
-    cases = hard_cases()
-    names = list(cases) if full else ["methane, 10 distances", "collinear, 3"]
-    result["hard"] = []
-    for name in names:
-        row = {"name": name, "kcons": run_carried(*cases[name]), "OpenMM": run_builtin(*cases[name])}
-        result["hard"].append(row)
+    cases = {name: c for name, c in hard_cases().items() if full or name in ("methane, 10 distances", "collinear, 3")}
+    result["hard"] = [{"name": name, "kcons": run_carried(*c), "OpenMM": run_builtin(*c)} for name, c in cases.items()]
     return result
 
 
 def show(result: dict, console: Console) -> None:
-    table = Table(title="The solver alone: OpenMM's CCMA and kcons on the same input, ns a row")
-    for heading in (
-        "system",
-        "rows",
-        "tol",
-        "P CCMA",
-        "P kcons",
-        "ratio",
-        "V CCMA",
-        "V kcons",
-        "ratio",
-        "CCMA",
-        "kcons",
-    ):
-        table.add_column(heading, justify="left" if heading == "system" else "right")
+    table = measuring.table(
+        "The solver alone: OpenMM's CCMA and kcons on the same input, ns a row",
+        ("system", "rows", "tol", *("P CCMA", "P kcons", "ratio", "V CCMA", "V kcons", "ratio"), "CCMA", "kcons"),
+        {"system"},
+    )
     table.add_row(*[""] * 9, "error", "error", end_section=True)
     for r in result["solver"]:
         table.add_row(
@@ -509,28 +453,24 @@ def show(result: dict, console: Console) -> None:
             f"{r['ccma_error']:.0e}", f"{r['error']:.0e}",
         )  # fmt: skip
     console.print(table)
-    table = Table(title="From a System to a Context, s")
-    for heading in ("system", "rows", "CCMA", "rows given to kcons", "ratio", "moved over to kcons", "ratio"):
-        table.add_column(heading, justify="left" if heading == "system" else "right")
+    headings = ("system", "rows", "CCMA", "rows given to kcons", "ratio", "moved over to kcons", "ratio")
+    table = measuring.table("From a System to a Context, s", headings, {"system"})
     for r in result["setup"]:
         table.add_row(
             r["name"], f"{r['rows']:,}", f"{r['ccma_s']:.2f}", f"{r['given_s']:.3f}", f"{r['given_ratio']:.0f}",
             f"{r['moved_s']:.3f}", f"{r['moved_ratio']:.0f}",
         )  # fmt: skip
     console.print(table)
-    table = Table(title="Speed of whole steps: milliseconds, and times VerletIntegrator's steps a second")
-    for heading in ("system", "integrator", "ms", "speed"):
-        table.add_column(heading, justify="left" if heading in ("system", "integrator") else "right")
+    title = "Speed of whole steps: milliseconds, and times VerletIntegrator's steps a second"
+    table = measuring.table(title, ("system", "integrator", "ms", "speed"), {"system", "integrator"})
     for r in result["steps"]:
         for k, (name, ms) in enumerate(r["ms_a_step"].items()):
             table.add_row(r["name"] if k == 0 else "", name, f"{ms:.2f}", f"{r['ratio'][name]:.2f}")
     console.print(table)
-    table = Table(title="Hard cases: largest relative error of a distance over 500 steps")
-    for heading in ("distances held", "kcons", "OpenMM"):
-        table.add_column(heading)
+    headings = ("distances held", "kcons", "OpenMM")
+    table = measuring.table("Hard cases: largest relative error of a distance over 500 steps", headings, headings)
     for r in result["hard"]:
-        ours = r["kcons"]
-        theirs = r["OpenMM"]
+        ours, theirs = r["kcons"], r["OpenMM"]
         bad = f"NaN after {theirs['steps']} steps" if not np.isfinite(theirs["error"]) else f"{theirs['error']:.0e}"
         held = "refused: singular at this geometry" if "refused" in ours else f"{ours['error']:.0e}"
         table.add_row(r["name"], held, theirs["raised"] or bad)
@@ -546,21 +486,14 @@ def show(result: dict, console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="all systems")
-    parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
-    options = parser.parse_args()
     console = Console(width=150)
-    if options.show:
-        show(json.loads(options.show.read_text()), console)
-        return
-    kept = json.loads(options.steps.read_text()) if options.steps else None
-    result = run(options.full, console, kept)
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
-    show(result, console)
+    parser = measuring.options(__doc__, full="all systems")
+    parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
+
+    def measure(options: argparse.Namespace) -> dict:
+        return run(options.full, console, json.loads(options.steps.read_text()) if options.steps else None)
+
+    measuring.script(parser, measure, lambda result: show(result, console))
 
 
 if __name__ == "__main__":
