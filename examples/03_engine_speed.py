@@ -11,14 +11,13 @@ the same run: kick and drift, then kick.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +28,14 @@ from ase.calculators.calculator import Calculator, all_changes
 from ase.constraints import FixBondLengths
 from ase.md.verlet import VelocityVerlet
 from rich.console import Console
-from rich.table import Table
 
-from kcons import compare
+from kcons import compare, measuring
 from kcons.ase import constrain
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
-from kcons.plan import make_plan
+from kcons.plan import DistanceClusters, make_plan
+from kcons.scenes.openmm_host import system_of
 from kcons.solvers.distances import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
@@ -47,33 +46,29 @@ DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 # -- systems: positions (Å), masses (amu), pairs --------------------------------------------------
 
 
-def water(n: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
-    """Rigid TIP3P molecules on a lattice, turned at random."""
-    rng = np.random.default_rng(1)
-    shape = np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]])
-    turns = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+def scattered(molecule: np.ndarray, n: int, spacing: float, seed: int) -> np.ndarray:
+    """Copies of a molecule on a lattice, turned at random."""
+    turns = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, 3, 3)))[0]
     edge = int(np.ceil(n ** (1 / 3)))
-    grid = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), -1).reshape(-1, 3)[:n] * 3.1
-    x = (np.einsum("nij,kj->nki", turns, shape) + grid[:, None]).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), -1).reshape(-1, 3)[:n] * spacing
+    return np.ascontiguousarray((np.einsum("nij,kj->nki", turns, molecule) + grid[:, None]).reshape(-1, 3))
+
+
+def water(n: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
+    """Rigid TIP3P molecules."""
+    x = scattered(np.array([[0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.9266272, 0]]), n, 3.1, 1)
     o = 3 * np.arange(n)
     pairs = np.concatenate([np.c_[o, o + 1], np.c_[o, o + 2], np.c_[o + 1, o + 2]])
-    return np.ascontiguousarray(x), np.tile([15.999, 1.008, 1.008], n), [Distance(pairs)]
+    return x, np.tile([15.999, 1.008, 1.008], n), [Distance(pairs)]
 
 
 def groups(n: int, hydrogens: int) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
     """X-H, CH2 or CH3 groups with their C-H bonds held."""
-    x, masses, pairs = [], [12.011, *[1.008] * hydrogens], []
     ends = 1.09 * np.array([[0.943, 0, 0.333], [-0.471, 0.816, 0.333], [-0.471, -0.816, 0.333]])[:hydrogens]
-    rng = np.random.default_rng(2)
-    turns = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    unit = np.vstack([np.zeros(3), ends])
-    edge = int(np.ceil(n ** (1 / 3)))
-    grid = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), -1).reshape(-1, 3)[:n] * 4.0
-    x = (np.einsum("nij,kj->nki", turns, unit) + grid[:, None]).reshape(-1, 3)
-    size = hydrogens + 1
-    first = size * np.arange(n)
-    pairs = np.concatenate([np.c_[first, first + h] for h in range(1, size)])
-    return np.ascontiguousarray(x), np.tile(masses, n), [Distance(pairs)]
+    x = scattered(np.vstack([np.zeros(3), ends]), n, 4.0, 2)
+    first = (hydrogens + 1) * np.arange(n)
+    pairs = np.concatenate([np.c_[first, first + h] for h in range(1, hydrogens + 1)])
+    return x, np.tile([12.011, *[1.008] * hydrogens], n), [Distance(pairs)]
 
 
 def chain(bonds: int, kind: str) -> tuple[np.ndarray, np.ndarray, list[Constraint]]:
@@ -239,8 +234,6 @@ def measure(name: str, x: np.ndarray, masses: np.ndarray, constraints: list[Cons
 
 def _use_sparse(motion: Motion, x: np.ndarray) -> None:
     """Replace the chain solver of a plan by the sparse one."""
-    from kcons.plan import DistanceClusters
-
     held = motion.constraint_set
     (item,) = held.constraints
     plan = make_plan(held, x, 0.0)
@@ -257,22 +250,19 @@ def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance
     import openmm
     from openmm import unit
 
-    bare_system = openmm.System()
-    for m in masses:
-        bare_system.addParticle(float(m))
-    pairs, lengths = [], []
-    for k in range(system.getNumConstraints()):
-        i, j, d = system.getConstraintParameters(k)
-        bare_system.addConstraint(i, j, d)
-        pairs.append((i, j))
-        lengths.append(d.value_in_unit(unit.angstrom))
+    from kcons.openmm.guard import positions_of, velocities_of
+
+    table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    pairs = [(i, j) for i, j, _ in table]
+    angles = []
     for force in system.getForces():
         if isinstance(force, openmm.HarmonicAngleForce):  # CCMA takes its coupling from it
-            copy = openmm.HarmonicAngleForce()
-            copy.setForceGroup(1)
+            angles.append(openmm.HarmonicAngleForce())
+            angles[-1].setForceGroup(1)
             for k in range(force.getNumAngles()):
-                copy.addAngle(*force.getAngleParameters(k))
-            bare_system.addForce(copy)
+                angles[-1].addAngle(*force.getAngleParameters(k))
+    lengths = np.array([d.value_in_unit(unit.nanometer) for _, _, d in table])
+    bare_system = system_of(masses, *angles, pairs=pairs, lengths=lengths)
     integrators, contexts = {}, {}
     for what in ("neither", "positions", "velocities"):
         integrator = openmm.CustomIntegrator(0.001 * STEP)
@@ -290,13 +280,12 @@ def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance
         context = openmm.Context(bare_system, integrator, platform, {"Threads": "1"})
         context.setPositions(x * 0.1)
         context.applyConstraints(1e-12)
-        start = context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        start = positions_of(context)
         thermal = np.random.default_rng(5).normal(size=x.shape) * np.sqrt(KT / masses)[:, None] * 100
         context.setVelocities(thermal)
         context.applyVelocityConstraints(1e-12)
-        tangent = context.getState(velocities=True).getVelocities(asNumpy=True)
+        tangent = velocities_of(context)
         integrator.setPerDofVariableByName("x0", start)
-        tangent = tangent.value_in_unit(unit.nanometer / unit.picosecond)
         # Velocities are drawn back onto the surface at the start, positions from a step along it.
         integrator.setPerDofVariableByName("v0", thermal if what == "velocities" else tangent)
         if what == "velocities":
@@ -310,31 +299,22 @@ def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance
             integrator.step(repeats)
             samples[what].append((time.perf_counter() - begin) / repeats)
     times = {what: float(np.median(values)) for what, values in samples.items()}
-    state = {
-        what: context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.angstrom)
-        for what, context in contexts.items()
-    }
     i, j = np.array(pairs).T
-    reached = np.linalg.norm(state["positions"][i] - state["positions"][j], axis=1)
+    reached = positions_of(contexts["positions"])
     n = len(pairs)
     return {
         "tolerance": tolerance,
         "p_ns": (times["positions"] - times["neither"]) / n * 1e9,
         "v_ns": (times["velocities"] - times["neither"]) / n * 1e9,
-        "relative_error": float(np.max(np.abs(reached / np.array(lengths) - 1))),
+        "relative_error": float(np.max(np.abs(np.linalg.norm(reached[i] - reached[j], axis=1) / lengths - 1))),
     }
 
 
 def settle(n: int, repeats: int) -> dict:
     """OpenMM's SETTLE on n rigid waters."""
-    import openmm
-
     x, masses, (rows,) = water(n)
-    system = openmm.System()
-    for m in masses:
-        system.addParticle(float(m))
-    for i, j in rows.atoms:
-        system.addConstraint(int(i), int(j), float(np.linalg.norm(x[i] - x[j])) * 0.1)
+    i, j = rows.atoms.T
+    system = system_of(masses, pairs=rows.atoms, lengths=np.linalg.norm(x[i] - x[j], axis=1) * 0.1)
     return openmm_constraints(x, masses, system, 1e-12, repeats)
 
 
@@ -434,7 +414,6 @@ def first_call() -> dict:
 
 
 def run(full: bool, console: Console) -> dict:
-    have_openmm = _have_openmm()
     result: dict[str, Any] = {"machine": compare.environment(), "full": full, "engine": [], "peers": {}}
 
     def add(*args: Any, **kwargs: Any) -> None:
@@ -446,10 +425,9 @@ def run(full: bool, console: Console) -> dict:
 
     for n in (1_000, 10_000, 100_000) if full else (1_000,):
         add(f"rigid water, {n} molecules", *water(n))
+    n = 10_000 if full else 1_000
     for hydrogens, label in ((1, "X-H"), (2, "CH2"), (3, "CH3")):
-        add(
-            f"{label}, 10000 groups" if full else f"{label}, 1000 groups", *groups(10_000 if full else 1_000, hydrogens)
-        )
+        add(f"{label}, {n} groups", *groups(n, hydrogens))
     sizes = (1_000, 10_000, 100_000, 1_000_000) if full else (1_000,)
     for kind in ("zigzag", "straight", "175 degrees", "freely jointed"):
         for n in sizes:
@@ -457,7 +435,7 @@ def run(full: bool, console: Console) -> dict:
     for n in sizes:
         add(f"chain by the generic path, zigzag, {n} bonds", *chain(n, "zigzag"), path="generic")
         add(f"tree (polymethylene), {n} bonds", *tree(n // 3))
-    if have_openmm:
+    if find_spec("openmm") is not None:
         for held in ("all bonds", "bonds and H angles", "mixed"):
             x, masses, constraints, system = protein(held)
             add(f"DHFR, {held}", x, masses, constraints)
@@ -477,14 +455,6 @@ def run(full: bool, console: Console) -> dict:
     return result
 
 
-def _have_openmm() -> bool:
-    try:
-        import openmm  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 def exponent(rows: list[dict], start: str) -> float:
     """Fitted exponent of P + V against the number of rows."""
     points = [(r["rows"], r["rows"] * (r["p_ns"] + r["v_ns"])) for r in rows if r["name"].startswith(start)]
@@ -493,9 +463,8 @@ def exponent(rows: list[dict], start: str) -> float:
 
 
 def show(result: dict, console: Console) -> None:
-    table = Table(title="Engine: time and error")
-    for heading in ("system", "solver", "rows", "P", "V", "P + V", "bare", "P + V", "σ/tol", "|Av|/v", "set-up"):
-        table.add_column(heading, justify="left" if heading in ("system", "solver") else "right")
+    headings = ("system", "solver", "rows", "P", "V", "P + V", "bare", "P + V", "σ/tol", "|Av|/v", "set-up")
+    table = measuring.table("Engine: time and error", headings, {"system", "solver"})
     table.add_row("", "", "", "ns/row", "ns/row", "ns/row", "ns/atom", "× bare", "", "", "s", end_section=True)
     for r in result["engine"]:
         table.add_row(
@@ -510,10 +479,9 @@ def show(result: dict, console: Console) -> None:
     for name, peer in result["peers"].items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in peer.items()))
     for name, times in result["ase_step"].items():
-        ratio = times["kcons"] / times["free"]
         console.print(
             f"ASE VelocityVerlet, {name}: free {times['free'] * 1e6:.0f} µs, kcons {times['kcons'] * 1e6:.0f} µs, "
-            f"ratio {ratio:.2f}"
+            f"ratio {times['kcons'] / times['free']:.2f}"
         )
     console.print(f"one bond among {result['one_bond']['atoms']:,} atoms: {result['one_bond']['p_plus_v_us']:.1f} µs")
     if result["full"]:
@@ -523,19 +491,9 @@ def show(result: dict, console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="all sizes and the slow peers")
-    parser.add_argument("--out", type=Path, help="JSON file for the results")
-    parser.add_argument("--show", type=Path, help="print the table of an earlier result and stop")
-    options = parser.parse_args()
     console = Console(width=150)
-    if options.show:
-        show(json.loads(options.show.read_text()), console)
-        return
-    result = run(options.full, console)
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
-    show(result, console)
+    parser = measuring.options(__doc__, full="all sizes and the slow peers")
+    measuring.script(parser, lambda options: run(options.full, console), lambda result: show(result, console))
 
 
 if __name__ == "__main__":
