@@ -172,3 +172,15 @@ def loose_alanine():
 def holding(**arguments):
     """A part that holds z of the atom that no constraint of `loose_alanine` touches."""
     return HeldCoordinates([0], 2, float(alanine()[1][0, 2]), 22, **arguments)
+
+
+def volumes_under_pressure(system, integrator, context):
+    """Volumes (nm^3) met in 80 steps under the barostat of the System, always on its constraints."""
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    volumes = set()
+    for _ in range(20):
+        integrator.step(4)
+        volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
+        assert residuals(system, context)[0] < 1e-7
+    return volumes
