@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "docs" / "results" / "openmm_compare.json"
+from committed_pages import FOLDER, page, printed
+
+RESULTS = FOLDER / "openmm_compare.json"
 
 
 def test_page_shows_the_committed_results():
-    result = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "11_openmm_compare.py"), "--summary", str(RESULTS)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert result.stdout.strip("\n") in (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    assert printed("11_openmm_compare.py", "openmm_compare.json", "--summary") in page("compare.md")
 
 
 def test_results_are_those_of_a_full_run():
