@@ -214,13 +214,4 @@ class LeanStepWriter(StepWriter):
         if self.single:
             self.parts[0].land_alone(p, u, h)  # type: ignore[attr-defined]
             return
-        p.each("x", f"x+{h}*{u}", "move freely (drift)")
-        p.each("xu", "x", "where that leads")
-        for part in self.parts:
-            if not part.meets_system:
-                part.land(p, h)
-        together = [part for part in self.parts if part.meets_system]
-        if together:
-            together[0].land(p, h)
-        else:
-            p.hold_positions("back onto the constraints of the System")
+        self._land(u, h)

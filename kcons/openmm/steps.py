@@ -209,7 +209,16 @@ class StepWriter:
         p = self.program
         for part in self.parts:
             part.remember(p)
-        p.each("x", f"x+{h}*v", "move freely (drift)")
+        self._land("v", h)
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _land(self, u: str, h: str) -> None:
+        """Fly freely for h with velocities u, and go from there back onto all constraints."""
+        p = self.program
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
         p.each("xu", "x", "where that leads")
         for part in self.parts:
             if not part.meets_system:
@@ -219,10 +228,6 @@ class StepWriter:
             together[0].land(p, h)
         else:
             p.hold_positions("back onto the constraints of the System")
-        if self.scheme is None:
-            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
-            return "impulse"
-        return f"(x-xu)/{h}"
 
     def _project(self) -> None:
         p = self.program
