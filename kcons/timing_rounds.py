@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 
@@ -21,6 +22,8 @@ from kcons.scenes import Scene
 
 #: Steps before the clock starts, of runs short enough.
 WARM_STEPS = 4
+#: Where they take little time, so many steps are made at a stretch, though the horizon is nearer: a run is longer.
+BLOCK_STEPS = 100
 #: What holds nothing goes back to the start after so many steps: it would fly apart.
 FLOOR_BLOCK = 4
 
@@ -171,16 +174,24 @@ def interleaved(
 
 
 def marched(run: Run, m: Measurement, holds: bool, pass_seconds: float) -> float:
-    """Seconds a step of a run that was just started: the median over passes of its planned steps.
+    """Seconds a step of a run that was just started: the median over passes of its planned steps, or more.
 
     Raises
     ------
     KconsError
         It ran to where nothing is finite.
     """
-    block = m.steps if holds else min(m.steps, FLOOR_BLOCK)
     run.constraints.release()
-    run.march(min(block, WARM_STEPS) if WARM_STEPS * float(m.step_seconds or 0.0) < pass_seconds else 1)
+    step_seconds = float(m.step_seconds or 0.0)
+    block = m.steps if holds else min(m.steps, FLOOR_BLOCK)
+    if holds and block < BLOCK_STEPS and block * step_seconds < pass_seconds:
+        longer = min(BLOCK_STEPS, int(pass_seconds / max(step_seconds, 1e-9)))
+        with suppress(Exception):  # beyond the horizon anything may happen
+            run.march(longer)
+            if np.isfinite(run.positions).all():
+                block = max(block, longer)
+        run.rewind()
+    run.march(min(block, WARM_STEPS) if WARM_STEPS * step_seconds < pass_seconds else 1)
     found: list[float] = []
     while sum(found) < pass_seconds:
         run.rewind()

@@ -13,7 +13,7 @@ from kcons.errors import ConvergenceError
 from kcons.peers import lammps_shake, shake
 from kcons.results import Measurement
 from kcons.runs import Run, Stopwatch
-from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
+from kcons.timing_rounds import BLOCK_STEPS, FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
 SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
@@ -176,16 +176,42 @@ def measurement(**more):
 
 @pytest.mark.parametrize(
     ("step_seconds", "holds", "warm", "block"),
-    [(1e-6, True, WARM_STEPS, 12), (1.0, True, 1, 12), (1e-6, False, WARM_STEPS, FLOOR_BLOCK)],
+    [(1e-6, True, WARM_STEPS, 120), (1.0, True, 1, 120), (1e-6, False, WARM_STEPS, FLOOR_BLOCK)],
 )
 def test_warm_first_and_every_pass_from_the_start(step_seconds, holds, warm, block):
     run = Noted()
-    found = marched(run, measurement(steps=12, step_seconds=step_seconds), holds, 1e-4)
+    found = marched(run, measurement(steps=120, step_seconds=step_seconds), holds, 1e-4)
     first, *passes = run.asked
     assert first == warm
     assert passes == ["back", block] * (len(passes) // 2)
     assert len(passes) > 2  # a pass takes nothing here: they go on until enough is timed
     assert 0 < found < 1e-4 / block
+
+
+@pytest.mark.parametrize(("limit", "end", "block"), [(1000, 1.0, BLOCK_STEPS), (90, 1.0, 12), (1000, np.inf, 12)])
+def test_few_short_steps_go_on_beyond_the_horizon_where_they_can(limit, end, block):
+    class Limited(Noted):
+        def march(self, steps):
+            super().march(steps)
+            self.far = steps > 12
+            if steps > limit:
+                raise ArithmeticError("too far")
+
+        @property
+        def positions(self):
+            return np.full((1, 3), end if self.far else 1.0)
+
+    run = Limited()
+    marched(run, measurement(steps=12, step_seconds=1e-6), True, 1e-3)
+    tried, back, warm, *passes = run.asked
+    assert (tried, back, warm) == (BLOCK_STEPS, "back", WARM_STEPS)
+    assert passes == ["back", block] * (len(passes) // 2) and passes
+
+
+def test_few_long_steps_end_at_the_horizon():
+    run = Noted()
+    marched(run, measurement(steps=12, step_seconds=1e-4), True, 1e-3)
+    assert set(run.asked) == {WARM_STEPS, 12, "back"}
 
 
 def test_running_away_is_an_error():
