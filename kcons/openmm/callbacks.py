@@ -70,18 +70,22 @@ class Engine:
         self._nothing = np.zeros(local)
         #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
         self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        self._moved = np.zeros((n, 3))
         #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
         self._x, self._read = np.zeros(local), np.zeros(local)
         rows = self.motion.constraint_set.n_rows
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
         #: Whether the time of a drift matters.
         self.timed = self.motion.constraint_set.moving
+        resting = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
+        fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
+        #: Which of the carried particles do not move.
+        self._fixed = np.searchsorted(self.atoms, fixed)
         self._flight: NonholonomicFlight | None = None
         if not self.motion.constraint_set.holonomic.all():
             with np.errstate(divide="ignore"):
                 weights = (1 / masses)[:, None]
-            fixed = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
-            weights[np.concatenate([*fixed, np.zeros(0, np.int64)])] = 0.0
+            weights[fixed] = 0.0
             self._flight = NonholonomicFlight(self.motion, weights)
             self._weights = np.repeat(weights, 3, axis=1)
             self.timed = True
@@ -153,16 +157,23 @@ class Engine:
         then, now, h = self._times(self._stage)
         if self._flight is None:
             impulse = self._impulse if len(self._fractions) == 1 else None
+            # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+            moved = self._moved
+            moved.fill(0.0)
             self.motion.project_positions(
-                there, self._start, time=now, reference_time=then, out=there, multipliers=impulse
-            )
+                there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, out=there,
+                multipliers=impulse,
+            )  # fmt: skip
+            change = moved.copy() if self.whole else moved[self.atoms]
+            fixed = self._fixed
+            change[fixed] = there[self.atoms[fixed]] - read[fixed]
         else:
             point = Point(self._start.copy(), (there - self._start) / h, self._weights, exact=False)
             self._flight.move(point, there, then, now, h)
+            change = (there if self.whole else there[self.atoms]) - read
         # What the velocity stage before found belongs to the same positions as this impulse.
         self._push, self._push_before = self._push_before, self._push
         self._push.fill(0.0)
-        change = (there if self.whole else there[self.atoms]) - read
         np.add(read, change, out=self._x)
         change *= CARRY_SCALE
         self._landing = (read.copy(), change)
