@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,9 +18,10 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
+from kcons.mdanalysis.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.dcd import PlainDcd, plain_dcd
 from kcons.mdanalysis.findings import BOLTZMANN, Part, by_unit, joined, rms_of, row_result, temperature_of, verdict_of
-from kcons.mdanalysis.loading import READ_ERRORS, intact_frames, last_offset, leftover, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, intact_frames, last_offset, leftover, quiet
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.precision import FilePrecision, precision_of
 from kcons.mdanalysis.rank import rank_of
@@ -137,7 +139,7 @@ class ConstraintCheck(AnalysisBase):
         self._removed, self._wants_rank, self._n_worst = removed, rank, int(worst)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
-        self._format = _format(reader)
+        self._format = format_of(reader)
         self._names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         if self._path and Path(self._path).is_file():
             self._precision = precision_of(self._path, self._format, precision)
@@ -267,13 +269,16 @@ class ConstraintCheck(AnalysisBase):
         lengths = ~is_length & (np.concatenate([np.full(c.n_rows, c.period is None) for c in held.constraints]))
         angles = np.concatenate([np.full(c.n_rows, c.family == "Angle") for c in held.constraints])
         self._scale = np.where(lengths & ~angles, held.scale, self._scale)
+        shot = frame_of(ts, plain_dcd(self._trajectory) is not None)
+        first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, self._grid, self._wants_rank))
         self._rank: int | None = None
         if self._wants_rank:
             try:
-                self._rank = rank_of(held, x)
+                self._rank = first_use(lambda: rank_of(held, x))
             except KconsError as error:
                 self._remarks.append(f"no rank: {error}")
-        self._table = RowTable(held, self._grid)
+        table = self._table = RowTable(held, self._grid)
+        first_use(lambda: look_once(table, shot))
 
     def _hold_means(self) -> None:
         """Take the means that the first pass found as targets."""
@@ -493,8 +498,3 @@ class ConstraintCheck(AnalysisBase):
 
 def _flat(values: Any) -> NDArray[np.float32]:
     return np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
-
-
-def _format(reader: Any) -> str:
-    name = getattr(reader, "format", "")
-    return str(name if isinstance(name, str) else name[0]).upper()

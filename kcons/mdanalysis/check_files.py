@@ -10,7 +10,8 @@ import numpy as np
 
 from kcons.errors import InputError
 from kcons.mdanalysis.check import ConstraintCheck
-from kcons.mdanalysis.loading import load_trajectory, open_universe, quiet
+from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
+from kcons.mdanalysis.memory import give_back
 from kcons.mdanalysis.precision import precision_of
 from kcons.mdanalysis.result import CheckResult
 from kcons.mdanalysis.targets import TargetFile
@@ -78,9 +79,8 @@ def check_trajectory(
             )
         with quiet():
             reader = universe.trajectory
-            file_format = reader.format if isinstance(reader.format, str) else reader.format[0]
             largest = float(np.abs(universe.atoms.positions).max(initial=0.0))
-            options["target_error"] = precision_of(topology, file_format).half_step(largest)
+            options["target_error"] = precision_of(topology, format_of(reader)).half_step(largest)
         constraints = constraints_of(universe, constrain, **held)
         load_trajectory(universe, trajectory, topology)
         given, text = "given", f"coordinates of {topology}"
@@ -93,10 +93,15 @@ def check_trajectory(
         check.target_text = text
     # Sets are made anew at the first frame; this one need not stay in memory.
     del constraints
+    give_back()
     parallel: dict[str, Any] = {"backend": backend, "n_workers": workers} if workers > 1 else {}
     with quiet():
         check.run(**chosen, **parallel)
-    return check.check
+    result = check.check
+    # A report is drawn next, with libraries of its own.
+    del check, universe
+    give_back()
+    return result
 
 
 def _slice(frames: str | None) -> dict[str, int | None]:

@@ -116,6 +116,12 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
     )
 
 
+def format_of(reader: Any) -> str:
+    """What MDAnalysis calls the format of a reader; '' of none."""
+    name = getattr(reader, "format", "")
+    return str(name if isinstance(name, str) else name[0]).upper()
+
+
 def _look_at(path: Path, what: str) -> None:
     if not path.is_file():
         raise InputError(f"there is no file {path} (the {what})", item=what)
