@@ -2,6 +2,7 @@
 
     python examples/21_check_speed.py                 # small, seconds
     python examples/21_check_speed.py --full --out docs/results/trajectory_check.json     # 1 GB files
+    python examples/21_check_speed.py --full --cold --out docs/results/trajectory_check.json    # memory, into the same
 
 The files are made in a temporary folder and deleted: rigid water that tumbles and wanders through a periodic cell.
 """
@@ -26,6 +27,7 @@ with warnings.catch_warnings():
 
 from kcons import __version__
 from kcons.constraints import Distance
+from kcons.machine import environment
 from kcons.mdanalysis import ConstraintCheck
 
 OXYGEN_HYDROGEN, ANGLE = 0.9572, np.radians(104.52)
@@ -84,11 +86,61 @@ def reading(path: str, atoms: int) -> dict[str, float]:
     return dict(json.loads(done.stdout))
 
 
-def checking(path: str, molecules: int, workers: int) -> dict[str, float]:
-    """The check, in a process of its own."""
+def checking(path: str, molecules: int, workers: int, cache: str | None = None) -> dict[str, float]:
+    """The check, in a process of its own; with a folder of its own for compiled kernels where one is given."""
     command = [sys.executable, __file__, "--check", path, str(molecules), str(workers)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    variables = os.environ | ({} if cache is None else {"NUMBA_CACHE_DIR": cache})
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=variables)
     return dict(json.loads(done.stdout))
+
+
+def commanding(path: str, topology: str, workers: int, cache: str, folder: str) -> float:
+    """Memory of `kcons check` in MB: of the largest of its processes."""
+    words = ["check", path, "--topology", topology, "--workers", str(workers), "--out", folder]
+    command = [sys.executable, "-c", "import sys; from kcons.cli import main; sys.exit(main())", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"NUMBA_CACHE_DIR": cache})
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"kcons check {path} ended with {process.returncode}")
+    return used.ru_maxrss / 1024
+
+
+def first_checks(path: str, molecules: int, frames: int) -> list[dict[str, object]]:
+    """Memory of a check on a machine where nothing is compiled yet, with one worker and with two."""
+    folder = Path(path).parent
+    named = mda.Universe.empty(
+        3 * molecules, n_residues=molecules, atom_resindex=np.repeat(np.arange(molecules), 3), trajectory=False
+    )
+    named.add_TopologyAttr("names", ["OW", "HW1", "HW2"] * molecules)
+    named.add_TopologyAttr("resnames", ["SOL"] * molecules)
+    named.add_TopologyAttr("resids", np.arange(1, molecules + 1))
+    named.load_new(path)
+    topology = str(folder / "water.gro")
+    named.atoms.write(topology)
+    found: list[dict[str, object]] = []
+    for workers in (1, 2):
+        with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
+            measured = checking(path, molecules, workers, one)
+            found.append(
+                {
+                    "format": Path(path).suffix[1:],
+                    "atoms": 3 * molecules,
+                    "frames": frames,
+                    "bytes": os.path.getsize(path),
+                    "workers": workers,
+                    "peak": measured["peak"],
+                    "peak_of_others": measured["peak_worker"],
+                    "peak_of_command": commanding(path, topology, workers, other, str(folder / "report")),
+                }
+            )
+        print(
+            f"{found[-1]['format']}, {3 * molecules} atoms, workers: {workers}, nothing compiled: peak "
+            f"{measured['peak']:.0f} MB, other processes up to {measured['peak_worker']:.0f} MB, "
+            f"kcons check {found[-1]['peak_of_command']:.0f} MB",
+            flush=True,
+        )
+    return found
 
 
 def check(path: str, molecules: int, workers: int) -> None:
@@ -125,6 +177,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", action="store_true", help="files of 1 GB")
     parser.add_argument("--size", type=float, default=1.0, help="with --full: size of the files in GB")
+    parser.add_argument("--cold", action="store_true", help="only the memory of a first check, nothing compiled yet")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--check", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
@@ -134,7 +187,17 @@ def main() -> None:
         return
     size, repeats = (1e9 * chosen.size, 3) if chosen.full else (2e6, 1)
     cases = (("dcd", 33_000), ("xtc", 33_000), ("dcd", 3_000)) if chosen.full else (("xtc", 1_000),)
-    results = []
+    results: list[dict[str, object]] = []
+    if chosen.cold:
+        for ending, molecules in cases:
+            with tempfile.TemporaryDirectory() as place:
+                path = str(Path(place) / f"water.{ending}")
+                results += first_checks(path, molecules, make(path, molecules, size))
+        if chosen.out:
+            data = json.loads(chosen.out.read_text()) if chosen.out.exists() else {}
+            data["cold"] = {"environment": environment() | {"mdanalysis": mda.__version__}, "cases": results}
+            chosen.out.write_text(json.dumps(data, indent=1) + "\n")
+        return
     for ending, molecules in cases:
         with tempfile.TemporaryDirectory() as folder:
             path = str(Path(folder) / f"water.{ending}")
@@ -174,6 +237,9 @@ def main() -> None:
         machine |= {"machine": platform.machine(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
         chosen.out.parent.mkdir(parents=True, exist_ok=True)
         data = {"date": date.today().isoformat(), "environment": machine, "cases": results}
+        if chosen.out.exists():
+            # Memory of first checks is measured by itself.
+            data |= {key: value for key, value in json.loads(chosen.out.read_text()).items() if key == "cold"}
         chosen.out.write_text(json.dumps(data, indent=1) + "\n")
         print(f"wrote {chosen.out}")
 

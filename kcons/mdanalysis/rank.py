@@ -10,7 +10,7 @@ from kcons.constraints.target import FloatArray
 from kcons.motion import Motion
 
 #: Rows of one piece; a larger cluster is a piece of its own.
-PIECE = 20_000
+PIECE = 6_000
 
 
 def rank_of(constraint_set: ConstraintSet, positions: FloatArray) -> int:

@@ -1,0 +1,128 @@
+"""Kernels that are in no cache are compiled by another process, on a sample that takes the same ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+import water_files as files
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Angle, Distance
+from kcons.mdanalysis import compiling
+from kcons.mdanalysis.compiling import Frame, compiled_elsewhere, sample_of
+
+N = 40
+#: A check in a process of its own: kernels of kcons that it compiled itself, and other processes that it started.
+CHECK = """
+import json, subprocess, sys
+from numba.core import event
+from kcons.mdanalysis import check_trajectory
+
+class Compiled(event.Listener):
+    def on_start(self, event):
+        pass
+    def on_end(self, event):
+        kernel = event.data["dispatcher"]
+        if kernel.py_func.__module__.startswith("kcons.") and event.data["args"] in kernel.overloads:
+            compiled.append(kernel.py_func.__qualname__)
+
+compiled, started, run = [], [], subprocess.run
+subprocess.run = lambda *words, **options: started.append(words) or run(*words, **options)
+event.register("numba:compile", Compiled())
+result = check_trajectory(*sys.argv[1:])
+print(json.dumps([compiled, len(started), result.rank, result.series["largest Å"]]))
+"""
+
+
+def checked(cache, *words):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-W", "ignore", "-c", CHECK, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_process_that_checks_compiles_nothing(tmp_path):
+    x = files.water(N, 3)
+    topology = files.topology(tmp_path / "w.gro", N, x[0])
+    blocks = files.write(tmp_path / "w.dcd", x)
+    moving = files.write(tmp_path / "w.trr", x, velocities=np.ones_like(x))
+    compiled, started, rank, largest = checked(tmp_path, blocks, topology)
+    assert (compiled, started, rank) == ([], 1, 3 * N)
+    # Frames one by one, with velocities: other kernels, of which some are there.
+    compiled, started, rank, others = checked(tmp_path, moving, topology)
+    assert (compiled, started, rank) == ([], 1, 3 * N)
+    np.testing.assert_allclose(largest, others, atol=1e-5)
+    # Nothing is cold any more.
+    again = checked(tmp_path, blocks, topology)
+    assert again == [[], 0, 3 * N, largest]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("constrain", ["allbonds", "hangles"])
+def test_nor_where_clusters_are_large(tmp_path, constrain):
+    data = pytest.importorskip("MDAnalysisTests.datafiles")
+    compiled, started, rank, _ = checked(tmp_path, data.DCD, data.PSF, constrain)
+    assert (compiled, started) == ([], 1)
+    assert rank > 3000
+
+
+def frame(x):
+    return Frame(np.asarray(x, dtype=np.float32).ravel(), None, None, 0.0, False)
+
+
+def test_a_sample_has_a_few_clusters_of_each_kind():
+    n = 500
+    x = np.random.default_rng(3).normal(size=(3 * n + 2 * n + 3 * n, 3)) * 20
+    pairs, end = files.pairs(n), 3 * n
+    bonds = end + np.arange(2 * n).reshape(-1, 2)
+    bends = 5 * n + np.arange(3 * n).reshape(-1, 3)
+    held = ConstraintSet([Distance(pairs), Distance(bonds), Angle(bends)], x, np.ones(len(x)))
+    sample = sample_of(held, frame(x), 0.01, True)
+    few = compiling.OF_A_KIND
+    part = sample.constraint_set
+    assert [(item.family, item.n_rows) for item in part.constraints] == [
+        ("Distance", 3 * few),
+        ("Distance", few),
+        ("Angle", few),
+    ]
+    assert part.n_atoms == 8 * few == len(sample.frame.x) / 3
+    np.testing.assert_allclose(part.value(sample.frame.x.reshape(-1, 3).astype(float)), 0.0, atol=1e-4)
+    assert (sample.grid, sample.rank) == (0.01, True)
+    sample.use()
+
+
+def kernel(module):
+    def double(x):
+        return 2 * x
+
+    double.__module__ = module
+    return numba.njit(double)
+
+
+def test_only_what_is_ours_and_cold_is_compiled_elsewhere(monkeypatch):
+    used = []
+    monkeypatch.setattr(compiling, "_use_elsewhere", used.append)
+    ours, other = kernel("kcons.some"), kernel("some")
+    assert compiled_elsewhere(lambda: "sample", lambda: ours(2)) == 4
+    assert used == ["sample"]
+    assert compiled_elsewhere(lambda: "sample", lambda: ours(3)) == 6
+    assert compiled_elsewhere(lambda: "sample", lambda: other(3)) == 6
+    assert used == ["sample"]
+
+
+@pytest.mark.parametrize("how", ["fails", "cannot be sent", "cannot be started"])
+def test_without_another_process_this_one_compiles(monkeypatch, how):
+    monkeypatch.setattr(compiling, "COMMAND", "raise SystemExit(3)")
+    if how == "cannot be started":
+        monkeypatch.setattr(sys, "executable", "/no/such/python")
+    sample = (lambda: None) if how == "cannot be sent" else "sample"
+    assert compiling._use_elsewhere(sample) is False
+    ours = kernel("kcons.some")
+    assert compiled_elsewhere(lambda: sample, lambda: ours(2)) == 4
