@@ -269,7 +269,7 @@ class ConstraintCheck(AnalysisBase):
         lengths = ~is_length & (np.concatenate([np.full(c.n_rows, c.period is None) for c in held.constraints]))
         angles = np.concatenate([np.full(c.n_rows, c.family == "Angle") for c in held.constraints])
         self._scale = np.where(lengths & ~angles, held.scale, self._scale)
-        shot = frame_of(ts, plain_dcd(self._trajectory) is not None)
+        shot = frame_of(ts, time, plain_dcd(self._trajectory) is not None)
         first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, self._grid, self._wants_rank))
         self._rank: int | None = None
         if self._wants_rank:

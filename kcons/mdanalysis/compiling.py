@@ -67,11 +67,11 @@ class Frame:
         return Frame(x, None if self.v is None else np.zeros_like(x), self.dimensions, self.time, self.in_blocks)
 
 
-def frame_of(ts: Any, in_blocks: bool) -> Frame:
+def frame_of(ts: Any, time: float, in_blocks: bool) -> Frame:
     """The frame that a reader has just read."""
     x = np.array(ts.positions, dtype=np.float32).ravel()
     v = np.array(ts.velocities, dtype=np.float32).ravel() if ts.has_velocities else None
-    return Frame(x, v, ts.dimensions, float(ts.time), in_blocks)
+    return Frame(x, v, ts.dimensions, time, in_blocks)
 
 
 def look_once(table: RowTable, frame: Frame) -> None:
