@@ -18,7 +18,18 @@ from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion import Motion
-from kcons.openmm.callbacks import CARRY_SCALE, LIVE, PHASES, PREFIX, SPEED_SCALE, Callback, Engine, cell_of, force_name
+from kcons.openmm.callbacks import (
+    CARRY_SCALE,
+    LIVE,
+    LOW_SCALE,
+    PHASES,
+    PREFIX,
+    SPEED_SCALE,
+    Callback,
+    Engine,
+    cell_of,
+    force_name,
+)
 from kcons.openmm.program import Program
 from kcons.openmm.requirements import (
     free_groups,
@@ -218,14 +229,20 @@ class CarriedConstraints:
 
     def project(self, program: Program) -> None:
         change = f"f{self._groups['project']}"
+        # Thermostats stir more than rounding does.
+        rest = self._engine.carries_rest
         program.each("xu", "x", "to come back to")
         program.each("x", f"x+{1 / SPEED_SCALE!r}*v", "carries v, exactly as far as it can be told from x")
         self._guard(program, "project", "carried rows: solve for velocities")
-        program.each(
-            "v",
-            f"select({change}, (x-xu)*{SPEED_SCALE!r}+{1 / CARRY_SCALE!r}*{change}, v)",
-            "tangent to the carried rows",
-        )
+        carried = f"(x-xu)*{SPEED_SCALE!r}"
+        if rest:
+            program.vector("v_low", "what of v was too small to be carried together with x")
+            program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
+        program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
+        if rest:
+            program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
+            self._guard(program, "project", "carried rows: the same for the rest")
+            program.each("v", f"v+v_low+{1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)!r}*{change}", "tangent, all of it")
         program.each("x", "xu", "back")
 
     # -- in a context ---------------------------------------------------------------------------

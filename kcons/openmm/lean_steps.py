@@ -49,8 +49,6 @@ class LeanStepWriter(StepWriter):
         self.joined = self.ensemble.adds_up and not self.parts and isinstance(self.scheme, Rattle)
         self.lazy = self.lean or self.joined or (self.scheme is None and not self.parts)
         self.observed = 2 if self.lean else 1
-        #: One part whose rows are all there is.
-        self.single = len(self.parts) == 1 and getattr(self.parts[0], "alone", False)
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:
             self.program.number("between", "1 if nobody looks at the velocities after this step")

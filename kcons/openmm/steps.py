@@ -172,7 +172,12 @@ class StepWriter:
         p = self.program
         with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
             p.let("h", "dt*drift_share(stage)", "length of this drift")
-            p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
+            if self.single:
+                # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
+                self.parts[0].remember(p)
+                self.parts[0].land_alone(p, "v", "h")  # type: ignore[attr-defined]
+            else:
+                p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
             p.let("stage", "stage+1", "what follows")
             # Without the block set-up is faster, but forces are then computed after a failure as well.
             if all(self.kicks[1:]) and all(getattr(part, "stays_finite", False) for part in self.parts):
@@ -182,6 +187,11 @@ class StepWriter:
                     self._kick_after()
 
     # -- what both are made of ------------------------------------------------------------------
+
+    @property
+    def single(self) -> bool:
+        """Whether there is one part, whose rows are all there is."""
+        return len(self.parts) == 1 and getattr(self.parts[0], "alone", False)
 
     @property
     def _last_drift_apart(self) -> bool:
