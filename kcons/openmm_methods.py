@@ -399,7 +399,7 @@ def _of_kcons() -> list[OpenMMMethod]:
             scheme=scheme,
         )
         found.append(projected)
-    for tolerance in (1e-4, 1e-6, TIGHT):
+    for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
         exponent = f"{tolerance:.0e}".replace("e-0", "e-")
         name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{exponent}"
         found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {exponent}", tolerance=tolerance))
