@@ -160,7 +160,7 @@ def test_dumbbells_in_a_trap_by_the_general_estimator():
             held,
             state,
             0.02,
-            200_000,
+            1_000_000,
             stepper=thermostat,
             observers=[lambda s, seen=samples: seen.append(configurational_sample(held, s, rng))],
             every=10,
