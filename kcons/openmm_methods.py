@@ -90,7 +90,8 @@ class _HostRun(Run):
         self.steps = min(self._stride if self._done else 1, self._planned - self._done)
         begun = perf_counter()
         self._integrator.step(self.steps)
-        self._spent += perf_counter() - begun
+        if self._done:
+            self._spent += perf_counter() - begun
         self._done += self.steps
         self.time = self._done * self._dt
         if self.finished and hasattr(self._integrator, "check"):
@@ -127,12 +128,14 @@ class _HostRun(Run):
         return self._done * self._evaluations
 
     def own_step_seconds(self) -> float | None:
-        if not self.finished or self._spent > SHORT_STEP * self._planned:
+        # Without the first step.
+        timed = self._planned - 1
+        if not self.finished or not timed or self._spent > SHORT_STEP * timed:
             return None
         self._end = self._state()
         if not np.isfinite(self._end[0]).all():
             return None
-        size = int(np.clip(BLOCK_SECONDS * self._planned / self._spent, *BLOCK_STEPS))
+        size = int(np.clip(BLOCK_SECONDS * timed / self._spent, *BLOCK_STEPS))
         found = []
         try:
             for _ in range(BLOCKS):
