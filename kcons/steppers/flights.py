@@ -272,13 +272,9 @@ def one_flight(  # type: ignore[no-untyped-def]
     """
     weights = piece(tables, tables.view(np.int64), MORE)
     if what != FLY:
-        if not add_kick(v0, last_kick, force, weights):
-            return 1 if what == END else UNENDED
-        found = _ended(x, v0, tables, triangles, others, chains)
-        if what == END:
-            return found
-        if found != 0:
-            return UNENDED
+        found = _ended(add_kick(v0, last_kick, force, weights), x, v0, tables, triangles, others, chains)
+        if what == END or found != 0:
+            return found if what == END else UNENDED
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
     took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others, chains)
@@ -295,13 +291,9 @@ def many_flights(  # type: ignore[no-untyped-def]
     """
     weights = piece(tables, tables.view(np.int64), MORE)
     if what != FLY:
-        if not land(v0, work[1], last_kick, force, weights):
-            return 1 if what == END else UNENDED
-        found = _ended(x, v0, tables, triangles, others, chains)
-        if what == END:
-            return found
-        if found != 0:
-            return UNENDED
+        found = _ended(land(v0, work[1], last_kick, force, weights), x, v0, tables, triangles, others, chains)
+        if what == END or found != 0:
+            return found if what == END else UNENDED
         fresh = True
     n, took = fractions.size, -1
     for i in range(first, n):
@@ -321,8 +313,10 @@ def many_flights(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _ended(x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
-    """Velocities projected; 0, or what `Flights.ended` has to do."""
+def _ended(sound, x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
+    """Velocities projected after a kick, sound or not; 0, or what `Flights.ended` has to do."""
+    if not sound:
+        return 1
     if not all_finite(x):
         return 2
     return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains) else -1
