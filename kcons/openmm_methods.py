@@ -33,8 +33,10 @@ TEMPERATURE, COLLISIONS = 300.0, 1.0
 RECORDS = 12
 #: Steps that take less than this are timed in blocks: of so many seconds, and of so few and so many steps. A call of
 #: `step` has costs of its own, which those who make a million steps do not see.
-SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.01, 0.05, (100, 2000)
+SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.03, 0.05, (100, 2000)
 BLOCKS = 3
+#: Fewer steps a block where these would take longer.
+LONG_BLOCK, LONG_BLOCK_STEPS = 0.6, 30
 
 HALF_STEP = (
     "OpenMM's own integrators keep velocities half a step off the positions; |Av| is that of the velocities that "
@@ -135,7 +137,10 @@ class _HostRun(Run):
         self._end = self._state()
         if not np.isfinite(self._end[0]).all():
             return None
-        size = int(np.clip(BLOCK_SECONDS * timed / self._spent, *BLOCK_STEPS))
+        each = self._spent / timed
+        size = (
+            int(np.clip(BLOCK_SECONDS / each, *BLOCK_STEPS)) if BLOCK_STEPS[0] * each < LONG_BLOCK else LONG_BLOCK_STEPS
+        )
         found = []
         try:
             for _ in range(BLOCKS):
