@@ -40,12 +40,15 @@ class Rounds:
         Beyond the least, no more rounds of a measurement than fit into this, start and all.
     pass_seconds : float
         In a round, passes over the planned steps are made until so much is timed.
+    whole : bool
+        Whether methods that cannot `march` are run again, too. The run that was observed is one of the same kind.
     """
 
     least: int = 2
     most: int = 8
     seconds: float = 0.6
     pass_seconds: float = 0.01
+    whole: bool = True
 
 
 @dataclass
@@ -110,7 +113,9 @@ def timed(
     margin : float or None
         See `margin`.
     """
-    chosen = [k for k, m in enumerate(measurements) if _short(m, limit)]
+    chosen = [
+        k for k, m in enumerate(measurements) if _short(m, limit) and (rounds.whole or methods[m.method].marches)
+    ]
 
     def task(m: Measurement) -> Callable[[], float]:
         method, setting = methods[m.method], m.setting if m.adaptive else m.setting * scene.units.time_unit
@@ -136,7 +141,6 @@ def timed(
             found[k] = replace(m, note="; ".join(filter(None, (m.note, f"time as observed: {mine.failure}"))))
             continue
         if not methods[m.method].marches:
-            # The run that was observed is one of the same kind.
             mine.steps.insert(0, float(m.step_seconds or 0.0))
         step = float(np.median(mine.steps))
         each = float(m.seconds_per_time or 0.0) / float(m.step_seconds or 1.0)
