@@ -31,7 +31,7 @@ FORMAT = "kcons-report-1"
 QUICK_SECONDS = 280.0
 #: Rounds in which short runs are timed again, and those of a quick run.
 ROUNDS = Rounds()
-QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002, whole=False)
+QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002)
 
 
 @dataclass(frozen=True)

@@ -85,11 +85,14 @@ class Run(ABC):
         Wall time of the constraints.
     divided : bool
         Whether that time can be told from the rest of a step.
+    stretch : int
+        Of short steps, so many are timed at a stretch, though the horizon is nearer: a run is longer.
     """
 
     time: float = 0.0
     steps: int = 1
     divided: bool = True
+    stretch: int = 100
 
     def __init__(self) -> None:
         self.constraints = Stopwatch()
@@ -163,8 +166,8 @@ class Method(ABC):
     damps : bool
         Whether it can run scenes with friction.
     marches : bool
-        Of the class: whether its runs can `rewind`, and make one step an `advance`, so that steps can be timed with
-        nobody looking on. Otherwise whole runs are timed.
+        Of the class: whether its runs can `march` and `rewind`, so that steps can be timed with nobody looking on.
+        Otherwise whole runs are timed.
     """
 
     marches: ClassVar[bool] = False

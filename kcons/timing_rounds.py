@@ -22,8 +22,6 @@ from kcons.scenes import Scene
 
 #: Steps before the clock starts, of runs short enough.
 WARM_STEPS = 4
-#: Where they take little time, so many steps are made at a stretch, though the horizon is nearer: a run is longer.
-BLOCK_STEPS = 100
 #: What holds nothing goes back to the start after so many steps: it would fly apart.
 FLOOR_BLOCK = 4
 
@@ -40,15 +38,12 @@ class Rounds:
         Beyond the least, no more rounds of a measurement than fit into this, start and all.
     pass_seconds : float
         In a round, passes over the planned steps are made until so much is timed.
-    whole : bool
-        Whether methods that cannot `march` are run again, too. The run that was observed is one of the same kind.
     """
 
     least: int = 2
-    most: int = 8
+    most: int = 16
     seconds: float = 0.6
     pass_seconds: float = 0.01
-    whole: bool = True
 
 
 @dataclass
@@ -113,9 +108,7 @@ def timed(
     margin : float or None
         See `margin`.
     """
-    chosen = [
-        k for k, m in enumerate(measurements) if _short(m, limit) and (rounds.whole or methods[m.method].marches)
-    ]
+    chosen = [k for k, m in enumerate(measurements) if _short(m, limit)]
 
     def task(m: Measurement) -> Callable[[], float]:
         method, setting = methods[m.method], m.setting if m.adaptive else m.setting * scene.units.time_unit
@@ -141,6 +134,7 @@ def timed(
             found[k] = replace(m, note="; ".join(filter(None, (m.note, f"time as observed: {mine.failure}"))))
             continue
         if not methods[m.method].marches:
+            # The run that was observed is one of the same kind.
             mine.steps.insert(0, float(m.step_seconds or 0.0))
         step = float(np.median(mine.steps))
         each = float(m.seconds_per_time or 0.0) / float(m.step_seconds or 1.0)
@@ -188,8 +182,8 @@ def marched(run: Run, m: Measurement, holds: bool, pass_seconds: float) -> float
     run.constraints.release()
     step_seconds = float(m.step_seconds or 0.0)
     block = m.steps if holds else min(m.steps, FLOOR_BLOCK)
-    if holds and block < BLOCK_STEPS and block * step_seconds < pass_seconds:
-        longer = min(BLOCK_STEPS, int(pass_seconds / max(step_seconds, 1e-9)))
+    if holds and block < run.stretch and block * step_seconds < pass_seconds:
+        longer = min(run.stretch, int(pass_seconds / max(step_seconds, 1e-9)))
         with suppress(Exception):  # beyond the horizon anything may happen
             run.march(longer)
             if np.isfinite(run.positions).all():

@@ -13,7 +13,7 @@ from kcons.errors import ConvergenceError
 from kcons.peers import lammps_shake, shake
 from kcons.results import Measurement
 from kcons.runs import Run, Stopwatch
-from kcons.timing_rounds import BLOCK_STEPS, FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
+from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
 SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
@@ -87,8 +87,22 @@ def test_back_at_the_start_everything_is_as_it_was(chain, name):
 
 def test_what_cannot_go_back_does_not_march():
     for name, method in methods.METHODS.items():
-        adaptive = method.adaptive or isinstance(method, lammps_shake.LammpsShake) or method.host == "openmm"
-        assert method.marches is not adaptive, name
+        whole = method.adaptive or isinstance(method, lammps_shake.LammpsShake)
+        assert method.marches is not whole, name
+
+
+@pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
+@pytest.mark.parametrize("name", ["openmm-verlet", "openmm-rattle", "openmm-kcons-suzuki4", "openmm-held-rattle"])
+def test_openmm_goes_back_to_the_start_and_one_step_on(chain, name):
+    run = methods.METHODS[name].start(chain, min(chain.time_steps))
+    run.march(5)
+    positions, velocities = run.positions, run.velocities
+    assert run.time == pytest.approx(5 * min(chain.time_steps))
+    for _ in range(2):
+        run.rewind()
+        run.march(4)
+        np.testing.assert_allclose(run.positions, positions, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(run.velocities, velocities, rtol=0, atol=1e-11)
 
 
 def test_sweeps_that_do_not_converge_are_an_error_without_onlookers(chain, monkeypatch):
@@ -188,7 +202,7 @@ def test_warm_first_and_every_pass_from_the_start(step_seconds, holds, warm, blo
     assert 0 < found < 1e-4 / block
 
 
-@pytest.mark.parametrize(("limit", "end", "block"), [(1000, 1.0, BLOCK_STEPS), (90, 1.0, 12), (1000, np.inf, 12)])
+@pytest.mark.parametrize(("limit", "end", "block"), [(1000, 1.0, Run.stretch), (90, 1.0, 12), (1000, np.inf, 12)])
 def test_few_short_steps_go_on_beyond_the_horizon_where_they_can(limit, end, block):
     class Limited(Noted):
         def march(self, steps):
@@ -204,7 +218,7 @@ def test_few_short_steps_go_on_beyond_the_horizon_where_they_can(limit, end, blo
     run = Limited()
     marched(run, measurement(steps=12, step_seconds=1e-6), True, 1e-3)
     tried, back, warm, *passes = run.asked
-    assert (tried, back, warm) == (BLOCK_STEPS, "back", WARM_STEPS)
+    assert (tried, back, warm) == (Run.stretch, "back", WARM_STEPS)
     assert passes == ["back", block] * (len(passes) // 2) and passes
 
 
@@ -357,7 +371,7 @@ def test_quick_rounds_are_fewer_and_shorter():
 
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
-def test_openmm_times_itself_in_every_round():
+def test_openmm_is_timed_in_rounds():
     scene = scenes.build("chain", 4)
     scene = replace(scene, time_steps=scene.time_steps[:1])
     found = compare.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
