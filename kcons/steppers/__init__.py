@@ -5,6 +5,7 @@ has happened: the state that was passed in is still the last good one.
 """
 
 from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
+from kcons.steppers.extrapolation import Extrapolation
 from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
 from kcons.steppers.rattle import Rattle
@@ -19,6 +20,7 @@ __all__ = [
     "BlanesMoan6",
     "BlanesMoan6a",
     "Composition",
+    "Extrapolation",
     "Geodesic",
     "KahanLi6",
     "Observer",
