@@ -54,9 +54,8 @@ class Item:
         The finest step times this decides about the work of a converged reference.
     every_stepper : bool
         Whether all steppers of kcons run in a full run, or the usual ones.
-    without : sequence of str
-        Beginnings of names of methods that are left out, for `why`.
-    why : str
+    without : mapping of str to str
+        Beginnings of names of methods that are left out, and why.
     needs : str
         A package without which it cannot run.
     budget : float
@@ -79,8 +78,7 @@ class Item:
     steps: Sequence[float] | None = None
     pace: float | None = None
     every_stepper: bool = False
-    without: Sequence[str] = ()
-    why: str = ""
+    without: Mapping[str, str] = field(default_factory=dict)
     needs: str = ""
     budget: float = 15.0
     seconds: float = 30.0
@@ -94,8 +92,15 @@ def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any
     return Item(key, f"{text}, {title}", structure, options={"constrain": constrain}, needs="openmm", **more)
 
 
-TOO_LARGE = "too large for it: its own Python loops over bonds, or its set-up, would take hours"
-LEAVE_OUT = ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853")
+#: Steps of its own size are for few atoms and smooth forces.
+FEW = {"extrapolation": "meant for few atoms; smaller systems show it"}
+TOO_LONG = {"ase-internals": "a step takes longer than the whole budget; smaller systems show it"}
+TOO_LARGE = FEW | dict.fromkeys(
+    ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853"),
+    "too large for it: its own Python loops over bonds, or its set-up, would take hours",
+)
+SAVE_TIME = "left out to save time; smaller systems show it"
+CCMA = "CCMA takes a minute to set up for these constraints, each time, and loops in Python longer for a step"
 
 #: All parts, in the order in which they are run and shown.
 PLAN: tuple[Item, ...] = (
@@ -114,14 +119,23 @@ PLAN: tuple[Item, ...] = (
     Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=100, quick_seconds=6),
     Item("fekete", "Fekete points on a sphere", "fekete", every_stepper=True, seconds=20),
     Item("ethanol", "Ethanol, GFN2-xTB", "ethanol", needs="tblite", seconds=60, quick_seconds=20, budget=20),
-    Item("water-216", "Water, 216 molecules", "water", 216, seconds=300, quick_seconds=16, quick_size=8, budget=20),
+    Item(
+        "water-216",
+        "Water, 216 molecules",
+        "water",
+        216,
+        without=FEW,
+        seconds=300,
+        quick_seconds=16,
+        quick_size=8,
+        budget=20,
+    ),
     Item(
         "water-900",
         "Water, 900 molecules",
         "water",
         900,
-        without=("ase-internals",),
-        why="a step takes longer than the whole budget; 216 molecules show it",
+        without=TOO_LONG | FEW,
         seconds=120,
         quick_seconds=0,
         budget=20,
@@ -133,21 +147,23 @@ PLAN: tuple[Item, ...] = (
         5000,
         steps=(4.0, 2.0, 1.0),
         pace=2.0,
-        without=("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6"),
-        why="left out to save time; 900 molecules show it",
+        without=FEW
+        | dict.fromkeys(
+            ("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6"),
+            SAVE_TIME,
+        ),
         seconds=200,
         quick_seconds=0,
         budget=15,
     ),
     Item("chain-1e2", "Chain of 10² bonds", "chain", 100, every_stepper=True, seconds=75, quick_seconds=14),
-    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, seconds=120, quick_seconds=14),
+    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, without=FEW, seconds=120, quick_seconds=14),
     Item(
         "chain-1e4",
         "Chain of 10⁴ bonds",
         "chain",
         10_000,
-        without=("ase-internals",),
-        why="a step takes longer than the whole budget; 10³ bonds show it",
+        without=TOO_LONG | FEW,
         seconds=300,
         quick_seconds=0,
         budget=10,
@@ -159,8 +175,7 @@ PLAN: tuple[Item, ...] = (
         100_000,
         steps=(10.0, 5.0, 2.5),
         pace=2.0,
-        without=LEAVE_OUT,
-        why=TOO_LARGE,
+        without=TOO_LARGE,
         seconds=60,
         quick_seconds=0,
         budget=10,
@@ -172,8 +187,7 @@ PLAN: tuple[Item, ...] = (
         1_000_000,
         steps=(10.0, 5.0, 2.5),
         pace=2.0,
-        without=(*LEAVE_OUT, "openmm", "kahan-li6"),
-        why=TOO_LARGE,
+        without=TOO_LARGE | dict.fromkeys(("openmm", "kahan-li6"), SAVE_TIME),
         seconds=180,
         quick_seconds=0,
         budget=20,
@@ -183,7 +197,7 @@ PLAN: tuple[Item, ...] = (
         for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"), ("hangles", "HAngles"))
     ),
     *(
-        _molecule("dhfr", "DHFR", constrain, title, seconds=350, quick_seconds=0, budget=15)
+        _molecule("dhfr", "DHFR", constrain, title, without=FEW, seconds=350, quick_seconds=0, budget=15)
         for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"))
     ),
     _molecule(
@@ -192,16 +206,19 @@ PLAN: tuple[Item, ...] = (
         "hangles",
         "HAngles",
         steps=(2.0, 1.0),
-        without=(
-            "ase-bonds",
-            "ase-internals",
-            "openmm-verlet-",
-            "openmm-middle",
-            "openmm-nose",
-            "openmm-kcons-",
-            "openmm-rattle",
+        without=FEW
+        | dict.fromkeys(
+            (
+                "ase-bonds",
+                "ase-internals",
+                "openmm-verlet-",
+                "openmm-middle",
+                "openmm-nose",
+                "openmm-kcons-",
+                "openmm-rattle",
+            ),
+            CCMA,
         ),
-        why="CCMA takes a minute to set up for these constraints, each time, and loops in Python longer for a step",
         seconds=200,
         quick_seconds=0,
         budget=75,
@@ -374,8 +391,9 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
         rounds=rounds,
         settings={"part": item.key, "quick": quick},
     )
-    remarks = [*found.remarks, f"not run: {', '.join(left_out)} ({item.why})"] if left_out else found.remarks
-    found = replace(found, remarks=remarks)
+    reasons = dict.fromkeys(left_out.values())
+    remarks = [f"not run: {', '.join(n for n in left_out if left_out[n] == why)} ({why})" for why in reasons]
+    found = replace(found, remarks=[*found.remarks, *remarks])
     return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher, rounds=rounds)
 
 
@@ -388,21 +406,25 @@ def scene_of(item: Item, quick: bool) -> Scene:
     return scene if item.pace is None else replace(scene, reference_pace=item.pace)
 
 
-def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], list[str]]:
-    """Names of the methods that run, and of those that are left out though they could.
+def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[str, str]]:
+    """Names of the methods that run, and of those that are left out though they could, with the reasons.
 
     Of every host the usual ones, those that refuse with their reasons; of OpenMM and of guests those that can run
     the scene.
     """
     kept: list[str] = []
+    out: dict[str, str] = {}
     for method in METHODS.values():
         usual = method.usual or (item.every_stepper and not quick and method.host == "kcons")
         guest = method.guest or method.host == "openmm"
         if not usual or not method.follows or (guest and method.refuses(scene) is not None):
             continue
-        kept.append(method.name)
-    out = [name for name in kept if name.startswith(tuple(item.without))] if item.without else []
-    return [name for name in kept if name not in out], out
+        why = next((why for beginning, why in item.without.items() if method.name.startswith(beginning)), None)
+        if why is None:
+            kept.append(method.name)
+        else:
+            out[method.name] = why
+    return kept, out
 
 
 # -- files ------------------------------------------------------------------------------------------

@@ -178,6 +178,41 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
     return lambda dt: item()  # type: ignore[no-any-return]
 
 
+class _ExtrapolatedRun(Run):
+    def __init__(self, scene: Scene, tolerance: float) -> None:
+        super().__init__()
+        motion = Motion(scene.constraint_set, scene.positions)
+        self.constraints.watch(motion, ENGINE_CALLS)
+        base: Stepper = Damped(Rattle(), scene.friction) if scene.friction else Rattle()
+        system, self._state = System(motion, scene.potential.forces), State(scene.positions, scene.velocities)
+        self._horizon = scene.horizon
+        self._states = steppers.Extrapolation(tolerance, base=base).states(system, self._state, scene.horizon)
+
+    def advance(self) -> None:
+        self._state = next(self._states)
+        self.time = self._state.time
+        self.divided = self.constraints.seconds > 0.0
+
+    @property
+    def finished(self) -> bool:
+        return self.time == self._horizon
+
+    @property
+    def positions(self) -> FloatArray:
+        return self._state.positions
+
+    @property
+    def velocities(self) -> FloatArray:
+        return self._state.velocities
+
+
+class Extrapolated(Method):
+    """`kcons.steppers.Extrapolation`: RATTLE, extrapolated; its settings are tolerances of a step."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _ExtrapolatedRun(scene, setting)
+
+
 # -- ASE --------------------------------------------------------------------------------------------
 
 
@@ -363,6 +398,7 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         *of_steppers(STEPPERS),
+        Extrapolated("extrapolation", "kcons Extrapolation", adaptive=True, damps=True),
         AseKcons("ase-kcons", "ASE Verlet + kcons", host="ase"),
         AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
         AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 
 from kcons.errors import InputError
-from kcons.methods import METHODS, AseBonds, AseKcons, CoreStepper, ProjectedOde
+from kcons.methods import METHODS, AseBonds, AseKcons, CoreStepper, Extrapolated, ProjectedOde
 from kcons.openmm_methods import TIGHT, BuiltIn, Compiled, Held, OnSurfaces, Projected, middle, nose_hoover, verlet
 from kcons.runs import Method
 from kcons.scenes import Scene
@@ -19,6 +19,14 @@ _OPENMM_KINDS = {
     middle: "LangevinMiddleIntegrator(300, 0, {dt})",
     nose_hoover: "NoseHooverIntegrator({dt})",
 }
+
+
+_ON_ARRAYS = (
+    "scene = SCENE",
+    "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet and positions",
+    "system = System(motion, scene.potential.forces)  # a function of positions and time",
+    "start = State(scene.positions, scene.velocities)",
+)
 
 
 def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
@@ -51,6 +59,8 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
     elif isinstance(found, CoreStepper) and _plain(found):
         stepper = type(found.make(1.0)).__name__
         lines = _ase_stepper(dt, steps, stepper) if molecular else _arrays(dt, steps, stepper)
+    elif isinstance(found, Extrapolated):
+        lines = _extrapolated(setting)
     elif isinstance(found, AseKcons):
         lines = _ase_kcons(dt, steps)
     elif isinstance(found, AseBonds):
@@ -94,11 +104,19 @@ def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
         "from kcons import Motion, State, System, run, scenes",
         f"from kcons.steppers import {stepper}",
         "",
-        "scene = SCENE",
-        "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet and positions",
-        "system = System(motion, scene.potential.forces)  # a function of positions and time",
-        "start = State(scene.positions, scene.velocities)",
+        *_ON_ARRAYS,
         f"end = run(system, start, {dt}, {steps}, stepper={stepper}())",
+    ]
+
+
+def _extrapolated(tolerance: float) -> list[str]:
+    return [
+        "from kcons import Motion, State, System, scenes",
+        "from kcons.steppers import Extrapolation",
+        "",
+        *_ON_ARRAYS,
+        f"for end in Extrapolation({tolerance!r}).states(system, start, until=scene.horizon):",
+        "    pass  # each state is the end of a step",
     ]
 
 

@@ -190,6 +190,15 @@ def test_lines_of_code_on_arrays():
     assert np.abs(space["end"].positions - scene.reference().positions).max() < 1e-4
 
 
+def test_lines_of_code_of_adaptive_steps():
+    scene = scenes.build("dumbbells")
+    text = snippets.code(scene, "extrapolation", 1e-8, 'scenes.build("dumbbells")')
+    space = {}
+    exec(compile(text, "extrapolation", "exec"), space)
+    assert "Extrapolation(1e-08)" in text and space["end"].time == scene.horizon
+    assert 0 < np.abs(space["end"].positions - scene.reference().positions).max() < 1e-5
+
+
 @pytest.mark.parametrize(
     "name", ["openmm-verlet", "openmm-middle", "openmm-rattle-1e-6", "openmm-kcons-blanes-moan4", "openmm-held-rattle"]
 )
