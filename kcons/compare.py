@@ -27,8 +27,8 @@ from kcons.scenes.potential import Potential
 from kcons.steppers import Rattle, State, System
 from kcons.timing_rounds import Rounds
 
-#: A first step below this may be slow only because it is the first.
-FIRST_STEP_DOUBT = 0.5
+#: A first step below so many seconds, or this part of the budget, may be slow only because it is the first.
+FIRST_STEP_DOUBT, FIRST_STEP_SHARE = 0.5, 0.25
 
 #: A run is timed again if it takes at most this part of a method's budget, and so many seconds.
 REPEAT_SHARE, REPEAT_SECONDS = 0.2, 2.0
@@ -408,7 +408,7 @@ def _run_to_horizon(
             break
         first = len(log.seconds) == 1
         to_go = run.steps * (scene.horizon - run.time) / (run.time - log.times[-2])
-        doubtful = first and log.seconds[0] < FIRST_STEP_DOUBT
+        doubtful = first and log.seconds[0] < max(FIRST_STEP_DOUBT, FIRST_STEP_SHARE * budget)
         if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
             return _too_slow(log.seconds[-1], budget)
     return ""

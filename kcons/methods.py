@@ -146,6 +146,11 @@ class CoreVerlet(Method):
 
     marches = True
 
+    def warm_up(self, scene: Scene) -> None:
+        run = self.start(scene, min(scene.time_steps))
+        run.advance()
+        run.march(2)
+
     def start(self, scene: Scene, setting: float) -> Run:
         nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
         return _CoreRun(scene, nothing, Rattle(), setting)

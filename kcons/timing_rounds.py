@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from kcons.errors import KconsError
 from kcons.results import Measurement
-from kcons.runs import Method, Run, first_line, interrupted_after
+from kcons.runs import Method, OverBudgetError, Run, first_line, interrupted_after
 from kcons.scenes import Scene
 
 #: Steps before the clock starts, of runs short enough.
@@ -184,10 +183,8 @@ def marched(run: Run, m: Measurement, holds: bool, pass_seconds: float) -> float
     block = m.steps if holds else min(m.steps, FLOOR_BLOCK)
     if holds and block < run.stretch and block * step_seconds < pass_seconds:
         longer = min(run.stretch, int(pass_seconds / max(step_seconds, 1e-9)))
-        with suppress(Exception):  # beyond the horizon anything may happen
-            run.march(longer)
-            if np.isfinite(run.positions).all():
-                block = max(block, longer)
+        if _stays_finite(run, longer):
+            block = max(block, longer)
         run.rewind()
     run.march(min(block, WARM_STEPS) if WARM_STEPS * step_seconds < pass_seconds else 1)
     found: list[float] = []
@@ -214,6 +211,16 @@ def margin(times: Iterable[Sequence[float]]) -> float | None:
         abs(math.log(float(np.median(mine[0::2])) / float(np.median(mine[1::2])))) for mine in times if len(mine) > 1
     ]
     return float(np.expm1(np.quantile(off, 0.9))) if off else None
+
+
+def _stays_finite(run: Run, steps: int) -> bool:
+    try:
+        run.march(steps)
+    except OverBudgetError:
+        raise
+    except Exception:  # beyond the horizon anything may happen
+        return False
+    return bool(np.isfinite(run.positions).all())
 
 
 def _short(m: Measurement, limit: float) -> bool:

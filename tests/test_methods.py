@@ -7,6 +7,7 @@ import pytest
 
 from kcons import compare, methods, report, scenes, steppers
 from kcons.errors import InputError, UnsupportedError
+from kcons.runs import Method
 from kcons.steppers import Rattle, State
 
 
@@ -202,3 +203,9 @@ def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name
         assert held.velocity_residual < 1e-14
     errors = [m.error for m in found.of("dop853-projected")]
     assert errors[0] > 100 * errors[1] > 1e4 * errors[2]
+
+
+def test_what_has_kernels_loads_them_before_the_clock_starts():
+    for method in methods.METHODS.values():
+        if method.host == "kcons" and method.marches:
+            assert type(method).warm_up is not Method.warm_up, method.name

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from kcons import compare, everything, methods, scenes
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, KconsError
 from kcons.peers import lammps_shake, shake
 from kcons.results import Measurement
-from kcons.runs import Run, Stopwatch
+from kcons.runs import OverBudgetError, Run, Stopwatch
 from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
@@ -228,8 +228,20 @@ def test_few_long_steps_end_at_the_horizon():
     assert set(run.asked) == {WARM_STEPS, 12, "back"}
 
 
+def test_time_is_up_beyond_the_horizon_too():
+    class Endless(Noted):
+        def march(self, steps):
+            super().march(steps)
+            raise OverBudgetError("not done after 1 s")
+
+    run = Endless()
+    with pytest.raises(OverBudgetError):
+        marched(run, measurement(steps=12, step_seconds=1e-6), True, 1e-3)
+    assert run.asked == [Run.stretch]
+
+
 def test_running_away_is_an_error():
-    with pytest.raises(Exception, match="positions are not finite"):
+    with pytest.raises(KconsError, match="positions are not finite"):
         marched(Noted(np.nan), measurement(steps=3, step_seconds=1e-6), True, 1e-4)
 
 
