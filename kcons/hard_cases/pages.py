@@ -184,7 +184,8 @@ def markdown(result: Mapping[str, Any]) -> str:
     systems = result["systems"]
     lines = [f"| | | {' | '.join(systems)} |", "| --- | --- |" + " --- |" * len(systems)]
     for name, row in _rows(result):
-        cells = [_words(row.get(system)) for system in systems]
+        # Some checks are called |J v|.
+        cells = [_words(row.get(system)).replace("|", r"\|") for system in systems]
         lines.append(f"| {name} | {result['cases'][name]['title']} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
