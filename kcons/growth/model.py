@@ -109,10 +109,6 @@ class GrowthModel:
         self._sources = sources
         self.vectorized = vectorized
 
-    @property
-    def has_sources(self) -> bool:
-        return self._sources is not None
-
     def rates(self, p: Populations) -> FloatArray:
         """phi, shape of p.x (notes eq. 62)."""
         return evaluate(self._rates, p, self.n, self.vectorized, "the rates")

@@ -52,10 +52,6 @@ class Freedom:
     directions: FloatArray
     turns: bool = False
 
-    @property
-    def momentum_conserved(self) -> bool:
-        return len(self.directions) > 0
-
 
 def freedom(
     system: System, state: State, forces: FloatArray, atoms: ArrayLike | None = None, momentum: Momentum = "auto"
