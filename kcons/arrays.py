@@ -25,13 +25,23 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
 
 
 def check_out(out: FloatArray, shape: tuple[int, int], item: str = "out") -> None:
-    """Refuse arrays that results cannot be written into."""
+    """Refuse arrays that results cannot be written into.
+
+    Raises
+    ------
+    InputError
+    """
     if not isinstance(out, np.ndarray) or out.dtype != _FLOAT or out.shape != shape or not out.flags.carray:
         raise InputError(f"{item} must be a writeable, contiguous float64 array of shape {shape}", item=item)
 
 
 def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
-    """Refuse arrays that one multiplier a row cannot be written into."""
+    """Refuse arrays that one multiplier a row cannot be written into.
+
+    Raises
+    ------
+    InputError
+    """
     good = isinstance(multipliers, np.ndarray) and multipliers.dtype == np.float64 and multipliers.shape == (n_rows,)
     if not good or not multipliers.flags.writeable:
         raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")

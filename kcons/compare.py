@@ -228,6 +228,12 @@ def timed_again(
     rounds : Rounds or None
         None: everything stays as it is.
     watcher : Watcher, optional
+
+    Returns
+    -------
+    measurements : list of Measurement
+    margin : float or None
+        See `kcons.timing_rounds.margin`.
     """
     if rounds is None:
         return measurements, None

@@ -20,7 +20,15 @@ if TYPE_CHECKING:
 def in_turn(
     calls: Mapping[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = process_time
 ) -> dict[str, list[float]]:
-    """Seconds of each call, `repeats` times, one after the other: what disturbs the machine meets all of them."""
+    """Seconds of each call, `repeats` times, one after the other: what disturbs the machine meets all of them.
+
+    Parameters
+    ----------
+    calls : mapping of name to callable
+    repeats : int
+    clock : callable, optional
+        Seconds; CPU time of this process by default.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats):
         for name, call in calls.items():
@@ -36,7 +44,14 @@ def ratio(first: Sequence[float], second: Sequence[float]) -> float:
 
 
 def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict[str, float]]:
-    """Median milliseconds of one of the `steps` of a call, and the speed relative to the first of them all."""
+    """Median milliseconds of one of the `steps` of a call, and the speed relative to the first of them all.
+
+    Parameters
+    ----------
+    seconds : mapping of name to sequence of float
+        From `in_turn`.
+    steps : int
+    """
     first = next(iter(seconds.values()))
     return {
         name: {"ms": 1e3 * float(np.median(found)) / steps, "ratio": ratio(first, found)}
@@ -47,7 +62,15 @@ def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict
 def table(
     title: str, headings: Sequence[str], words: Collection[str] = (), rows: Iterable[Sequence[str]] = ()
 ) -> Table:
-    """A table whose columns are numbers, but for those whose headings are in `words`."""
+    """A table whose columns are numbers, but for those whose headings are in `words`.
+
+    Parameters
+    ----------
+    title : str
+    headings : sequence of str
+    words : collection of str, optional
+    rows : iterable of sequence of str, optional
+    """
     from rich.table import Table
 
     made = Table(title=title)
@@ -96,7 +119,16 @@ def script(
 
 
 def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick: bool) -> dict[str, Any]:
-    """A measurement that goes on from what the file `out` has, and is written to it after each of its parts."""
+    """A measurement that goes on from what the file `out` has, and is written to it after each of its parts.
+
+    Parameters
+    ----------
+    out : Path or None
+        None: from the beginning, and nothing is written.
+    measure : callable
+        Gets `quick`, `keep`, which takes what has been measured so far, and `earlier`, what the file has or None.
+    quick : bool
+    """
 
     def keep(result: dict[str, Any]) -> None:
         if out:

@@ -234,7 +234,13 @@ class OverBudgetError(Exception):
 
 @contextmanager
 def interrupted_after(seconds: float) -> Iterator[None]:
-    """Raise OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread)."""
+    """Raise OverBudgetError in the body after `seconds`, where the system can do that (Unix, main thread).
+
+    Raises
+    ------
+    OverBudgetError
+        Once: a body that handles it is not interrupted again.
+    """
     if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
         yield
         return

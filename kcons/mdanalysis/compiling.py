@@ -68,7 +68,15 @@ class Frame:
 
 
 def frame_of(ts: Any, time: float, in_blocks: bool) -> Frame:
-    """The frame that a reader has just read."""
+    """The frame that a reader has just read.
+
+    Parameters
+    ----------
+    ts : MDAnalysis.coordinates.timestep.Timestep
+    time : float
+    in_blocks : bool
+        See `Frame`.
+    """
     x = np.array(ts.positions, dtype=np.float32).ravel()
     v = np.array(ts.velocities, dtype=np.float32).ravel() if ts.has_velocities else None
     return Frame(x, v, ts.dimensions, time, in_blocks)
@@ -126,7 +134,18 @@ class Sample:
 
 
 def sample_of(constraint_set: ConstraintSet, frame: Frame, grid: float, rank: bool) -> Sample:
-    """A few clusters of each kind: equal numbers of rows, of atoms, and of rows of each sort."""
+    """A few clusters of each kind: equal numbers of rows, of atoms, and of rows of each sort.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+    frame : Frame
+        Of all atoms of the set.
+    grid : float
+        See `RowTable`.
+    rank : bool
+        Whether the rank is asked for.
+    """
     incidence = constraint_set.incidence
     graph = sp.block_array([[None, incidence], [incidence.T, None]], format="csr")
     n_clusters, labels = sp.csgraph.connected_components(graph, directed=False)

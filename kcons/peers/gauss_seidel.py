@@ -109,9 +109,23 @@ class GaussSeidel:
     ) -> FloatArray:
         """Steps of velocity Verlet in place, two compiled calls and one for the forces each; the last forces.
 
+        Parameters
+        ----------
+        x, velocities : ndarray, shape (n_atoms, 3)
+            Change.
+        forces : ndarray, shape (n_atoms, 3)
+            At `x`.
+        dt : float
+        steps : int
+        force : callable
+            Forces at given positions.
+        old : ndarray, shape (n_atoms, 3)
+            Room to work in.
+
         Raises
         ------
         ConvergenceError
+            The sweeps do not converge; `x` and `velocities` are then those of the middle of a step.
         """
         pairs, squares, w, bonds, tolerance = (
             self.pairs, self.squares, self.inverse_masses, self._old, self.tolerance,
