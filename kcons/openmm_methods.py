@@ -36,7 +36,7 @@ RECORDS = 12
 SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.03, 0.05, (100, 2000)
 BLOCKS = 3
 #: Fewer steps a block where these would take longer.
-LONG_BLOCK, LONG_BLOCK_STEPS = 0.6, 30
+LONG_BLOCK, LONG_BLOCK_STEPS = 0.6, (10, 30)
 
 HALF_STEP = (
     "OpenMM's own integrators keep velocities half a step off the positions; |Av| is that of the velocities that "
@@ -58,8 +58,6 @@ class _HostRun(Run):
     """
 
     divided = False
-    #: A call of `step` has costs of its own, which those who make a million steps do not see.
-    stretch = 2000
 
     def __init__(
         self,
@@ -106,6 +104,9 @@ class _HostRun(Run):
         self._done += steps
         self.time = self._done * self._dt
 
+    def stretch(self, step_seconds: float, pass_seconds: float) -> int:
+        return _block(step_seconds, pass_seconds)
+
     def rewind(self) -> None:
         self._context.setPositions(self._x)
         self._context.setVelocities(self._v)
@@ -146,10 +147,7 @@ class _HostRun(Run):
         self._end = self._state()
         if not np.isfinite(self._end[0]).all():
             return None
-        each = self._spent / timed
-        size = (
-            int(np.clip(BLOCK_SECONDS / each, *BLOCK_STEPS)) if BLOCK_STEPS[0] * each < LONG_BLOCK else LONG_BLOCK_STEPS
-        )
+        size = _block(self._spent / timed, BLOCK_SECONDS)
         found = []
         try:
             for _ in range(BLOCKS):
@@ -170,6 +168,12 @@ class _HostRun(Run):
     def _forces(self) -> FloatArray:
         state = self._context.getState(forces=True, groups=self._groups)
         return np.asarray(state.getForces(asNumpy=True)._value)
+
+
+def _block(step_seconds: float, seconds: float) -> int:
+    if BLOCK_STEPS[0] * step_seconds >= LONG_BLOCK:
+        return int(np.clip(LONG_BLOCK / step_seconds, *LONG_BLOCK_STEPS))
+    return int(np.clip(seconds / step_seconds, *BLOCK_STEPS))
 
 
 class _CarriedRun(_HostRun):

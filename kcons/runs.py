@@ -33,6 +33,9 @@ ENGINE_CALLS = (
     "constraint_force",
 )
 
+#: Short steps are timed so many at a stretch.
+STRETCH = 100
+
 
 class Stopwatch:
     """Wall time spent inside some methods of one object; calls within calls count once."""
@@ -85,14 +88,11 @@ class Run(ABC):
         Wall time of the constraints.
     divided : bool
         Whether that time can be told from the rest of a step.
-    stretch : int
-        Of short steps, so many are timed at a stretch, though the horizon is nearer: a run is longer.
     """
 
     time: float = 0.0
     steps: int = 1
     divided: bool = True
-    stretch: int = 100
 
     def __init__(self) -> None:
         self.constraints = Stopwatch()
@@ -109,6 +109,18 @@ class Run(ABC):
     def rewind(self) -> None:
         """Go back to the start, forces known, while time and steps go on counting."""
         raise NotImplementedError
+
+    def stretch(self, step_seconds: float, pass_seconds: float) -> int:
+        """How many steps to time at a stretch, though the horizon may be nearer: a run is longer.
+
+        Parameters
+        ----------
+        step_seconds : float
+            About what a step takes.
+        pass_seconds : float
+            What is to be timed in all.
+        """
+        return min(STRETCH, int(pass_seconds / step_seconds))
 
     @property
     @abstractmethod

@@ -39,7 +39,7 @@ class Rounds:
         In a round, passes over the planned steps are made until so much is timed.
     """
 
-    least: int = 2
+    least: int = 3
     most: int = 16
     seconds: float = 0.6
     pass_seconds: float = 0.01
@@ -180,22 +180,30 @@ def marched(run: Run, m: Measurement, holds: bool, pass_seconds: float) -> float
     """
     run.constraints.release()
     step_seconds = float(m.step_seconds or 0.0)
-    block = m.steps if holds else min(m.steps, FLOOR_BLOCK)
-    if holds and block < run.stretch and block * step_seconds < pass_seconds:
-        longer = min(run.stretch, int(pass_seconds / max(step_seconds, 1e-9)))
-        if _stays_finite(run, longer):
-            block = max(block, longer)
-        run.rewind()
-    run.march(min(block, WARM_STEPS) if WARM_STEPS * step_seconds < pass_seconds else 1)
+    run.march(min(m.steps, WARM_STEPS) if WARM_STEPS * step_seconds < pass_seconds else 1)
+    if not holds:
+        return _passes(run, min(m.steps, FLOOR_BLOCK), pass_seconds)
+    longer = run.stretch(max(step_seconds, 1e-9), pass_seconds)
+    if longer > m.steps:
+        try:
+            return _passes(run, longer, pass_seconds)
+        except OverBudgetError:
+            raise
+        except Exception:  # beyond the horizon anything may happen: then no farther than to it
+            run.rewind()
+    return _passes(run, m.steps, pass_seconds)
+
+
+def _passes(run: Run, steps: int, pass_seconds: float) -> float:
     found: list[float] = []
     while sum(found) < pass_seconds:
         run.rewind()
         begun = perf_counter()
-        run.march(block)
+        run.march(steps)
         found.append(perf_counter() - begun)
     if not np.isfinite(run.positions).all():
         raise KconsError("positions are not finite")
-    return float(np.median(found)) / block
+    return float(np.median(found)) / steps
 
 
 def margin(times: Iterable[Sequence[float]]) -> float | None:
@@ -211,16 +219,6 @@ def margin(times: Iterable[Sequence[float]]) -> float | None:
         abs(math.log(float(np.median(mine[0::2])) / float(np.median(mine[1::2])))) for mine in times if len(mine) > 1
     ]
     return float(np.expm1(np.quantile(off, 0.9))) if off else None
-
-
-def _stays_finite(run: Run, steps: int) -> bool:
-    try:
-        run.march(steps)
-    except OverBudgetError:
-        raise
-    except Exception:  # beyond the horizon anything may happen
-        return False
-    return bool(np.isfinite(run.positions).all())
 
 
 def _short(m: Measurement, limit: float) -> bool:
