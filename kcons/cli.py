@@ -154,6 +154,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         return _compare_averages(chosen, budget, folder, asked)
     from kcons import compare, methods, recommendation, report
     from kcons.progress import Bars
+    from kcons.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
@@ -165,12 +166,26 @@ def _compare(chosen: argparse.Namespace) -> int:
             scene = scene.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
         reference = None if target is None else compare.reference_of(scene, watcher)
+        rounds = QUICK_ROUNDS if chosen.quick else ROUNDS
         result = compare.compare(
-            scene, methods=chosen.methods, budget=budget, watcher=watcher, settings=asked, reference=reference
+            scene,
+            methods=chosen.methods,
+            budget=budget,
+            watcher=watcher,
+            settings=asked,
+            reference=reference,
+            rounds=rounds,
         )
         if target is not None and reference is not None:
             result = recommendation.recommend(
-                scene, result, target, reference=reference, made_by=_expression(chosen), budget=budget, watcher=watcher
+                scene,
+                result,
+                target,
+                reference=reference,
+                made_by=_expression(chosen),
+                budget=budget,
+                watcher=watcher,
+                rounds=rounds,
             )
     terminal = console()
     explained = report.explanation(result)

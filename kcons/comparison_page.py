@@ -145,7 +145,17 @@ def _machines(parts: Sequence[Part]) -> PageTable:
 
 def winners(parts: Sequence[Part]) -> PageTable:
     """Who wins where: a line for each scene and host with a method of kcons and another one."""
-    headings = ["scene", "host", "decided by", "gain", "at an error of", "ahead of kcons", "of", "over"]
+    headings = [
+        "scene",
+        "host",
+        "decided by",
+        "times repeat to",
+        "gain",
+        "at an error of",
+        "ahead of kcons",
+        "of",
+        "over",
+    ]
     headings += ["ahead in the other cost", "on the front"]
     rows: list[list[str]] = []
     marks: list[str] = []
@@ -154,13 +164,16 @@ def winners(parts: Sequence[Part]) -> PageTable:
             continue
         found = Comparison.from_dict(part.data["comparison"])
         length = found.scene["units"]["length"]
+        margin = found.timing.get("margin")
         for row in summary(found):
             if not row["rivals"]:
                 continue
             gain = row["gain"]
+            by_time = row["cost"] == COSTS["wall"][1]
             rows.append(
                 [
                     *(part.heading, row["host"], row["cost"]),
+                    f"{100 * margin:.0f} %" if by_time and margin is not None else "",
                     "" if gain is None else factor(gain),
                     "" if gain is None else f"{row['gain_error']:.0e} {length}",
                     row["lost"] or "none",
@@ -170,7 +183,7 @@ def winners(parts: Sequence[Part]) -> PageTable:
                 ]
             )
             marks.append("bad" if row["losses"] else "good")
-    return PageTable(headings, rows, text_columns=(0, 1, 2, 5, 6, 7, 8, 9), marks=marks)
+    return PageTable(headings, rows, text_columns=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
 
 
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
@@ -180,7 +193,7 @@ PICTURES = (
     *("solver-precision", "scaling"),
 )
 #: Columns of the table of winners that go there.
-SHORT = (0, 1, 2, 3, 4, 5)
+SHORT = (0, 1, 2, 3, 4, 5, 6)
 
 
 def fill(path: Path, parts: Sequence[Part]) -> list[Path]:

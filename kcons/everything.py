@@ -24,14 +24,11 @@ from kcons.methods import METHODS
 from kcons.recommendation import sharpen
 from kcons.results import Comparison
 from kcons.scenes import Scene
-from kcons.timing_rounds import Rounds
+from kcons.timing_rounds import FULL_ROUNDS, QUICK_ROUNDS
 
 FORMAT = "kcons-report-1"
 #: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
 QUICK_SECONDS = 280.0
-#: Rounds in which short runs are timed again, and those of a quick run.
-ROUNDS = Rounds()
-QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002)
 
 
 @dataclass(frozen=True)
@@ -381,7 +378,7 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
     names, left_out = methods_of(item, scene, quick)
     reference = reference_of(scene, watcher)
-    rounds = QUICK_ROUNDS if quick else ROUNDS
+    rounds = QUICK_ROUNDS if quick else FULL_ROUNDS
     found = compare(
         scene,
         methods=names,

@@ -111,6 +111,7 @@ def recommend(
     made_by: str,
     budget: float = 30.0,
     watcher: Watcher | None = None,
+    rounds: Rounds | None = None,
 ) -> Comparison:
     """Find the cheapest method and step that make at most the error `target` at the horizon.
 
@@ -128,6 +129,8 @@ def recommend(
     budget : float
         Seconds for a run.
     watcher : Watcher, optional
+    rounds : Rounds, optional
+        Those in which the comparison timed short runs.
 
     Returns
     -------
@@ -156,13 +159,14 @@ def recommend(
             limit = min((cost_of(m, decides) for m in found if _reaches(m, target)), default=math.inf)
             if prediction.cost(decides) < 1.5 * limit:
                 found += reach(scene, prediction, target, reference, budget, watching)
+    found, _ = timed_again(scene, found, reference, budget, rounds, watching)
     everything = [*(m for curve in curves.values() for m in curve), *found]
     able = [m for m in everything if target >= floor and _reaches(m, target)]
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
         best = min(able, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
         entry |= {**_facts(best), "code": code(scene, best.method, best.setting, made_by)}
-        default, more = _default(scene, comparison, best, target, reference, budget, watching)
+        default, more = _default(scene, comparison, best, target, reference, budget, watching, rounds)
         entry["default"] = default
         found += more
     else:
@@ -190,10 +194,8 @@ def sharpen(
 
     Parameters
     ----------
-    scene, comparison, reference, budget, watcher
+    scene, comparison, reference, budget, watcher, rounds
         As for `recommend`.
-    rounds : Rounds, optional
-        Those in which the comparison timed short runs.
     """
     floor = floor_of(comparison)
     curves = _curves(comparison)
@@ -303,6 +305,7 @@ def _default(
     reference: Reference,
     budget: float,
     watcher: Watcher,
+    rounds: Rounds | None,
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
     """What the host of the best method does unless told otherwise: at its usual step, and at this error."""
     name = default_method(scene, METHODS[best.method].host)
@@ -319,7 +322,9 @@ def _default(
     if first is None:
         warm_up(scene, [method])
         internal = setting if method.adaptive else setting * scene.units.time_unit
-        first = measure(scene, method, internal, reference, budget, watcher)
+        (first,), _ = timed_again(
+            scene, [measure(scene, method, internal, reference, budget, watcher)], reference, budget, rounds, watcher
+        )
         found.append(first)
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
     points = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
@@ -327,6 +332,7 @@ def _default(
     prediction = predicted(points, SAFETY * target, floor_of(comparison))
     if prediction is not None:
         more = reach(scene, prediction, target, reference, budget, watcher)
+        more, _ = timed_again(scene, more, reference, budget, rounds, watcher)
         found += more
         reached += [m for m in more if _reaches(m, target)]
     if reached:

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from kcons import cli, comparison_page, everything, scenes
+from kcons import cli, comparison_page, everything, scenes, timing_rounds
 from kcons.compare import Watcher
 from kcons.errors import InputError
 from kcons.everything import Item
@@ -92,7 +92,7 @@ def test_numbers_come_back_as_they_were(finished):
     data = everything.read(finished, "chain-3")
     found = Comparison.from_dict(data["comparison"])
     assert list(dict.fromkeys(m.method for m in found.measurements)) == METHODS
-    assert found.timing["repeats"] == everything.ROUNDS.least and found.timing["margin"] is not None
+    assert found.timing["repeats"] == timing_rounds.FULL_ROUNDS.least and found.timing["margin"] is not None
     for m in found.of("rattle"):
         assert m.title == "kcons RATTLE" and m.error > 0 and m.steps == round(80 / m.setting)
     assert found.observed_order("rattle") == pytest.approx(2.0, abs=0.1)
@@ -141,7 +141,17 @@ def test_winners_name_host_and_gain(finished):
     cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
     (sphere,) = [row for row in cells if row["scene"] == "Spheres"]
     assert sphere["decided by"] == "force evaluations" and sphere["over"] == "SciPy DOP853 on eq. 105"
-    text = comparison_page.markdown(table, (0, 1, 3))
+    # Where times decide, how well they repeat is said.
+    margins = {
+        part.heading: part.data["comparison"]["timing"]["margin"]
+        for part in everything.parts(finished)
+        if part.key in ("chain-3", "sphere")
+    }
+    for row in cells:
+        by_time = row["decided by"] == "wall time"
+        assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
+    assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
+    text = comparison_page.markdown(table, (0, 1, 4))
     assert text.splitlines()[0] == "| scene | host | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)

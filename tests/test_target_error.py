@@ -12,6 +12,7 @@ from kcons import cli, compare, methods, recommendation, scenes, snippets
 from kcons.compare import Watcher
 from kcons.errors import InputError
 from kcons.results import Measurement
+from kcons.timing_rounds import Rounds
 
 CHAIN = 'scenes.build("chain", 4)'
 
@@ -159,6 +160,16 @@ def test_sharpening_tries_longer_steps_where_another_method_seems_ahead(chain, r
     sharper = recommendation.sharpen(fine, there, reference=reference, budget=20)
     longest = max(m.setting for m in sharper.of("blanes-moan4"))
     assert longest > 2 * max(m.setting for m in plain.of("blanes-moan4"))
+
+
+def test_points_are_timed_as_the_comparison_was(chain, reference, monkeypatch):
+    monkeypatch.setattr("kcons.timing_rounds.marched", lambda run, m, holds, pass_seconds: 7.0)
+    rounds = Rounds(least=1, most=1)
+    plain = compare.compare(chain, methods=["rattle", "ase-bonds"], reference=reference, rounds=rounds)
+    found = recommendation.recommend(chain, plain, 1e-4, reference=reference, made_by=CHAIN, rounds=rounds)
+    new = [m for m in found.measurements if m not in plain.measurements]
+    assert new and {m.step_seconds for m in new} == {7.0}
+    assert found.recommendation["default"]["seconds_per_time"] == pytest.approx(7000 / 2.0, rel=0.1)
 
 
 # -- lines of code ----------------------------------------------------------------------------------

@@ -8,12 +8,12 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons import compare, everything, methods, scenes
+from kcons import compare, methods, scenes
 from kcons.errors import ConvergenceError, KconsError
 from kcons.peers import lammps_shake, shake
 from kcons.results import Measurement
 from kcons.runs import STRETCH, OverBudgetError, Run, Stopwatch
-from kcons.timing_rounds import FLOOR_BLOCK, WARM_STEPS, Rounds, interleaved, marched, margin
+from kcons.timing_rounds import FLOOR_BLOCK, FULL_ROUNDS, QUICK_ROUNDS, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
 SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
@@ -379,7 +379,7 @@ def test_a_round_that_does_not_come_back_is_interrupted(chain, monkeypatch):
 
 
 def test_quick_rounds_are_fewer_and_shorter():
-    full, quick = everything.ROUNDS, everything.QUICK_ROUNDS
+    full, quick = FULL_ROUNDS, QUICK_ROUNDS
     # Runs of 50 ms are timed seven times at least.
     assert full.seconds / 0.05 >= 7 and full.most >= 7
     assert quick.least < full.least and quick.most < full.most
