@@ -115,7 +115,16 @@ PLAN: tuple[Item, ...] = (
     Item("rotor", "Asymmetric top", "rotor", every_stepper=True, seconds=25, quick_seconds=6),
     Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=100, quick_seconds=6),
     Item("fekete", "Fekete points on a sphere", "fekete", every_stepper=True, seconds=20),
-    Item("ethanol", "Ethanol, GFN2-xTB", "ethanol", needs="tblite", seconds=60, quick_seconds=20, budget=20),
+    Item(
+        "ethanol",
+        "Ethanol, GFN2-xTB",
+        "ethanol",
+        needs="tblite",
+        every_stepper=True,
+        seconds=80,
+        quick_seconds=20,
+        budget=20,
+    ),
     Item(
         "water-216",
         "Water, 216 molecules",
@@ -190,7 +199,7 @@ PLAN: tuple[Item, ...] = (
         budget=20,
     ),
     *(
-        _molecule("alanine", "Alanine dipeptide", constrain, title, seconds=45, quick_seconds=14)
+        _molecule("alanine", "Alanine dipeptide", constrain, title, every_stepper=True, seconds=60, quick_seconds=14)
         for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"), ("hangles", "HAngles"))
     ),
     *(

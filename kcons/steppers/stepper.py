@@ -171,7 +171,8 @@ def run(
     UnsupportedError
         The stepper may not be used with this system.
     KconsError
-        Whatever a step raises; `error.step` is its number. Observers have then seen the last good state.
+        Whatever a step raises; `error.step` is its number. Observers have then seen all states that they were due, the
+        last one less than `every` steps before.
     """
     if steps < 0 or every < 1:
         raise InputError(f"steps is {steps} and every {every}; give steps >= 0 and every >= 1", item="steps")
