@@ -33,10 +33,10 @@ TEMPERATURE, COLLISIONS = 300.0, 1.0
 RECORDS = 12
 #: Steps that take less than this are timed in blocks: of so many seconds, and of so few and so many steps. A call of
 #: `step` has costs of its own, which those who make a million steps do not see.
-SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.03, 0.05, (100, 2000)
+SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.03, 0.05, (500, 2000)
 BLOCKS = 3
-#: Fewer steps a block where these would take longer.
-LONG_BLOCK, LONG_BLOCK_STEPS = 0.6, (10, 30)
+#: Fewer steps a block where these would take longer, but no fewer than that.
+LONG_BLOCK, LEAST_STEPS = 0.6, 10
 
 HALF_STEP = (
     "OpenMM's own integrators keep velocities half a step off the positions; |Av| is that of the velocities that "
@@ -171,9 +171,8 @@ class _HostRun(Run):
 
 
 def _block(step_seconds: float, seconds: float) -> int:
-    if BLOCK_STEPS[0] * step_seconds >= LONG_BLOCK:
-        return int(np.clip(LONG_BLOCK / step_seconds, *LONG_BLOCK_STEPS))
-    return int(np.clip(seconds / step_seconds, *BLOCK_STEPS))
+    wanted = np.clip(seconds / step_seconds, *BLOCK_STEPS)
+    return int(max(min(wanted, LONG_BLOCK / step_seconds), LEAST_STEPS))
 
 
 class _CarriedRun(_HostRun):
