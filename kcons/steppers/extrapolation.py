@@ -14,21 +14,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.errors import (
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    SingularGeometryError,
+    UnsupportedError,
+)
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import Stepper
 
-#: Columns of the table: order 2 k - 1 of the estimate. Beyond, rounding grows faster than the error shrinks.
+#: Columns of the table: order 2 k - 1 of the estimate. Each one nearly doubles what rounding adds.
 FEWEST, MOST = 3, 9
-#: A step is aimed at this share of the tolerance, and made somewhat shorter than that (Hairer, Norsett, Wanner II.9).
-AIM, SAFETY = 0.65, 0.94
+#: A step is aimed at this share of the tolerance, and made somewhat shorter than that.
+AIM, SAFETY = 0.65, 0.85
 #: Bounds for the change of the size from one step to the next.
 SHRINK, GROW = 0.1, 8.0
-#: After a failure, such as no solution at so large a step.
-FAILED = 0.25
+#: After a failure, such as no solution at so large a step; most show in the first line, before any force.
+FAILED = 0.5
 #: An order is raised or lowered where it takes less than this share of the work for the same time.
 LOWER, RAISE = 0.8, 0.9
+_EPS = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -44,24 +51,27 @@ class Extrapolation:
 
     For a few bodies under smooth forces, where many digits count or where quiet stretches take turns with collisions.
     Constraints hold exactly at the end of every step, but the steps are neither reversible nor symplectic: energy is
-    kept to the tolerance, not better, and drifts. Not for long runs of many atoms, nor for forces with a cutoff.
+    kept to the tolerance, not better, and drifts. Not for long runs of many atoms, nor for forces that jump or
+    are noisy (a cutoff, single precision), which make steps small.
 
     Parameters
     ----------
     tolerance : float
-        Allowed error of a step, root mean square over coordinates: of positions relative to `length`, of velocities
-        relative to `speed`.
+        Allowed error of a step, root mean square over the coordinates of all atoms that are not fixed: of positions
+        relative to `length`, of velocities relative to `speed`. Rounding is allowed besides, so that below some 1e-13
+        little is gained.
     length, speed : float, optional
-        What is measured against; by default 1, and the root mean square of the velocities at the start (1 if all rest).
+        What is measured against; by default 1, and the larger of the root mean square of the velocities at the start
+        and the speed that accelerations there give along `length`.
     base : Stepper, optional
-        Reversible, of order 2; by default `Rattle`.
+        Reversible and symplectic, of order 2; by default `Rattle`.
 
     Raises
     ------
     InputError
         A number that is not positive, or a tolerance that rounding cannot reach (below 1e-14).
     UnsupportedError
-        The base is not reversible or not of order 2.
+        The base is not reversible, not symplectic (a thermostat), or not of order 2.
 
     References
     ----------
@@ -83,9 +93,9 @@ class Extrapolation:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"{item} is {value}; give a positive number", item=item)
         self.base: Stepper = Rattle() if base is None else base
-        if not self.base.reversible or self.base.order != 2:
+        if not (self.base.reversible and self.base.symplectic and self.base.order == 2):
             raise UnsupportedError(
-                f"{self.base!r} is no reversible stepper of order 2, whose errors are a series in dt^2; "
+                f"{self.base!r} is no reversible and symplectic stepper of order 2, whose errors are a series in dt^2; "
                 "use Rattle or Geodesic"
             )
         self.tolerance, self.length, self.speed = float(tolerance), float(length), speed
@@ -94,7 +104,7 @@ class Extrapolation:
         return f"Extrapolation({self.tolerance:g}, base={self.base!r})"
 
     def states(self, system: System, state: State, until: float, *, first_step: float | None = None) -> Iterator[State]:
-        """The states at the ends of the steps, the last one at `until`.
+        """The states at the ends of the steps, the last one at `until`; none if that is the time of the start.
 
         Parameters
         ----------
@@ -117,11 +127,12 @@ class Extrapolation:
             `until` or `first_step` is not finite; the force function returned a wrong shape.
         UnsupportedError
             A thermostat's state; the base may not be used with this system.
-        ConvergenceError, NonFiniteError
-            What the base raised at steps too small to be made smaller. The last state that came is intact.
+        ConvergenceError, NonFiniteError, SingularGeometryError
+            What the base raised, or an error above the tolerance, at steps too small to be made smaller. The last
+            state that came is intact; the first two carry `step`.
         """
         if not math.isfinite(until):
-            raise InputError(f"until is {until}", item="until")
+            raise InputError(f"until is {until}; give a time", item="until")
         if first_step is not None and not (math.isfinite(first_step) and first_step > 0):
             raise InputError(f"first_step is {first_step}; give a positive number", item="first_step")
         if state.thermostat is not None:
@@ -130,53 +141,61 @@ class Extrapolation:
         return self._states(system, state, until, first_step)
 
     def _states(self, system: System, state: State, until: float, first_step: float | None) -> Iterator[State]:
+        if state.time == until:
+            return
         state = system.with_forces(state)
-        speed = self.speed or float(np.sqrt(np.mean(state.velocities**2))) or 1.0
-        plan = _Plan(first_step or self._first_size(system, state, speed, until), self._first_columns())
+        speed, rate = self._speed_and_rate(system, state)
+        left = abs(until - state.time)
+        plan = _Plan(first_step or (min(0.1 / rate, left) if rate > 0 else left), self._first_columns())
         while state.time != until:
             state, plan = self._advanced(system, state, until, plan, speed)
             yield state
 
     def _first_columns(self) -> int:
-        # Hairer, Norsett, Wanner II.9, eq. 9.35 in spirit: two digits a column.
+        # Hairer, Norsett, Wanner II.9: a column for less than two digits.
         return int(np.clip(round(-0.6 * math.log10(self.tolerance) + 0.5), FEWEST, MOST - 1))
 
-    def _first_size(self, system: System, state: State, speed: float, until: float) -> float:
+    @np.errstate(over="ignore", invalid="ignore")
+    def _speed_and_rate(self, system: System, state: State) -> tuple[float, float]:
+        """What velocities are measured against, and how fast the start changes, in units of its scales."""
         assert state.forces is not None
         v = state.velocities
-        a = system.motion.acceleration(state.positions, v, state.forces, state.time)
-        rate = math.sqrt(float(np.mean(v * v))) / self.length + math.sqrt(float(np.mean(a * a))) / speed
-        return min(0.1 / rate, abs(until - state.time)) if rate > 0 else abs(until - state.time)
+        speed = _rms(v, system)
+        a = _rms(system.motion.acceleration(state.positions, v, state.forces, state.time), system)
+        scale = self.speed or max(speed, math.sqrt(a * self.length)) or 1.0
+        return scale, speed / self.length + a / scale
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _advanced(self, system: System, start: State, until: float, plan: _Plan, speed: float) -> tuple[State, _Plan]:
         """The state after one step, and how to make the next one."""
         smallest = 16 * float(np.spacing(max(abs(start.time), abs(until))))
+        left = (until - start.time) - start.time_remainder
         failed = False
         while True:
-            left = until - start.time
             last = plan.size >= abs(left)
             size = left if last else math.copysign(plan.size, left)
+            if not last and 2 * plan.size > abs(left):
+                size = 0.5 * left  # two equal steps rather than a long and a tiny one
+            table = _Table(self, system, start, size, speed)
             try:
-                table = _Table(self, system, start, size, speed)
-                fits = table.fill(plan.columns)
-                if fits:
+                if table.fill(plan.columns):
                     state = self._landed(system, start, table, until if last else None)
                     return state, table.following(grow=not failed)
-            except (ConvergenceError, NonFiniteError):
+            except (ConvergenceError, NonFiniteError, SingularGeometryError) as error:
                 if abs(size) <= smallest:
-                    raise
+                    raise _given_up(error, start, size) from error
                 plan = _Plan(FAILED * abs(size), max(FEWEST, plan.columns - 1))
             else:
-                plan = table.following(grow=False)
                 if abs(size) <= smallest:
                     raise ConvergenceError(
-                        f"step {start.step + 1} at time {start.time:g}: the error stays above the tolerance "
-                        f"{self.tolerance:g} at steps of {abs(size):.3g}; forces that jump, or a tolerance that "
-                        "rounding does not allow",
+                        f"step {start.step + 1}, from time {start.time:g}: the error stays above the tolerance "
+                        f"{self.tolerance:g} at steps of {abs(size):.3g}. Forces that jump or are noisy: make them "
+                        "smooth, give a larger tolerance, or use Rattle with equal steps",
                         residual=table.error * self.tolerance,
                         tolerance=self.tolerance,
                         step=start.step + 1,
                     )
+                plan = table.following(grow=False)
             failed = True
 
     def _landed(self, system: System, start: State, table: _Table, until: float | None) -> State:
@@ -218,7 +237,9 @@ class _Table:
 
     def __init__(self, scheme: Extrapolation, system: System, start: State, size: float, speed: float) -> None:
         self.scheme, self.system, self.start, self.size = scheme, system, start, size
-        self._scale = np.array([scheme.length, speed])[:, None, None] * scheme.tolerance
+        x = start.positions if start.remainder is None else start.positions - start.positions[system.anchor]
+        self._tolerated = scheme.tolerance * np.array([scheme.length, speed])
+        self._rounding = _EPS * np.array([_rms(x, system), _rms(start.velocities, system)])
         self._line: list[FloatArray] = []
         self._errors: list[float] = []
 
@@ -255,8 +276,13 @@ class _Table:
             entry = entry + (entry - above) / ((n / (n - k)) ** 2 - 1.0)
             line.append(entry)
         self._line = line
-        off = (line[-1] - line[-2]) / self._scale if n > 1 else np.array(np.inf)
-        self._errors.append(float(np.sqrt(np.mean(off**2))))
+        error = math.inf
+        if n > 1:
+            # No smaller step mends what rounding leaves.
+            allowed = self._tolerated + 2.0 ** (n - 1) * self._rounding
+            off = [_rms(d, self.system) for d in line[-1] - line[-2]]
+            error = float(np.hypot(*(off / allowed))) / math.sqrt(2.0)
+        self._errors.append(error)
 
     def _steps(self, n: int) -> FloatArray:
         """What n steps of the base change."""
@@ -269,8 +295,8 @@ class _Table:
             for _ in range(n):
                 state = base.step(self.system, state, dt)
         moved = state.positions - start.positions
-        if start.remainder is not None and state.remainder is not None:
-            moved += state.remainder - start.remainder
+        if state.remainder is not None:
+            moved += state.remainder if start.remainder is None else state.remainder - start.remainder
         return np.stack([moved, state.velocities - start.velocities])
 
     def following(self, *, grow: bool) -> _Plan:
@@ -294,3 +320,38 @@ class _Table:
 def _work(columns: int) -> int:
     """Force evaluations of a step: those of all lines, and one at its end."""
     return columns * (columns + 1) // 2 + 1
+
+
+def _rms(values: FloatArray, system: System) -> float:
+    """Root mean square over the coordinates of atoms that are not fixed; 0 without any."""
+    moving = values[system.inverse_masses[:, 0] > 0]
+    return math.sqrt(float(np.mean(moving * moving))) if moving.size else 0.0
+
+
+def _given_up(
+    error: ConvergenceError | NonFiniteError | SingularGeometryError, start: State, size: float
+) -> ConvergenceError | NonFiniteError | SingularGeometryError:
+    """What goes wrong however small the step, with the step's number: the base counts its own."""
+    number = start.step + 1
+    where = f"step {number}, from time {start.time:g}, at steps down to {abs(size):.3g}"
+    if isinstance(error, NonFiniteError):
+        return NonFiniteError(
+            f"{where}: non-finite {error.item} on atom {error.atom}. The state before this step is intact; check the "
+            "geometry and the force function there",
+            item=error.item,
+            atom=error.atom,
+            step=number,
+        )
+    if isinstance(error, ConvergenceError):
+        return type(error)(
+            f"{where}: no solution. Targets that jump or cannot be met, or a start off the constraints (use "
+            f"System.initial_state): {error.__cause__ or error}",
+            residual=error.residual,
+            tolerance=error.tolerance,
+            iterations=error.iterations,
+            row=error.row,
+            atoms=error.atoms,
+            cluster=error.cluster,
+            step=number,
+        )
+    return SingularGeometryError(f"{where}: {error}", rows=error.rows, atoms=error.atoms)
