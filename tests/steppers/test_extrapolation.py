@@ -91,7 +91,7 @@ def scene_system(scene, far: float = 8.0) -> tuple[System, list[float]]:
 
 
 @pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)
-@pytest.mark.parametrize(("columns", "steps"), [(2, [16, 24]), (3, [10, 13])])
+@pytest.mark.parametrize(("columns", "steps"), [(2, [12, 16]), (3, [8, 10])])
 def test_each_column_adds_two_orders(columns, steps, problem: GlobalError) -> None:
     assert observed_order(Columns(columns), problem, steps) == pytest.approx(2 * columns, abs=0.35)
 
@@ -120,7 +120,11 @@ def test_errors_are_proportional_to_the_tolerance(name, most) -> None:
 
 
 #: Whose forces or rows take long.
-SLOW = references.SLOW | {"A06_water_free3"} | {n for n in cases.NAMES if n.startswith("A10") and "dumbbell" not in n}
+SLOW = (
+    references.SLOW
+    | {"A06_water_free3", "A03_planar_pendulum_179deg", "A03_planar_pendulum_150deg"}
+    | {n for n in cases.NAMES if n.startswith("A10") and "dumbbell" not in n}
+)
 
 
 @pytest.mark.parametrize("name", [n for n in cases.NAMES if n not in SLOW])
@@ -174,7 +178,7 @@ def test_fewer_evaluations_than_dop853(name) -> None:
 def test_what_is_held_holds_at_loose_tolerances(make) -> None:
     system, state = make()
     held = system.motion.constraint_set
-    for s in Extrapolation(1e-2).states(system, state, 3.0):
+    for s in Extrapolation(1e-2).states(system, state, 1.5):
         assert np.abs(held.value(s.positions, s.time)).max(initial=0.0) <= 1e-14
         slip = held.jacobian(s.positions, s.time) @ s.velocities.ravel() - held.velocity_target(s.positions, s.time)
         assert np.abs(slip).max(initial=0.0) <= 1e-14
