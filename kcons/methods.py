@@ -188,7 +188,9 @@ class _ExtrapolatedRun(Run):
         super().__init__()
         motion = Motion(scene.constraint_set, scene.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
-        base: Stepper = Damped(Rattle(), scene.friction) if scene.friction else Rattle()
+        base: Stepper = steppers.Geodesic(4)
+        if scene.friction:
+            base = Damped(base, scene.friction)
         system, self._state = System(motion, scene.potential.forces), State(scene.positions, scene.velocities)
         self._horizon = scene.horizon
         self._states = steppers.Extrapolation(tolerance, base=base).states(system, self._state, scene.horizon)
@@ -212,7 +214,7 @@ class _ExtrapolatedRun(Run):
 
 
 class Extrapolated(Method):
-    """`kcons.steppers.Extrapolation`: RATTLE, extrapolated; its settings are tolerances of a step."""
+    """`kcons.steppers.Extrapolation`, by itself of the size and order of its steps; its settings are tolerances."""
 
     def start(self, scene: Scene, setting: float) -> Run:
         return _ExtrapolatedRun(scene, setting)

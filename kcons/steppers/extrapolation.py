@@ -35,6 +35,7 @@ SHRINK, GROW = 0.1, 8.0
 FAILED = 0.5
 #: An order is raised or lowered where it takes less than this share of the work for the same time.
 LOWER, RAISE = 0.8, 0.9
+NO_THERMOSTAT = "Extrapolation knows no thermostats; use a stepper with equal steps"
 _EPS = float(np.finfo(float).eps)
 
 
@@ -64,7 +65,7 @@ class Extrapolation:
         What is measured against; by default 1, and the larger of the root mean square of the velocities at the start
         and the speed that accelerations there give along `length`.
     base : Stepper, optional
-        Reversible and symplectic, of order 2; by default `Geodesic(4)`, whose first lines, of long steps, find a
+        Reversible, of order 2; by default `Geodesic(4)`, whose first lines, of long steps, find a
         solution where `Rattle` has none. `Rattle` where projections cost more than forces.
 
     Raises
@@ -72,7 +73,7 @@ class Extrapolation:
     InputError
         A number that is not positive, or a tolerance that rounding cannot reach (below 1e-14).
     UnsupportedError
-        The base is not reversible, not symplectic (a thermostat), or not of order 2.
+        The base is not reversible, or not of order 2.
 
     References
     ----------
@@ -94,10 +95,10 @@ class Extrapolation:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"{item} is {value}; give a positive number", item=item)
         self.base: Stepper = Geodesic(4) if base is None else base
-        if not (self.base.reversible and self.base.symplectic and self.base.order == 2):
+        if not (self.base.reversible and self.base.order == 2):
             raise UnsupportedError(
-                f"{self.base!r} is no reversible and symplectic stepper of order 2, whose errors are a series in dt^2; "
-                "use Rattle or Geodesic"
+                f"{self.base!r} is no reversible stepper of order 2, whose errors are a series in dt^2; use Rattle or "
+                "Geodesic"
             )
         self.tolerance, self.length, self.speed = float(tolerance), float(length), speed
 
@@ -137,7 +138,7 @@ class Extrapolation:
         if first_step is not None and not (math.isfinite(first_step) and first_step > 0):
             raise InputError(f"first_step is {first_step}; give a positive number", item="first_step")
         if state.thermostat is not None:
-            raise UnsupportedError("Extrapolation knows no thermostats; use a stepper with equal steps")
+            raise UnsupportedError(NO_THERMOSTAT)
         self.base.check(system)
         return self._states(system, state, until, first_step)
 
@@ -295,6 +296,8 @@ class _Table:
         else:
             for _ in range(n):
                 state = base.step(self.system, state, dt)
+        if state.thermostat is not None:
+            raise UnsupportedError(NO_THERMOSTAT)
         moved = state.positions - start.positions
         if state.remainder is not None:
             moved += state.remainder if start.remainder is None else state.remainder - start.remainder

@@ -15,6 +15,7 @@ from kcons import compare, scenes
 from kcons.constraints import Distance, FixedAtoms
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.motion import Motion
+from kcons.scenes.friction import Damped
 from kcons.steppers import (
     Composition,
     Extrapolation,
@@ -479,12 +480,27 @@ def test_wrong_shapes_of_forces() -> None:
 
 @pytest.mark.parametrize(
     "base",
-    [ProjectedVerlet(project=True), Suzuki4(), Isokinetic(1.0), Langevin(1.0, 1.0, 1), NoseHooverChain(1.0, 1.0)],
+    [ProjectedVerlet(project=True), Suzuki4(), Isokinetic(1.0), Langevin(1.0, 1.0, 1)],
     ids=lambda base: type(base).__name__,
 )
 def test_bases_that_cannot_be_extrapolated(base) -> None:
     with pytest.raises(UnsupportedError, match="use Rattle or Geodesic"):
         Extrapolation(base=base)
+
+
+def test_a_thermostat_as_the_base() -> None:
+    system, state = rotor()
+    with pytest.raises(UnsupportedError, match="no thermostats"):
+        next(Extrapolation(base=NoseHooverChain(1.0, 1.0)).states(system, state, 1.0))
+
+
+def test_friction_around_the_base() -> None:
+    """Of order 2 and reversible is enough: with friction alone, velocities fall off exactly."""
+    system, state = rotor()
+    free = System(system.motion)
+    end = end_of(Extrapolation(1e-10, base=Damped(Geodesic(4), 0.5)), free, replace(state, forces=None), 1.0)
+    kinetic = free.kinetic_energy(state.velocities)
+    assert free.kinetic_energy(end.velocities) == pytest.approx(kinetic * np.exp(-1.0), rel=1e-8)
 
 
 def test_bases_that_can() -> None:
