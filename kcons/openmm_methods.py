@@ -110,7 +110,8 @@ class _HostRun(Run):
     def rewind(self) -> None:
         self._context.setPositions(self._x)
         self._context.setVelocities(self._v)
-        # Back at the start and one step on: the first one pays for what is set up lazily.
+
+    def settle(self) -> None:
         self._integrator.step(1)
 
     @property

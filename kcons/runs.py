@@ -110,6 +110,9 @@ class Run(ABC):
         """Go back to the start, forces known, while time and steps go on counting."""
         raise NotImplementedError
 
+    def settle(self) -> None:  # noqa: B027 - most have nothing to set up
+        """After `rewind`: whatever the first steps from there would set up lazily, at the price of being as many on."""
+
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
         """How many steps to time at a stretch, though the horizon may be nearer: a run is longer.
 

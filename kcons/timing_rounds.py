@@ -204,6 +204,7 @@ def _passes(run: Run, steps: int, pass_seconds: float) -> float:
     found: list[float] = []
     while sum(found) < pass_seconds:
         run.rewind()
+        run.settle()
         begun = perf_counter()
         run.march(steps)
         found.append(perf_counter() - begun)
