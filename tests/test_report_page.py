@@ -8,6 +8,7 @@ import pytest
 from committed_pages import FOLDER, ROOT, page
 
 from kcons import comparison_page, everything
+from kcons.results import Comparison
 
 PARTS = everything.parts(FOLDER / "report")
 PAGE = page("report.md")
@@ -31,6 +32,46 @@ def test_parts_were_measured_in_a_full_run(part):
     assert part.data["environment"]["commit"]
     if "comparison" in part.data:
         assert part.data["comparison"]["settings"]["quick"] is False
+
+
+def ratios(method, other, keys):
+    """Times of a step of one method over those of another, at all steps that both made."""
+    found = []
+    for part in PARTS:
+        if part.key in keys:
+            compared = Comparison.from_dict(part.data["comparison"])
+            times = {m.setting: m.step_seconds for m in compared.of(other) if m.status == "ok"}
+            found += [
+                m.step_seconds / times[m.setting]
+                for m in compared.of(method)
+                if m.setting in times and m.status == "ok"
+            ]
+    assert len(found) > 3 * len(keys)
+    return found
+
+
+def test_what_the_page_says_of_single_steps():
+    words = " ".join(PAGE.split())
+    molecules = {
+        part.key for part in PARTS if part.key.startswith(("water-216", "water-900", "chain-1e2", "chain-1e3"))
+    }
+    molecules |= {"chain-1e4", "alanine-hbonds", "alanine-allbonds", "alanine-hangles", "dhfr-hbonds", "dhfr-allbonds"}
+    pairs = (("openmm-rattle-1e-4", "openmm-verlet-1e-4"), ("openmm-rattle", "openmm-verlet-1e-12"))
+    compiled = [ratio for pair in pairs for ratio in ratios(*pair, molecules)]
+    assert f"{min(compiled):.1f} to {max(compiled):.1f} times as long as `VerletIntegrator` on molecules" in words
+    tiny = [ratio for pair in pairs for ratio in ratios(*pair, {"dumbbells"})]
+    assert f"up to {max(tiny):.1f} times on two dumbbells" in words
+    interpreted = ratios("openmm-kcons-rattle", "openmm-verlet-1e-12", {"dhfr-hbonds", "dhfr-allbonds"})
+    assert f"interpretation costs up to {max(interpreted) - 1:.0%}".replace("%", " %") in words
+    assert "on alanine it doubles the step" in words
+    alanine = ratios("openmm-kcons-rattle", "openmm-verlet-1e-12", {"alanine-hbonds", "alanine-allbonds"})
+    assert min(alanine) > 1.5 and max(alanine) < 2.5
+    few = ratios(
+        "shake-1e-4",
+        "rattle",
+        {"rotor", "dumbbells", "chain-1e2", "alanine-hbonds", "alanine-allbonds", "alanine-hangles"},
+    )
+    assert f"{min(few):.1f} to {max(few):.1f} times as long on few bonds" in words
 
 
 def test_no_part_is_missing():
