@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -240,7 +240,15 @@ def _lost_and_won(parts: Sequence[Part]) -> list[str]:
     if not judged:
         return ["No scene has both a method of kcons and another one yet."]
     won = sum(not row["losses"] for row in judged)
-    return [f"kcons is on the best front everywhere in {won} of {len(judged)} lines of this table."]
+    strictly = [replace(found, timing={**found.timing, "margin": None}) for found in compared]
+    close = sum(bool(row["losses"]) for found in strictly for row in summary(found) if row["rivals"]) - (
+        len(judged) - won
+    )
+    return [
+        f"Beyond the margin to which times repeat, no other method is ahead of kcons in {won} of {len(judged)} lines "
+        f"of this table. In {close} of these, another method measured more than {100 * LEAST_MARGIN:g} % cheaper "
+        "somewhere, within that margin: these are ties at best, not wins."
+    ]
 
 
 def plain_text(table: PageTable) -> str:

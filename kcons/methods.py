@@ -56,7 +56,21 @@ ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribut
 # -- kcons ------------------------------------------------------------------------------------------
 
 
-class _CoreRun(Run):
+class _StateRun(Run):
+    """A run of `State`s."""
+
+    _state: State
+
+    @property
+    def positions(self) -> FloatArray:
+        return self._state.positions
+
+    @property
+    def velocities(self) -> FloatArray:
+        return self._state.velocities
+
+
+class _CoreRun(_StateRun):
     def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
         super().__init__()
         self.constraints.watch(motion, ENGINE_CALLS)
@@ -90,14 +104,6 @@ class _CoreRun(Run):
     @property
     def finished(self) -> bool:
         return self._done >= self._steps
-
-    @property
-    def positions(self) -> FloatArray:
-        return self._state.positions
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self._state.velocities
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,7 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
     return lambda dt: item()  # type: ignore[no-any-return]
 
 
-class _ExtrapolatedRun(Run):
+class _ExtrapolatedRun(_StateRun):
     def __init__(self, scene: Scene, tolerance: float) -> None:
         super().__init__()
         motion = Motion(scene.constraint_set, scene.positions)
@@ -203,14 +209,6 @@ class _ExtrapolatedRun(Run):
     @property
     def finished(self) -> bool:
         return self.time == self._horizon
-
-    @property
-    def positions(self) -> FloatArray:
-        return self._state.positions
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self._state.velocities
 
 
 class Extrapolated(Method):

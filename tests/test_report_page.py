@@ -59,6 +59,9 @@ def test_what_the_page_says_of_single_steps():
     pairs = (("openmm-rattle-1e-4", "openmm-verlet-1e-4"), ("openmm-rattle", "openmm-verlet-1e-12"))
     compiled = [ratio for pair in pairs for ratio in ratios(*pair, molecules)]
     assert f"{min(compiled):.1f} to {max(compiled):.1f} times as long as `VerletIntegrator` on molecules" in words
+    chains = ratios("openmm-rattle-1e-4", "openmm-verlet-1e-4", {"chain-1e2", "chain-1e3"})
+    low, high = (round(100 * (ratio - 1)) for ratio in (min(chains), max(chains)))
+    assert f"at 1e-4, {low} to {high} % more at every step" in words
     tiny = [ratio for pair in pairs for ratio in ratios(*pair, {"dumbbells"})]
     assert f"up to {max(tiny):.1f} times on two dumbbells" in words
     interpreted = ratios("openmm-kcons-rattle", "openmm-verlet-1e-12", {"dhfr-hbonds", "dhfr-allbonds"})
