@@ -218,12 +218,12 @@ def _literal(value: Any) -> str:
 
 
 def _compare_all(chosen: argparse.Namespace) -> int:
-    from kcons import everything
+    from kcons import everything, parts
     from kcons.progress import Bars
 
     if chosen.list:
         print("parts of the whole comparison")
-        for item in everything.PLAN:
+        for item in parts.PLAN:
             print(f"  {item.key:<22} {item.heading}")
         return 0
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
@@ -232,7 +232,7 @@ def _compare_all(chosen: argparse.Namespace) -> int:
         say_written(everything.redraw(chosen.redraw, chosen.into))
         return 0
     folder: Path = chosen.out or Path("compare-all")
-    items = everything.chosen(chosen.only)
+    items = parts.chosen(chosen.only)
     folder.mkdir(parents=True, exist_ok=True)
     with Bars() as watcher:
         path = everything.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)

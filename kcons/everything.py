@@ -10,7 +10,7 @@ import gc
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,7 @@ from kcons.compare import Watcher, compare, reference_of
 from kcons.errors import InputError, KconsError
 from kcons.machine import code_digest, environment
 from kcons.methods import METHODS
+from kcons.parts import PLAN, Item
 from kcons.recommendation import sharpen
 from kcons.results import Comparison
 from kcons.scenes import Scene
@@ -29,241 +30,6 @@ from kcons.timing_rounds import FULL_ROUNDS, QUICK_ROUNDS
 FORMAT = "kcons-report-1"
 #: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
 QUICK_SECONDS = 280.0
-
-
-@dataclass(frozen=True)
-class Item:
-    """One part of the whole comparison.
-
-    Attributes
-    ----------
-    key : str
-        Name of its files.
-    heading : str
-    scene : str
-        A key of `scenes.SCENES`; '' for a part with a module of its own.
-    size : int or None
-    options : mapping
-        For the scene.
-    steps : sequence of float or None
-        Time steps in the unit the scene shows, instead of its own.
-    pace : float
-        The finest step times this decides about the work of a converged reference.
-    every_stepper : bool
-        Whether all steppers of kcons run in a full run, or the usual ones.
-    without : mapping of str to str
-        Beginnings of names of methods that are left out, and why.
-    needs : str
-        A package without which it cannot run.
-    budget : float
-        Seconds a method.
-    seconds : float
-        What a full run of it takes on one core, for the time left.
-    quick_seconds : float
-        The same in a quick run; 0 where it is left out of it.
-    quick_size : int or None
-        Size in a quick run, by default what the scene says.
-    module : str
-        Where `measure`, `figure` and `table` are, for a part that is no scene.
-    """
-
-    key: str
-    heading: str
-    scene: str = ""
-    size: int | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    steps: Sequence[float] | None = None
-    pace: float | None = None
-    every_stepper: bool = False
-    without: Mapping[str, str] = field(default_factory=dict)
-    needs: str = ""
-    budget: float = 15.0
-    seconds: float = 30.0
-    quick_seconds: float = 6.0
-    quick_size: int | None = None
-    module: str = ""
-
-
-def _molecule(structure: str, text: str, constrain: str, title: str, **more: Any) -> Item:
-    key = f"{structure}-{constrain}"
-    return Item(key, f"{text}, {title}", structure, options={"constrain": constrain}, needs="openmm", **more)
-
-
-#: Steps of its own size are for few atoms and smooth forces.
-FEW = {"extrapolation": "meant for few atoms; smaller systems show it"}
-TOO_LONG = {"ase-internals": "a step takes longer than the whole budget; smaller systems show it"}
-TOO_LARGE = FEW | dict.fromkeys(
-    ("ase-bonds", "ase-internals", "openmm-verlet-", "openmm-rattle-", "openmm-held", "dop853"),
-    "too large for it: its own Python loops over bonds, or its set-up, would take hours",
-)
-SAVE_TIME = "left out to save time; smaller systems show it"
-CCMA = "CCMA takes a minute to set up for these constraints, each time, and loops in Python longer for a step"
-
-#: All parts, in the order in which they are run and shown.
-PLAN: tuple[Item, ...] = (
-    Item("sphere", "Free particles on spheres", "sphere", every_stepper=True, seconds=25, quick_seconds=6),
-    Item("sphere-pendulum", "Spherical pendulums", "sphere-pendulum", every_stepper=True, seconds=25, quick_seconds=6),
-    Item(
-        "sphere-pendulum-top",
-        "Spherical pendulum that passes near the top",
-        "sphere-pendulum-top",
-        every_stepper=True,
-        seconds=25,
-    ),
-    Item("pendulum", "Planar pendulum from 179.9°", "pendulum", every_stepper=True, seconds=15, quick_seconds=5),
-    Item("triple-pendulum", "Triple pendulum", "triple-pendulum", every_stepper=True, seconds=15, quick_seconds=5),
-    Item("rotor", "Asymmetric top", "rotor", every_stepper=True, seconds=25, quick_seconds=6),
-    Item("dumbbells", "Two colliding dumbbells", "dumbbells", every_stepper=True, seconds=100, quick_seconds=6),
-    Item("fekete", "Fekete points on a sphere", "fekete", every_stepper=True, seconds=20),
-    Item(
-        "ethanol",
-        "Ethanol, GFN2-xTB",
-        "ethanol",
-        needs="tblite",
-        every_stepper=True,
-        seconds=80,
-        quick_seconds=20,
-        budget=20,
-    ),
-    Item(
-        "water-216",
-        "Water, 216 molecules",
-        "water",
-        216,
-        without=FEW,
-        seconds=300,
-        quick_seconds=16,
-        quick_size=8,
-        budget=20,
-    ),
-    Item(
-        "water-900",
-        "Water, 900 molecules",
-        "water",
-        900,
-        without=TOO_LONG | FEW,
-        seconds=120,
-        quick_seconds=0,
-        budget=20,
-    ),
-    Item(
-        "water-5000",
-        "Water, 5000 molecules",
-        "water",
-        5000,
-        steps=(4.0, 2.0, 1.0),
-        pace=2.0,
-        without=FEW
-        | dict.fromkeys(
-            ("ase-internals", "dop853", "openmm-middle", "openmm-nose", "kahan-li6", "openmm-kcons-kahan-li6"),
-            SAVE_TIME,
-        ),
-        seconds=200,
-        quick_seconds=0,
-        budget=15,
-    ),
-    Item("chain-1e2", "Chain of 10² bonds", "chain", 100, every_stepper=True, seconds=75, quick_seconds=14),
-    Item("chain-1e3", "Chain of 10³ bonds", "chain", 1000, without=FEW, seconds=120, quick_seconds=14),
-    Item(
-        "chain-1e4",
-        "Chain of 10⁴ bonds",
-        "chain",
-        10_000,
-        without=TOO_LONG | FEW,
-        seconds=300,
-        quick_seconds=0,
-        budget=10,
-    ),
-    Item(
-        "chain-1e5",
-        "Chain of 10⁵ bonds",
-        "chain",
-        100_000,
-        steps=(10.0, 5.0, 2.5),
-        pace=2.0,
-        without=TOO_LARGE,
-        seconds=60,
-        quick_seconds=0,
-        budget=10,
-    ),
-    Item(
-        "chain-1e6",
-        "Chain of 10⁶ bonds",
-        "chain",
-        1_000_000,
-        steps=(10.0, 5.0, 2.5),
-        pace=2.0,
-        without=TOO_LARGE | dict.fromkeys(("openmm", "kahan-li6"), SAVE_TIME),
-        seconds=180,
-        quick_seconds=0,
-        budget=20,
-    ),
-    *(
-        _molecule("alanine", "Alanine dipeptide", constrain, title, every_stepper=True, seconds=60, quick_seconds=14)
-        for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"), ("hangles", "HAngles"))
-    ),
-    *(
-        _molecule("dhfr", "DHFR", constrain, title, without=FEW, seconds=350, quick_seconds=0, budget=15)
-        for constrain, title in (("hbonds", "HBonds"), ("allbonds", "AllBonds"))
-    ),
-    _molecule(
-        "dhfr",
-        "DHFR",
-        "hangles",
-        "HAngles",
-        steps=(2.0, 1.0),
-        without=FEW
-        | dict.fromkeys(
-            (
-                "ase-bonds",
-                "ase-internals",
-                "openmm-verlet-",
-                "openmm-middle",
-                "openmm-nose",
-                "openmm-kcons-",
-                "openmm-rattle",
-            ),
-            CCMA,
-        ),
-        seconds=200,
-        quick_seconds=0,
-        budget=75,
-    ),
-    Item(
-        "solver-precision",
-        "The solvers alone: residual against time a constraint",
-        module="kcons.solver_precision",
-        seconds=400,
-        quick_seconds=25,
-    ),
-    Item(
-        "scaling",
-        "Scaling: cost and memory against size",
-        module="kcons.scaling",
-        seconds=600,
-        quick_seconds=25,
-    ),
-)
-
-
-def chosen(keys: Sequence[str] | None = None) -> list[Item]:
-    """Parts by key; all by default. A name of a scene stands for all its parts.
-
-    Raises
-    ------
-    InputError
-        Unknown key.
-    """
-    if not keys:
-        return list(PLAN)
-    found: dict[str, Item] = {}
-    for key in keys:
-        fitting = [item for item in PLAN if key == item.key] or [item for item in PLAN if key == item.scene]
-        if not fitting:
-            known = ", ".join(item.key for item in PLAN)
-            raise InputError(f"there is no part {key!r} of the comparison; there are {known}", item="only")
-        found |= {item.key: item for item in fitting}
-    return [item for item in PLAN if item.key in found]
 
 
 def run(
@@ -415,13 +181,13 @@ def scene_of(item: Item, quick: bool) -> Scene:
 def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[str, str]]:
     """Names of the methods that run, and of those that are left out though they could, with the reasons.
 
-    Of every host the usual ones, those that refuse with their reasons; of OpenMM and of guests those that can run
-    the scene.
+    All steppers of kcons on arrays, in a quick run the usual ones; of other hosts the usual ones, those that refuse
+    with their reasons; of OpenMM and of guests those that can run the scene.
     """
     kept: list[str] = []
     out: dict[str, str] = {}
     for method in METHODS.values():
-        usual = method.usual or (item.every_stepper and not quick and method.host == "kcons")
+        usual = method.usual or (not quick and method.host == "kcons")
         guest = method.guest or method.host == "openmm"
         if not usual or not method.follows or (guest and method.refuses(scene) is not None):
             continue

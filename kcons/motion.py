@@ -278,6 +278,11 @@ class Motion:
         for solver, lam in zip(self.plan.solvers, found, strict=True):
             multipliers[solver.rows] = lam
 
+    @property
+    def sources(self) -> tuple[ConstraintSet, ConstraintSet]:
+        """The set that was given and `constraint_set`: a barostat may change the cell in either."""
+        return self._given, self.constraint_set
+
     def cell(self) -> FloatArray | None:
         """`lattice`, which a barostat may have changed in the set that was given."""
         if self._given.lattice is self._lattice and self.constraint_set.lattice is self._lattice:

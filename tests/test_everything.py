@@ -8,10 +8,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from kcons import cli, comparison_page, everything, scenes, timing_rounds
+from kcons import cli, comparison_page, everything, parts, scenes, timing_rounds
 from kcons.compare import Watcher
 from kcons.errors import InputError
-from kcons.everything import Item
+from kcons.methods import STEPPERS, USUAL_STEPPERS
+from kcons.parts import Item
 from kcons.results import Comparison
 
 TINY = (
@@ -36,7 +37,8 @@ class Listener(Watcher):
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    monkeypatch.setattr(everything, "PLAN", TINY)
+    for module in (parts, everything):
+        monkeypatch.setattr(module, "PLAN", TINY)
     monkeypatch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, {}))
     monkeypatch.setattr(everything, "code_digest", lambda: "digest")
 
@@ -45,7 +47,8 @@ def tiny(monkeypatch):
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("all")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(everything, "PLAN", TINY)
+        for module in (parts, everything):
+            patch.setattr(module, "PLAN", TINY)
         patch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, {}))
         patch.setattr(everything, "code_digest", lambda: "digest")
         everything.run(TINY, folder)
@@ -276,8 +279,8 @@ def test_there_is_nothing_to_redraw(tmp_path):
 
 def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     monkeypatch.undo()
-    plan = {item.key: item for item in everything.PLAN}
-    assert len(plan) == len(everything.PLAN)
+    plan = {item.key: item for item in parts.PLAN}
+    assert len(plan) == len(parts.PLAN)
     for item in plan.values():
         assert item.module or item.scene in scenes.SCENES
     assert {"sphere", "sphere-pendulum", "sphere-pendulum-top", "pendulum", "triple-pendulum", "rotor"} <= set(plan)
@@ -286,9 +289,9 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     for structure in ("alanine", "dhfr"):
         for constrain in ("hbonds", "allbonds", "hangles"):
             assert plan[f"{structure}-{constrain}"].options == {"constrain": constrain}
-    assert sum(item.seconds for item in plan.values()) <= 5400  # "an hour and a half" (docs/report.md)
+    assert sum(item.seconds for item in plan.values()) <= 6300  # "an hour and three quarters" (docs/report.md)
     assert sum(item.quick_seconds for item in plan.values()) <= everything.QUICK_SECONDS
-    assert [item.key for item in everything.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
+    assert [item.key for item in parts.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
 
 
 def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
@@ -297,10 +300,10 @@ def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
     names, left_out = everything.methods_of(Item("x", "x", "chain"), scene, False)
     for name in ("rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853", "verlet"):
         assert name in names
-    assert "yoshida4" not in names and "openmm-middle-bath" not in names
+    assert "openmm-middle-bath" not in names
     assert not left_out
-    every, _ = everything.methods_of(Item("x", "x", "chain", every_stepper=True), scene, False)
-    assert {"yoshida4", "baumgarte"} <= set(every)
-    assert set(every) >= set(names)
+    assert set(STEPPERS) | {"extrapolation"} <= set(names)
+    quick, _ = everything.methods_of(Item("x", "x", "chain"), scene, True)
+    assert {name for name in quick if name in STEPPERS} == set(USUAL_STEPPERS)
     kept, out = everything.methods_of(Item("x", "x", "chain", without={"ase-i": "slow", "dop": "why"}), scene, False)
     assert out == {"ase-internals": "slow", "dop853": "why", "dop853-projected": "why"} and not set(out) & set(kept)

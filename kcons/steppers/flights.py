@@ -38,6 +38,17 @@ END, FLY, BOTH = 1, 2, 3
 UNENDED, _FORCE, _ENGINE = -1, -2, -3
 #: No number of iterations.
 _UNKNOWN = 1000
+#: Types of the arguments of `one_flight` and `many_flights`, the last three apart.
+_POINTS = numba.float64[:, ::1]
+_ONE = (
+    *(numba.int64, numba.float64, _POINTS, _POINTS, _POINTS, numba.float64, numba.float64, _POINTS, _POINTS),
+    numba.float64[::1],
+)
+_MANY = (
+    *(numba.int64, numba.float64[::1], numba.float64, numba.int64, _POINTS, _POINTS, _POINTS, numba.float64[:, :, ::1]),
+    *(numba.float64, numba.float64, _POINTS, numba.boolean, _POINTS, numba.float64[::1]),
+)
+_DOUBLE = np.dtype(np.float64)
 #: Of a stage that is not flown.
 NO_FRACTIONS = np.empty(0)
 #: What it reports of the end of a step; less than 0 where the engine has to do it.
@@ -65,6 +76,7 @@ class Flights:
         self.took = _UNKNOWN
         self._lattice = motion.lattice
         set_lattice(found[0], self._lattice)
+        self._kernels: dict[Any, Any] = {}
 
     @classmethod
     def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> Flights | None:
@@ -91,9 +103,32 @@ class Flights:
             set_lattice(self._tables[0], lattice)
         return self._tables
 
+    @property
+    def one(self) -> Any:
+        """`one_flight` for these tables, without Numba's dispatcher.
+
+        That asks for the type of each argument, which takes as long as a dozen bonds. Here all arrays are of one type,
+        and have to be: contiguous, of doubles.
+        """
+        return self._kernel(one_flight, _ONE)
+
+    @property
+    def many(self) -> Any:
+        """`many_flights` in the same way."""
+        return self._kernel(many_flights, _MANY)
+
+    def _kernel(self, function: Any, types: tuple[Any, ...]) -> Any:
+        found = self._kernels.get(function)
+        if found is None:
+            flags = [numba.types.none if kind is None else numba.int64 for kind in self._tables[1:]]
+            found = self._kernels[function] = function.compile((*types, *flags))
+        return found
+
     def known(self, *arrays: FloatArray) -> Iterator[FloatArray]:
-        """Arrays as the kernels were compiled for, or copies: read-only ones would have all compiled once more."""
-        return (a if a.flags.carray else np.array(a, dtype=np.float64, order="C") for a in arrays)
+        """Arrays as the kernels were compiled for, or copies."""
+        return (
+            a if a.flags.carray and a.dtype is _DOUBLE else np.array(a, dtype=np.float64, order="C") for a in arrays
+        )
 
     def move(self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: Packed) -> str:
         """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.

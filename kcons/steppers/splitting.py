@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
-from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights, many_flights, one_flight
+from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import NO_WORK, Point
@@ -146,15 +146,20 @@ class Splitting:
         here = before = x, v, time, left_over
         u, spare, next_spare = np.empty(shape), np.empty(shape), np.empty(shape)
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
-        new, tables_now = np.empty, flights.tables
+        new, array, double = np.empty, np.ndarray, np.dtype(np.float64)
+        tables, (given, held) = flights.tables(), system.motion.sources
+        cell = held.lattice
+        one = many = flights.many if self._many else flights.one
         try:
             for made in range(steps):
-                tables = tables_now()
+                if held.lattice is not cell or given.lattice is not cell:
+                    # The force function is a barostat, too.
+                    tables, cell = flights.tables(), held.lattice
                 out = new(shape)
                 if later is None:
-                    found = one_flight(what, dt, x, v, u, last, first, f, out, *tables)
+                    found = one(what, dt, x, v, u, last, first, f, out, *tables)
                 else:
-                    found = many_flights(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
+                    found = many(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
                 if found == UNENDED:
                     return _at(before, start, made - 1), made - 1
                 here = x, v, time, left_over
@@ -166,9 +171,7 @@ class Splitting:
                             now = time + (stage.ends[-1] * dt + left_over)
                             f = system.accepted(force(out, now), number + made + 1, False)
                         x, out = out, new(shape)
-                        found = many_flights(
-                            FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables
-                        )
+                        found = many(FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
                 if found < 0:
                     return _at(here, start, made), made
                 # As State.later.
@@ -178,7 +181,12 @@ class Splitting:
                 left_over = (time - (then - part)) + (change - part)
                 time = then
                 if force is not None:
-                    f = system.accepted(force(out, time), number + made + 1, False)
+                    raw: Any = force(out, time)
+                    # What System.accepted finds most often.
+                    if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
+                        f = raw
+                    else:
+                        f = system.accepted(raw, number + made + 1, False)
                 x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
         except InputError:
             return _at(here, start, made), made
@@ -227,6 +235,7 @@ class Splitting:
         if start is not flights.last:
             x, before, f = flights.known(x, before, f)
         v, work, many, tables = np.empty(shape), NO_WORK, self._many, flights.tables()
+        fly = flights.many if many else flights.one
         if many:
             work = np.empty((3, *shape))
         out, left = x, len(self._stages)
@@ -236,11 +245,11 @@ class Splitting:
                 out = np.empty(shape)
                 now = start.time + (stage.ends[-1] * dt + start.time_remainder) if left else time
                 if many:
-                    found = many_flights(
+                    found = fly(
                         FLY, fractions, dt, 0, x, before, v, work, 0.0, kick * dt, f, before is not v, out, *tables
                     )
                 else:
-                    found = one_flight(FLY, dt, x, before, v, 0.0, kick * dt, f, out, *tables)
+                    found = fly(FLY, dt, x, before, v, 0.0, kick * dt, f, out, *tables)
                 if found != flights.took:
                     bad = flights.landed(found, fractions, dt, x, v, work, f, out, now, tables)
                     if bad:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -216,6 +218,57 @@ def test_the_engine_is_asked_for_nothing_and_forces_are_not_copied() -> None:
     for call in ("project_positions", "project_velocities"):
         setattr(system.motion, call, lambda *a, call=call, **k: asked.append(call))
     made = counted(system)
-    Rattle().march(system, state, 0.02, 8)
-    assert not asked
+    after = Rattle().march(system, state, 0.02, 8)
+    assert not asked and not made
+    force = system.force
+    system.force = lambda x, time: force(x, time).tolist()
+    listed = Rattle().march(system, state, 0.02, 8)
     assert made == [(number, False) for number in range(1, 9)]
+    assert_same(listed, after)
+
+
+def test_forces_of_other_kinds_are_taken_as_they_come() -> None:
+    system, state = molecules(*GROUPS)
+    force = system.force
+    expected = Rattle().march(system, system.with_forces(state), 0.02, 5)
+    for kind in (np.asfortranarray, lambda f: np.repeat(f, 2, axis=1)[:, ::2], lambda f: f.astype(np.longdouble)):
+        system.force = lambda x, time, kind=kind: kind(force(x, time))
+        assert_same(Rattle().march(system, system.with_forces(state), 0.02, 5), expected)
+    system.force = lambda x, time: force(x, time)[:-1]
+    with pytest.raises(InputError, match="shape"):
+        Rattle().march(system, state, 0.02, 5)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.asfortranarray, lambda a: a[::-1].copy()[::-1]])
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4()], ids=repr)
+def test_starts_of_other_kinds_of_arrays(stepper, kind) -> None:
+    system, state = molecules(*GROUPS)
+    x, v = kind(state.positions), kind(state.velocities)
+    plain = system.with_forces(State(np.array(x, dtype=float, order="C"), np.array(v, dtype=float, order="C")))
+    strange = State(x, v, forces=kind(np.array(plain.forces)))
+    plain = replace(plain, forces=np.array(strange.forces, dtype=float, order="C"))
+    for march in (stepper.march, lambda *run: one_by_one(stepper, *run)):
+        assert_same(march(system, strange, 0.02, 5), march(system, plain, 0.02, 5))
+
+
+@pytest.mark.parametrize("where", [0, 1], ids=["given", "held"])
+def test_a_cell_that_the_force_function_changes_is_seen(where) -> None:
+    cell = np.diag([9.0, 8.0, 7.0])
+    # Molecules whose atoms are in different cells.
+    apart = np.random.default_rng(0).integers(-1, 2, size=(len(triangles()[1].positions), 3)) * np.diag(cell)
+
+    system, state = triangles(cell=cell, pbc=True)
+    force, calls = system.force, []
+
+    def press(x, time):
+        calls.append(time)
+        if len(calls) == 4:
+            system.motion.sources[where].with_cell(1.001 * cell)
+        return force(x, time)
+
+    system.force = press
+    found = Rattle().march(system, State(state.positions + apart, state.velocities), 0.02, 9)
+    held = system.motion.constraint_set
+    assert np.abs(held.value(found.positions, 0.0)).max() <= 1e-13
+    held.with_cell(cell)
+    assert np.abs(held.value(found.positions, 0.0)).max() > 1e-3
