@@ -28,6 +28,7 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.guard import Guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 
@@ -73,6 +74,18 @@ def test_calls_do_not_change_the_motion():
     for there, speeds in ends[1:]:
         np.testing.assert_allclose(there, ends[0][0], rtol=0, atol=1e-12)
         np.testing.assert_allclose(speeds, ends[0][1], rtol=0, atol=1e-10)
+
+
+def test_checks_wait_for_the_end_of_a_call_that_is_near(monkeypatch):
+    system, x, v = dumbbell()
+    context = started(system, integrator := RattleIntegrator(1e-3, check_every=10), x, v)
+    checked = []
+    check = Guard.check
+    monkeypatch.setattr(Guard, "check", lambda guard: checked.append(context.getStepCount()) or check(guard))
+    for steps in (8, 7, 12, 16, 34):
+        integrator.step(steps)
+    # What is due at 10 waits for 15, what is due at 25 for 27; what is due at 37 does not wait for 43.
+    assert checked == [15, 27, 37, 47, 57, 67, 77]
 
 
 def test_order_two():
