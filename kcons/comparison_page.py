@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcons import page, report
 from kcons.errors import InputError
-from kcons.fronts import COSTS, EVERY_HOST, LEAST_MARGIN, NO_FORCE, summary, verdict
+from kcons.fronts import COSTS, EVERY_HOST, LEAST_MARGIN, NO_FORCE, overtaken, summary, verdict
 from kcons.page import PageTable, Section
 from kcons.results import Comparison, duration
 
@@ -50,9 +50,10 @@ class Part:
 
 def write(path: Path, parts: Sequence[Part]) -> Path:
     """The page of all parts."""
+    sentences, close = _lost_and_won(parts)
     sections = [
         Section("Where and with what", tables=[_machines(parts)]),
-        Section("Who wins where", [WINNERS_NOTE, *_lost_and_won(parts)], tables=[winners(parts)]),
+        Section("Who wins where", [WINNERS_NOTE, *sentences, *close], tables=[winners(parts)]),
         *(_section(part) for part in parts),
     ]
     return page.write(path, TITLE, sections, introduction=INTRODUCTION)
@@ -226,7 +227,9 @@ def results(parts: Sequence[Part]) -> str:
     """The table of winners in Markdown, with where and with what it was measured."""
     machines = _machines(parts)
     where = [f"{row[0]}; {row[2]}; commit {row[3]}; {row[4]} run, {row[6]} to {row[7]}." for row in machines.rows]
-    return "\n\n".join([*where, *_lost_and_won(parts), markdown(winners(parts), SHORT), ""])
+    sentences, close = _lost_and_won(parts)
+    listed = ["\n".join(f"- {line}" for line in close)] if close else []
+    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts), SHORT), ""])
 
 
 def factor(ratio: float) -> str:
@@ -234,21 +237,35 @@ def factor(ratio: float) -> str:
     return f"{ratio:.2g} ×" if ratio < 100 else f"{ratio:,.0f} ×" if ratio < 1e5 else f"{ratio:.0e} ×"
 
 
-def _lost_and_won(parts: Sequence[Part]) -> list[str]:
-    compared = [Comparison.from_dict(part.data["comparison"]) for part in parts if "comparison" in part.data]
-    judged = [row for found in compared for row in summary(found) if row["rivals"]]
-    if not judged:
-        return ["No scene has both a method of kcons and another one yet."]
-    won = sum(not row["losses"] for row in judged)
-    strictly = [replace(found, timing={**found.timing, "margin": None}) for found in compared]
-    close = sum(bool(row["losses"]) for found in strictly for row in summary(found) if row["rivals"]) - (
-        len(judged) - won
-    )
-    return [
-        f"Beyond the margin to which times repeat, no other method is ahead of kcons in {won} of {len(judged)} lines "
-        f"of this table. In {close} of these, another method measured more than {100 * LEAST_MARGIN:g} % cheaper "
-        "somewhere, within that margin: these are ties at best, not wins."
+def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
+    """Sentences on all lines of the table, and those lines in which others are close."""
+    compared = [
+        (part.heading, Comparison.from_dict(part.data["comparison"])) for part in parts if "comparison" in part.data
     ]
+    judged = [row for _, found in compared for row in summary(found) if row["rivals"]]
+    if not judged:
+        return ["No scene has both a method of kcons and another one yet."], []
+    won = sum(not row["losses"] for row in judged)
+    both = sum(bool(pairs) for _, found in compared for pairs in overtaken(found).values())
+    close = [
+        f"{heading}: {row['lost']}"
+        for heading, found in compared
+        for known, row in zip(summary(found), summary(_at_least_margin(found)), strict=True)
+        if row["rivals"] and row["losses"] and not known["losses"]
+    ]
+    percent = f"{100 * LEAST_MARGIN:g} %"
+    return [
+        f"In {len(judged) - both} of {len(judged)} lines of this table no other method is both cheaper and more "
+        f"accurate, by more than {percent} each, than a point on kcons' own front. At the same error, and beyond the "
+        f"margin to which times repeat, no other method is cheaper than kcons in {won} of them.",
+        f"Within that margin, another method measured more than {percent} cheaper at the same error somewhere in "
+        f"{len(close)} lines: ties at best, not wins." + (" These are:" if close else ""),
+    ], close
+
+
+def _at_least_margin(found: Comparison) -> Comparison:
+    """The same, as if times repeated to within `LEAST_MARGIN`."""
+    return replace(found, timing={**found.timing, "margin": None})
 
 
 def plain_text(table: PageTable) -> str:

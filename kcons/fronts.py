@@ -273,6 +273,31 @@ def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> S
     return Standing(host, cost, on_front, True, losses, *(gain or (None, None, None, None)))
 
 
+def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measurement]]]:
+    """Points on kcons' own front, each with one of another method that is both cheaper and more accurate.
+
+    Cheaper by more than `LEAST_MARGIN` (evaluations: `SAME_EVALUATIONS`), more accurate by more than `SAME_ERROR`; by
+    host, in what decides there. Hosts without rivals are left out.
+    """
+    judged, floor = verdict(comparison), floor_of(comparison)
+    found: dict[str, list[tuple[Measurement, Measurement]]] = {}
+    for standing in judged.standings:
+        host, cost = standing.host, standing.cost
+        if not standing.rivals or cost != judged.decides_on(host):
+            continue
+        here = points(comparison, cost, None if host == EVERY_HOST else host)
+        cheaper = 1 + (LEAST_MARGIN if cost == "wall" else SAME_EVALUATIONS)
+        found[host] = [
+            (mine, other)
+            for mine in front([m for m in here if is_ours(m)], cost, floor)
+            for other in here
+            if not is_ours(other)
+            and cost_of(other, cost) * cheaper < cost_of(mine, cost)
+            and max(float(other.error or 0.0), floor) < max(float(mine.error or 0.0), floor) * (1 - SAME_ERROR)
+        ]
+    return found
+
+
 # -- in words ---------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from html.parser import HTMLParser
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -158,6 +160,34 @@ def test_winners_name_host_and_gain(finished):
     assert text.splitlines()[0] == "| scene | host | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
+
+
+def test_close_calls_are_named(finished):
+    """Lines that only the margin saves are listed, and what beats kcons in both is counted."""
+    (chain,) = [part for part in everything.parts(finished) if part.key == "chain-3"]
+
+    def told(error, factor, margin):
+        data = copy.deepcopy(chain.data)
+        measured = data["comparison"]["measurements"]
+        best = min((m for m in measured if m["method"] == "rattle"), key=lambda m: m["error"])
+        peer = {**best, "method": "dop853", "title": "SciPy DOP853"}
+        peer |= {"error": error * best["error"], "seconds_per_time": factor * best["seconds_per_time"]}
+        data["comparison"]["measurements"] = [best, peer]
+        data["comparison"]["timing"] = {"force_seconds": 1e-3, "margin": margin}
+        return comparison_page.results([dataclasses.replace(chain, data=data)])
+
+    text = told(1.0, 0.8, 0.3)
+    assert "In 1 of 1 lines of this table no other method is both cheaper and more accurate" in text
+    assert "no other method is cheaper than kcons in 1 of them" in text
+    assert (
+        "at the same error somewhere in 1 lines: ties at best, not wins. These are:\n\n- Chain of 3 bonds: SciPy"
+        in text
+    )
+    assert "up to 20 % cheaper (wall time, arrays)" in text
+    text = told(1.0, 0.8, 0.1)
+    assert "no other method is cheaper than kcons in 0 of them" in text
+    assert "somewhere in 0 lines: ties at best, not wins.\n" in text
+    assert "In 0 of 1 lines of this table no other" in told(0.9, 0.8, 0.3)
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):

@@ -100,6 +100,31 @@ def test_times_within_the_margin_are_the_same():
     assert not fronts.verdict(comparison(*RATTLE, peer, margin=0.3)).losses
 
 
+@pytest.mark.parametrize(
+    ("peer", "beaten"),
+    [
+        (point("dop853", "SciPy DOP853", 0.9e-2, 90, 0.9), [1e-2]),
+        (point("dop853", "SciPy DOP853", 0.9e-2, 90, 0.96), []),
+        (point("dop853", "SciPy DOP853", 0.97e-2, 90, 0.5), []),
+        (point("dop853", "SciPy DOP853", 0.9e-4, 90, 0.9), [1e-2, 1e-4]),
+        (point("dop853", "SciPy DOP853", 2e-2, 90, 0.1), []),
+    ],
+    ids=["both", "time within five percent", "error within five percent", "both of two", "cheaper only"],
+)
+def test_overtaken_is_what_another_method_beats_in_time_and_error(peer, beaten):
+    dominated = point("yoshida4", "kcons Yoshida4", 2e-2, 100, 2.0)  # by RATTLE: not on the front
+    found = fronts.overtaken(comparison(*RATTLE, dominated, peer, margin=0.3))
+    assert [mine.error for mine, _ in found[fronts.ARRAYS]] == beaten
+    assert all(other is peer for _, other in found[fronts.ARRAYS])
+
+
+def test_overtaken_counts_evaluations_where_these_decide():
+    peer = point("dop853", "SciPy DOP853", 0.9e-2, 97, 5.0)
+    assert fronts.overtaken(comparison(*RATTLE, peer, force=1e-7)) == {fronts.ARRAYS: [(RATTLE[0], peer)]}
+    assert fronts.overtaken(comparison(*RATTLE, peer)) == {fronts.ARRAYS: []}
+    assert fronts.overtaken(comparison(*RATTLE)) == {}
+
+
 def test_evaluations_decide_where_forces_take_no_time():
     assert fronts.verdict(comparison(*RATTLE, force=1e-7)).decides == "evaluations"
     assert fronts.verdict(comparison(*RATTLE, force=1e-5)).decides == "wall"
