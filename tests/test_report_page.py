@@ -61,15 +61,13 @@ def test_what_the_page_says_of_single_steps():
     compiled = [ratio for pair in pairs for ratio in ratios(*pair, molecules)]
     assert f"{min(compiled):.1f} to {max(compiled):.1f} times as long as `VerletIntegrator` on molecules" in words
     chains = ratios("openmm-rattle-1e-4", "openmm-verlet-1e-4", {"chain-1e2", "chain-1e3"})
-    low, high = (round(100 * (ratio - 1)) for ratio in (min(chains), max(chains)))
-    assert f"at 1e-4, {low} to {high} % more at every step" in words
+    assert f"({min(chains):.2f} to {max(chains):.2f} times on chains of 100 and 1000 bonds at 1e-4" in words
     tiny = [ratio for pair in pairs for ratio in ratios(*pair, {"dumbbells"})]
     assert f"up to {max(tiny):.1f} times on two dumbbells" in words
     interpreted = ratios("openmm-kcons-rattle", "openmm-verlet-1e-12", {"dhfr-hbonds", "dhfr-allbonds"})
     assert f"interpretation costs up to {max(interpreted) - 1:.0%}".replace("%", " %") in words
-    assert "on alanine it doubles the step" in words
     alanine = ratios("openmm-kcons-rattle", "openmm-verlet-1e-12", {"alanine-hbonds", "alanine-allbonds"})
-    assert min(alanine) > 1.5 and max(alanine) < 2.5
+    assert f"on alanine steps take {min(alanine):.1f} to {max(alanine):.1f} times as long" in words
     few = ratios(
         "shake-1e-4",
         "rattle",
