@@ -144,6 +144,8 @@ def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntAr
         rows = slice(start, start + item.n_rows)
         if item.holonomic and item.width <= COMPILED_WIDTH:
             kinds[rows] = item.kind
+            if item.windings is not None:  # whole cells between the atoms of a row: for no compiled solver
+                kinds[start + np.flatnonzero(item.windings.any(axis=(1, 2)))] = RowKind.INTERPRETED
         if item.kind == RowKind.DISTANCE:
             pairs[rows] = item.atoms
     return kinds, pairs

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,6 +18,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
+from kcons.images import find_images, image_error, minimum_image
 
 
 class ConstraintSet:
@@ -54,6 +56,9 @@ class ConstraintSet:
     Notes, eqs. 81-92.
     """
 
+    #: What an engine converted to make this set from another one; see `Motion.conversions`.
+    conversions: tuple[Any, ...] = ()
+
     def __init__(
         self,
         constraints: Iterable[Constraint] | Constraint,
@@ -82,14 +87,15 @@ class ConstraintSet:
         self.constraints: tuple[Constraint, ...] = ()
         starts = np.concatenate([[0], np.cumsum([c.n_rows for c in given], dtype=np.int64)])
         self.starts: IntArray = starts.astype(np.int64)
+        weighted = [item.with_masses(m[item.atoms]) for item in given]
+        marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
+        y = self.whole(x)
         bound: list[Constraint] = []
-        for start, item in zip(self.starts, given, strict=False):
-            r = self.gather(item, x)
-            item = item.with_masses(m[item.atoms])
+        for start, item in zip(self.starts, marked, strict=False):
+            r = self._gather(item, x, y)
             item.check(r, time, int(start))
             if item.target is None:
                 item = item.with_target(item.measure(r, time) if item.holonomic else np.zeros(item.n_rows))
-            self._check_half_box(item, r, int(start), time)
             bound.append(item)
         self.constraints = tuple(bound)
         refuse_contradictions(self.constraints, self.starts, time)
@@ -118,8 +124,26 @@ class ConstraintSet:
         self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
 
     def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
-        """Change the cell in place (barostats); targets are unchanged."""
+        """Change the cell in place (barostats); targets are unchanged.
+
+        Raises
+        ------
+        InputError
+            A degenerate cell; a first cell, or a new periodic direction, for rows that have to be sorted by their
+            images, which needs positions.
+        """
+        before = self.lattice
         self._set_cell(cell, pbc)
+        if self.lattice is None or all(c.family == "Distance" and not c.moving for c in self.constraints if c.relative):
+            return
+        periodic = np.zeros(3, bool) if before is None else before[1].any(axis=0)
+        if np.any(self.lattice[1].any(axis=0) & ~periodic):
+            self.lattice = before
+            raise InputError(
+                "this set was made without this periodic direction, and which images its rows mean has to be found "
+                "anew; make a new ConstraintSet with the cell",
+                item="cell",
+            )
 
     @property
     def half_width(self) -> float:
@@ -129,64 +153,84 @@ class ConstraintSet:
         norms = np.linalg.norm(self.lattice[1], axis=0)
         return 0.5 / float(norms.max())
 
-    def check_half_box(self, positions: FloatArray | None = None, time: float = 0.0) -> None:
-        """Check all rows against half the box; without `positions`, distances only.
+    def check_half_box(self, positions: FloatArray | None = None) -> None:
+        """Check against half the box that images are unambiguous; without `positions`, of held distances only.
 
         Raises
         ------
         InputError
-            A row whose minimum image is ambiguous.
+            A constant distance that was shorter than half the box is so no longer.
+        ImageError
+            Atoms that nothing ties together are half the box apart.
         """
         if self.lattice is None:
             return
-        longest, number = self._longest_distance
+        longest, row = self._longest_plain
         if longest >= self.half_width:
-            item = self.constraints[number]
-            self._check_half_box(item, np.zeros((item.n_rows, item.width, 3)), int(self.starts[number]), time)
+            raise InputError(
+                f"row {self.row_name(row)}: target {longest:g} is not shorter than half the box "
+                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or make a new "
+                "ConstraintSet in this one",
+                item="target",
+                atoms=self.row_atoms(row),
+            )
+        if positions is None:
+            return
+        self.refuse_loose_links(self.whole(positions))
         for item, start in zip(self.constraints, self.starts, strict=False):
-            if item.half_box_rows and (item.family != "Distance" or item.moving) and positions is not None:
-                self._check_half_box(item, self.gather(item, positions), int(start), time)
+            if not item.relative or item.family == "Distance" or item.n_rows == 0:
+                continue
+            length = np.linalg.norm(minimum_image(np.diff(positions[item.atoms], axis=1), self.lattice), axis=2)
+            if item.whole is not None:
+                length[item.whole] = 0.0
+            k, slot = (int(i) for i in np.unravel_index(int(np.argmax(length)), length.shape))
+            if length[k, slot] >= self.half_width:
+                raise InputError(
+                    f"row {start + k}, {item.row_name(k)}: neighbouring atoms are {length[k, slot]:g} apart, not less "
+                    f"than half the box ({self.half_width:g}), although a shorter distance is held between them; "
+                    "bring the positions onto the constraints first",
+                    item="positions",
+                    atoms=item.atoms[k, slot : slot + 2],
+                )
+
+    def refuse_loose_links(self, whole: FloatArray, numbers: IntArray | None = None) -> None:
+        """Raise `ImageError` where atoms of a row, made whole, are half the cell apart and nothing ties them.
+
+        `numbers` are the names of the atoms in messages, if not their own numbers.
+        """
+        if self.images is None or self.lattice is None:
+            return
+        link = self.images.reached_half(whole, self.lattice)
+        if link >= 0:
+            pair = np.array([self.images.parents[link], self.images.atoms[link]])
+            row = int(self.images.loose[link])
+            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
 
     @cached_property
-    def _longest_distance(self) -> tuple[float, int]:
-        """Longest distance that is held at a constant length, and the number of its constraint."""
-        lengths = [
-            float(c.target_at(0.0).max(initial=0.0)) if c.family == "Distance" and not c.moving else 0.0
-            for c in self.constraints
-        ]
-        return (max(lengths), int(np.argmax(lengths))) if lengths else (0.0, 0)
-
-    def _check_half_box(self, item: Constraint, r: FloatArray, start: int, time: float) -> None:
-        """Minimum images are unique only for vectors shorter than half the box."""
-        if self.lattice is None or not item.half_box_rows:
-            return
-        if item.family == "Distance":
-            length, what = item.target_at(time)[:, None], "target"
-        else:
-            length, what = np.linalg.norm(np.diff(r, axis=1), axis=2), "distance of neighbouring atoms"
-        too_long = np.argwhere(length >= self.half_width)
-        if len(too_long):
-            k, slot = (int(i) for i in too_long[0])
-            raise InputError(
-                f"row {start + k}, {item.row_name(k)}: {what} {length[k, slot]:g} is not shorter than half the box "
-                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, no cell, or list the "
-                "atoms so that neighbours in the row are neighbours in space",
-                item="target" if what == "target" else "positions",
-                atoms=item.atoms[k, slot : slot + 2].tolist(),
-            )
+    def _longest_plain(self) -> tuple[float, int]:
+        """Longest constant distance that was shorter than half the box at set-up, and its row."""
+        longest, row = 0.0, 0
+        for item, start in zip(self.constraints, self.starts, strict=False):
+            if item.family != "Distance" or item.moving or item.n_rows == 0:
+                continue
+            lengths = item.target_at(0.0) if item.whole is None else np.where(item.whole, 0.0, item.target_at(0.0))
+            if lengths.max() > longest:
+                longest, row = float(lengths.max()), int(start + np.argmax(lengths))
+        return longest, row
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
         """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
         scale = self._rows(lambda c: c.scale(time))
         if not np.all(scale > 0):
-            size = self._rows(lambda c: self._reach(c, x, time))
+            y = self.whole(x)
+            size = self._rows(lambda c: self._reach(c, x, y, time))
             extent = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
             size = np.where(size > 0, size, extent if extent > 0 else 1.0)
             scale = np.where(scale > 0, scale, size)
         self.scale: FloatArray = scale
 
-    def _reach(self, item: Constraint, x: FloatArray, time: float) -> FloatArray:
-        gradient = np.linalg.norm(item.gradient(self.gather(item, x), time), axis=2)
+    def _reach(self, item: Constraint, x: FloatArray, whole: FloatArray, time: float) -> FloatArray:
+        gradient = np.linalg.norm(item.gradient(self._gather(item, x, whole), time), axis=2)
         return np.sum(gradient * np.linalg.norm(x[item.atoms], axis=2), axis=1)
 
     def _check_atoms(self, given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
@@ -279,18 +323,34 @@ class ConstraintSet:
 
     # -- sigma, A, b ----------------------------------------------------------------------------
 
-    def minimum_image(self, d: FloatArray) -> FloatArray:
-        """Shortest periodic images of difference vectors, shape (..., 3)."""
-        if self.lattice is None:
-            return d
-        return d - np.round(d @ self.lattice[1]) @ self.lattice[0]
+    def whole(self, x: FloatArray) -> FloatArray:
+        """Positions in which atoms of whole rows stand in the images that these rows mean; see `kcons.images`.
+
+        `x` itself where all rows are plain.
+        """
+        if self.lattice is None or self.images is None:
+            return x
+        return self.images.make_whole(x, self.lattice)
 
     def gather(self, item: Constraint, x: FloatArray) -> FloatArray:
-        """Positions of a constraint's atoms, shape (n_rows, width, 3), made whole across the boundary."""
-        r = x[item.atoms]
-        if self.lattice is not None and item.translation_invariant and item.width > 1:
-            steps = self.minimum_image(np.diff(r, axis=1))
+        """Positions of a constraint's atoms, shape (n_rows, width, 3), in the images that its rows mean."""
+        return self._gather(item, x, self.whole(x))
+
+    def _gather(self, item: Constraint, x: FloatArray, whole: FloatArray) -> FloatArray:
+        # Fixed atoms stand where they are told to, in no other image.
+        r = (x if item.family == "FixedAtoms" else whole)[item.atoms]
+        if self.lattice is None or not item.relative:
+            return r
+        if item.whole is None:
+            steps = minimum_image(np.diff(r, axis=1), self.lattice)
             r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
+            return r
+        plain = ~item.whole
+        if plain.any():
+            steps = minimum_image(np.diff(r[plain], axis=1), self.lattice)
+            r[plain, 1:] = r[plain, :1] + np.cumsum(steps, axis=1)
+        if item.windings is not None:
+            r += item.windings @ self.lattice[0]
         return r
 
     def target(self, time: float = 0.0) -> FloatArray:
@@ -300,16 +360,18 @@ class ConstraintSet:
     def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
         x = self._positions(x)
-        return self._rows(lambda c: c.measure(self.gather(c, x), time) if c.holonomic else np.zeros(c.n_rows))
+        y = self.whole(x)
+        return self._rows(lambda c: c.measure(self._gather(c, x, y), time) if c.holonomic else np.zeros(c.n_rows))
 
     def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
         x = self._positions(x)
+        y = self.whole(x)
 
         def sigma(c: Constraint) -> FloatArray:
             if not c.holonomic:
                 return np.zeros(c.n_rows)
-            difference = c.measure(self.gather(c, x), time) - c.target_at(time)
+            difference = c.measure(self._gather(c, x, y), time) - c.target_at(time)
             if c.period is not None:
                 difference -= c.period * np.round(difference / c.period)
             return difference
@@ -319,9 +381,10 @@ class ConstraintSet:
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
         x = self._positions(x)
+        y = self.whole(x)
         data, columns, widths = [], [], []
         for c in self.constraints:
-            data.append(c.gradient(self.gather(c, x), time).ravel())
+            data.append(c.gradient(self._gather(c, x, y), time).ravel())
             columns.append((3 * c.atoms[:, :, None] + np.arange(3)).ravel())
             widths.append(np.full(c.n_rows, 3 * c.width, dtype=np.int64))
         if not data:
@@ -334,13 +397,14 @@ class ConstraintSet:
     def velocity_target(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
         x = self._positions(x)
+        y = self.whole(x)
 
         def c_of(c: Constraint) -> FloatArray:
             if not c.holonomic:
                 return c.target_at(time)
             rate = _rate_at(c, time)
             if c.moving:
-                r = self.gather(c, x)
+                r = self._gather(c, x, y)
                 rate = rate - c.time_terms(r, np.zeros_like(r), time)[0]
             return rate
 
@@ -350,9 +414,10 @@ class ConstraintSet:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
         x = self._positions(x)
         v = self._positions(v, "velocities")
+        y = self.whole(x)
 
         def b_of(c: Constraint) -> FloatArray:
-            r = self.gather(c, x)
+            r = self._gather(c, x, y)
             u = v[c.atoms]
             curvature = c.curvature(r, u, time)
             if not c.holonomic:
@@ -366,15 +431,21 @@ class ConstraintSet:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
         x = self._positions(x)
 
-        floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, time))
+        y = self.whole(x)
+        floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
         return np.maximum(1e-14 * self.scale, floor)
+
+    def allowed(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """What |sigma| may be where rows count as held: 1e-10 of the scale, or what rounding leaves of far atoms."""
+        return np.maximum(1e-10 * self.scale, 4 * self.tolerance(x, time))
 
     # -- pieces ---------------------------------------------------------------------------------
 
     def subset(self, rows: IntArray) -> tuple[ConstraintSet, IntArray]:
         """The set made of some rows over their own atoms only, and those atoms' numbers in this set.
 
-        `rows` must be sorted. Targets and cell are kept; nothing is checked again.
+        Atoms along which whole rows are made whole belong to these. `rows` must be sorted. Targets, cell and
+        images are kept; nothing is checked again.
         """
         rows = np.asarray(rows, dtype=np.int64)
         bounds = np.searchsorted(rows, self.starts)
@@ -385,7 +456,17 @@ class ConstraintSet:
         ]
         used = np.concatenate([p.atoms.ravel() for p in pieces] or [np.zeros(0, np.int64)])
         atoms = _distinct(used, self.n_atoms)
+        images = None
+        if self.images is not None:
+            wholes = [p.atoms.ravel() for p in pieces if p.whole is not None]
+            if wholes:
+                between = self.images.ancestors(np.concatenate(wholes), self.n_atoms)
+                atoms = _distinct(np.concatenate([atoms, between]), self.n_atoms)
+            numbers = np.zeros(self.n_atoms, np.int64)
+            numbers[atoms] = np.arange(len(atoms))
+            images = self.images.among(atoms, numbers, rows)
         part = object.__new__(ConstraintSet)
+        part.images = images
         part.n_atoms = len(atoms)
         part.masses = self.masses[atoms]
         part.lattice = self.lattice
@@ -398,9 +479,10 @@ class ConstraintSet:
         """The same atoms, masses and cell under other constraints; their targets must be set. Nothing is checked."""
         other = object.__new__(ConstraintSet)
         other.n_atoms, other.masses, other.lattice = self.n_atoms, self.masses, self.lattice
-        other.constraints = tuple(constraints)
         ends = np.cumsum([c.n_rows for c in constraints], dtype=np.int64)
         other.starts = np.concatenate([[0], ends]).astype(np.int64)
+        marked, other.images = find_images(constraints, other.starts, positions, self.lattice, self.half_width, time)
+        other.constraints = tuple(marked)
         other._set_scale(positions, time)
         return other
 

@@ -79,6 +79,20 @@ class BudgetError(ConstraintError):
         self.time = time
 
 
+class ImageError(KconsError, ValueError):
+    """Atoms of a row have drifted so far apart that its periodic image is about to become another one.
+
+    Attributes
+    ----------
+    atoms : tuple of int
+        The two atoms whose distance has reached half the cell.
+    """
+
+    def __init__(self, message: str, *, atoms: Iterable[int] = ()) -> None:
+        super().__init__(message)
+        self.atoms = tuple(int(a) for a in atoms)
+
+
 class ConvergenceError(KconsError, RuntimeError):
     """No solution was found within the tolerance; positions and velocities are unchanged.
 

@@ -54,6 +54,14 @@ class FlatBody:
     weights: FloatArray
     linearised: int
 
+    def __str__(self) -> str:
+        """For example 'atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows'."""
+        distances, linear = len(self.pairs), 3 * len(self.tied)
+        return (
+            f"atoms {_listed(self.atoms)} {'on a line' if len(self.bases) == 2 else 'in a plane'}: {distances} "
+            f"distance{'s' if distances > 1 else ''} and {linear} linear rows in place of {len(self.rows)} rows"
+        )
+
     def renumbered(self, atoms: IntArray, rows: IntArray) -> FlatBody:
         """The same body where atom a is called atoms[a] and row k rows[k]."""
         return replace(
@@ -345,7 +353,9 @@ def with_flat_bodies(
                     np.concatenate([b.weights for b in same]),
                 )
             )
-    return constraint_set.replaced(pieces, positions, time)
+    new = constraint_set.replaced(pieces, positions, time)
+    new.conversions = tuple(bodies)
+    return new
 
 
 def refusal(body: FlatBody) -> SingularGeometryError:
@@ -355,8 +365,12 @@ def refusal(body: FlatBody) -> SingularGeometryError:
     )
 
 
+def _listed(atoms: IntArray) -> str:
+    return ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
+
+
 def _sentence(linearised: int, flat: int, atoms: IntArray) -> str:
-    shown = ", ".join(str(a) for a in atoms[:8]) + (", ..." if len(atoms) > 8 else "")
+    shown = _listed(atoms)
     freedom, shape, remedy = (
         (5, "collinear", "hold one distance and x_b = c x_a + (1-c) x_c (LinearRelation) instead")
         if flat == 1

@@ -22,6 +22,7 @@ from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
+from kcons.flat_bodies import FlatBody
 from kcons.plan import Plan, make_plan
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
@@ -51,6 +52,8 @@ class Motion:
         Clusters and the solver picked for each.
     rank, degrees_of_freedom : int
         Independent rows, and 3 n_atoms - rank.
+    conversions : tuple of FlatBody
+        What was converted, by atoms and rows of the set that was given; printed, a sentence each.
 
     Raises
     ------
@@ -104,6 +107,11 @@ class Motion:
         return self.plan.rank
 
     @property
+    def conversions(self) -> tuple[FlatBody, ...]:
+        """Straight and flat groups whose rows were singular at second order, and what holds them instead."""
+        return self.constraint_set.conversions
+
+    @property
     def degrees_of_freedom(self) -> int:
         return 3 * self.constraint_set.n_moving - self.plan.rank
 
@@ -136,14 +144,17 @@ class Motion:
         Raises
         ------
         InputError
-            A degenerate cell, or a row that is not shorter than half the box; nothing was changed.
+            A degenerate cell, a row that is not shorter than half the box, or a first cell for rows whose images
+            have to be found anew; nothing was changed.
+        ImageError
+            Atoms of a row that nothing ties together are half the box apart at `positions`.
         """
         held = self.constraint_set
         before = held.lattice
         try:
             held.with_cell(cell, pbc)
             held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"))
-        except InputError:
+        except KconsError:
             held.lattice = before
             raise
         # The solvers take the lattice at each call.
@@ -241,20 +252,27 @@ class Motion:
         """Run all solvers on the local arrays in place; restore them and raise if one fails."""
         plan = self.plan
         lattice = self.cell()
+        images = None if lattice is None else self._local.images
         targets = self._local.target(time) if self._moving else None
         # One solver alone restores what it changed; several need a copy to go back to.
-        saved = (x.copy(), None if velocities is None else velocities.copy()) if self._several else None
+        several = self._several or images is not None
+        saved = (x.copy(), None if velocities is None else velocities.copy()) if several else None
         found: list[FloatArray | None] = []
         try:
             if len(plan.pinned):
                 x[plan.pinned] = plan.pinned_targets(targets)
                 if plan.loose is not None:
                     plan.check_loose_rows(x, time)
+            if images is not None and lattice is not None:
+                stored, ref = ref, images.make_whole(ref, lattice)
+                shifts = images.follow(x, stored, ref, lattice)
+                x[images.atoms] += shifts
             for k, solver in enumerate(plan.solvers):
                 lam = None if multipliers is None else np.empty(len(solver.rows))
-                outcome = solver.positions(x, ref, targets, lattice, velocities, inv_dt, lam, time, reference_time)
+                cell = plan.cell_for(k, lattice)
+                outcome = solver.positions(x, ref, targets, cell, velocities, inv_dt, lam, time, reference_time)
                 if not outcome.converged or outcome.iterations > MANY_ITERATIONS:
-                    task = Task(x, ref, targets, lattice, velocities, inv_dt, time, reference_time)
+                    task = Task(x, ref, targets, cell, velocities, inv_dt, time, reference_time)
                     if not outcome.converged:
                         outcome = self._rescuers.rescue(solver, outcome, task, lam)
                     if outcome.iterations > MANY_ITERATIONS:
@@ -262,6 +280,9 @@ class Motion:
                         task.polish(solver, lam)
                 self._iterations[k] = outcome.iterations
                 found.append(lam)
+            if images is not None:
+                self._local.refuse_loose_links(x, self._atoms)
+                x[images.atoms] -= shifts
         except KconsError:
             if saved is not None:
                 np.copyto(x, saved[0])
@@ -393,12 +414,21 @@ class Motion:
         plan = self.plan
         lattice = self.cell()
         saved = y.copy() if self._several else None
+        if lattice is not None:
+            x = self._local.whole(x)
         if len(plan.pinned):
             y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
+            if plan.loose is not None:
+                try:
+                    plan.check_loose_rates(x, y, rates, time, what)
+                except KconsError:
+                    if saved is not None:
+                        np.copyto(y, saved)
+                    raise
         found: list[FloatArray | None] = []
-        for solver in plan.solvers:
+        for k, solver in enumerate(plan.solvers):
             lam = None if multipliers is None else np.empty(len(solver.rows))
-            outcome = solver.tangents(x, y, rates, lattice, lam, time)
+            outcome = solver.tangents(x, y, rates, plan.cell_for(k, lattice), lam, time)
             if not outcome.converged:
                 if saved is not None:
                     np.copyto(y, saved)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
+from kcons.images import minimum_image
 from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances, lengths_resolved
 from kcons.solvers.general import RANK_TOLERANCE, GeneralClusters
@@ -98,6 +100,8 @@ class Plan:
         Rows of each cluster in which rows may depend on each other.
     loose : ndarray of int or None
         Rows between fixed atoms that motion of these may break.
+    whole : list of bool
+        For each solver, whether it takes positions that were made whole, without a cell (see `kcons.images`).
     """
 
     constraint_set: ConstraintSet
@@ -112,7 +116,12 @@ class Plan:
     kinds: list[ClusterKind] = field(default_factory=list)
     dependent: list[IntArray] = field(default_factory=list)
     loose: IntArray | None = None
+    whole: list[bool] = field(default_factory=list)
     _places: FloatArray | None = None
+
+    def cell_for(self, solver: int, lattice: FloatArray | None) -> FloatArray | None:
+        """The cell that a solver is given: None where positions come whole and every image is as they say."""
+        return None if self.whole[solver] else lattice
 
     def pinned_targets(self, targets: FloatArray | None) -> FloatArray:
         """Where fixed atoms are held, shape (len(pinned), 3)."""
@@ -135,22 +144,41 @@ class Plan:
         whole = self.constraint_set
         with np.errstate(invalid="ignore"):
             miss = np.abs(whole.value(x, time))
-            allowed = np.maximum(whole.tolerance(x, time), 1e-10 * whole.scale)
-            if not whole.holonomic[self.loose].all():
-                speed = whole.velocity_target(x, time)
-                v = np.zeros_like(x)
-                v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
-                jacobian = whole.jacobian(x, time)
-                size = np.abs(speed) + abs(jacobian) @ np.abs(v.ravel())
-                free = ~whole.holonomic
-                miss[free] = np.abs(jacobian @ v.ravel() - speed)[free]
-                allowed[free] = 1e-10 * size[free]
+            allowed = whole.allowed(x, time)
         bad = self.loose[~(miss[self.loose] <= allowed[self.loose])]
         if len(bad):
             row = int(bad[0])
             raise ContradictionError(
                 f"row {self.named.row_name(row)} lies between fixed atoms and is off by {miss[row]:g}; "
                 "remove it or free one of its atoms",
+                rows=[row],
+                atoms=self.named.row_atoms(row),
+            )
+        speed = whole.velocity_target(x, time)
+        v = np.zeros_like(x)
+        v[self.pinned] = speed[self.pinned_rows].reshape(-1, 3)
+        self.check_loose_rates(x, v, speed, time, "velocity")
+
+    def check_loose_rates(self, x: FloatArray, y: FloatArray, rates: FloatArray | None, time: float, what: str) -> None:
+        """Refuse rows between fixed atoms only whose A y, with the y of these atoms, is not `rates`.
+
+        Raises
+        ------
+        ContradictionError
+        """
+        if self.loose is None:
+            return
+        jacobian = self.constraint_set.jacobian(x, time)[self.loose]
+        fixed = np.zeros_like(y)
+        fixed[self.pinned] = y[self.pinned]
+        wanted = np.zeros(len(self.loose)) if rates is None else rates[self.loose]
+        miss = np.abs(jacobian @ fixed.ravel() - wanted)
+        bad = np.flatnonzero(~(miss <= 1e-10 * (np.abs(wanted) + abs(jacobian) @ np.abs(fixed.ravel()))))
+        if len(bad):
+            row = int(self.loose[bad[0]])
+            raise ContradictionError(
+                f"row {self.named.row_name(row)} lies between fixed atoms, whose {what} does not follow it: off by "
+                f"{miss[bad[0]]:g}; remove it, free one of its atoms, or let the fixed atoms move with it",
                 rows=[row],
                 atoms=self.named.row_atoms(row),
             )
@@ -226,12 +254,14 @@ def make_plan(
         plan.check_loose_rows(positions, time)
         if not constraint_set.moving:
             plan.loose = None
-    for shape in classify(constraint_set, labels, inverse_masses):
+    whole_positions = constraint_set.whole(positions)
+    for shape, whole in _shapes(constraint_set, labels, inverse_masses):
         solver = _solver(shape, constraint_set, inverse_masses, labels, time)
         if shape.independent:
             rank = shape.rows.size
         else:
-            rank = _rank(constraint_set, shape, inverse_masses, positions, solver, time)
+            lattice = None if whole else constraint_set.lattice
+            rank = _rank(constraint_set, shape, inverse_masses, whole_positions, lattice, solver, time)
         if rank < shape.rows.size:
             plan.dependent += _by_cluster(shape.rows.ravel(), labels)
             if shape.kind in ("water", "lanes"):
@@ -241,10 +271,30 @@ def make_plan(
                 shape = Shape("sparse", flat, shape.clusters, False, pairs=ends)
                 solver = _solver(shape, constraint_set, inverse_masses, labels, time)
         plan.solvers.append(solver)
+        plan.whole.append(whole and not isinstance(solver, GeneralClusters))
         plan.rank += rank
         example = named.row_name(int(shape.rows.ravel()[0]))
         plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
     return plan
+
+
+def _shapes(
+    constraint_set: ConstraintSet, labels: IntArray, inverse_masses: FloatArray
+) -> Iterator[tuple[Shape, bool]]:
+    """The shapes of clusters, and whether these have whole rows: such clusters have solvers of their own."""
+    marks = [np.zeros(c.n_rows, bool) if c.whole is None else c.whole for c in constraint_set.constraints]
+    whole_rows = np.concatenate([*marks, np.zeros(0, bool)]) & (labels >= 0)
+    if not whole_rows.any():
+        for shape in classify(constraint_set, labels, inverse_masses):
+            yield shape, False
+        return
+    wholes = np.zeros(int(labels.max()) + 1, bool)
+    wholes[labels[whole_rows]] = True
+    for kind in (False, True):
+        number = np.where(wholes == kind, np.cumsum(wholes == kind) - 1, -1)
+        chosen = np.where(labels >= 0, number[labels], -1)
+        for shape in classify(constraint_set, chosen, inverse_masses):
+            yield shape, kind
 
 
 def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
@@ -405,27 +455,28 @@ def _rank(
     shape: Shape,
     inverse_masses: FloatArray,
     positions: FloatArray,
+    lattice: FloatArray | None,
     solver: ClusterSolver,
     time: float,
 ) -> int:
     """Independent rows of a shape whose graph does not tell."""
     if isinstance(solver, SparseRows):
-        return solver.rank(positions, constraint_set.lattice)
+        return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
         sparse = solver.solver
         if isinstance(sparse, SparseDistances):
-            return sparse.rank(positions, constraint_set.lattice)
-        return _rank_of_small(constraint_set, shape, inverse_masses, positions)
+            return sparse.rank(positions, lattice)
+        return _rank_of_small(shape, inverse_masses, positions, lattice)
     assert isinstance(solver, GeneralClusters)
     return solver.rank(positions, time)
 
 
-def _rank_of_small(
-    constraint_set: ConstraintSet, shape: Shape, inverse_masses: FloatArray, positions: FloatArray
-) -> int:
+def _rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
     """Rank of many small clusters of distances at once, from the singular values of their B."""
     ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
-    difference = constraint_set.minimum_image(positions[ends[..., 0]] - positions[ends[..., 1]])
+    difference = positions[ends[..., 0]] - positions[ends[..., 1]]
+    if lattice is not None:
+        difference = minimum_image(difference, lattice)
     n, k = ends.shape[:2]
     b = np.zeros((n, k, shape.atoms.shape[1], 3))
     row = np.arange(k)

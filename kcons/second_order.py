@@ -201,15 +201,15 @@ class LocalRows:
         whole = x.copy()
         placed = np.zeros(len(x), bool)
         placed[0] = True
+        rows = [r for item in self.part.constraints for r in self.part.gather(item, x)]
         for _ in range(len(x)):
             before = int(placed.sum())
-            for members in self.row_atoms:
+            for members, r in zip(self.row_atoms, rows, strict=True):
                 known = placed[members]
                 if known.any() and not known.all():
-                    base = members[np.argmax(known)]
-                    new = members[~known]
-                    whole[new] = whole[base] + self.part.minimum_image(x[new] - x[base])
-                    placed[new] = True
+                    base = int(np.argmax(known))
+                    whole[members[~known]] = whole[members[base]] + r[~known] - r[base]
+                    placed[members] = True
             if placed.all() or int(placed.sum()) == before:
                 break
         return whole

@@ -150,7 +150,7 @@ def test_lengths_of_half_the_box_are_refused():
     with pytest.raises(InputError, match=r"row 1, Distance\(1, 2\): target 4 is not shorter than half the box \(4\)"):
         ConstraintSet([Distance([[0, 1], [1, 2]], [1.0, 4.0])], x, np.ones(4), cell=[8.0] * 3)
     with pytest.raises(
-        InputError, match=r"row 0, Angle\(1, 2, 3\): distance of neighbouring atoms .* half the box"
+        InputError, match=r"row 0, Angle\(1, 2, 3\): distance .* of atoms 2 and 3 is not shorter than half the box"
     ) as e:
         ConstraintSet([Angle([[1, 2, 3]])], x, np.ones(4), cell=[8.0] * 3)
     assert e.value.atoms == (2, 3)

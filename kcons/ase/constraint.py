@@ -298,15 +298,18 @@ class Constraints(FixConstraint):
             return self.constraints
         x = atoms.arrays["positions"]
         cell = atoms.cell.array / np.array(times)[:, None]
-        lattice = ConstraintSet((), np.zeros((0, 3)), np.zeros(0), cell=cell, pbc=atoms.pbc).lattice
-        assert lattice is not None
+        copies = int(np.prod(times))
+        first = [item.select(np.arange(item.n_rows // copies)) for item in self.constraints]
+        one = ConstraintSet(first, x[:n], atoms.get_masses()[:n], cell=cell, pbc=atoms.pbc)
+        assert one.lattice is not None
         result = []
-        for item in self.constraints:
-            if item.translation_invariant and item.width > 1:
+        for item, bound in zip(self.constraints, one.constraints, strict=True):
+            if item.relative:
                 replica, base = np.divmod(item.atoms, n)
                 place = np.stack(np.unravel_index(replica, times), axis=-1)
-                steps = -np.round(np.diff(x[item.atoms], axis=1) @ lattice[1]).astype(np.int64)
-                place[:, 1:] = (place[:, 1:] + np.cumsum(steps, axis=1)) % np.array(times)
+                apart = one.gather(bound, x[:n]) - x[bound.atoms]
+                cells = np.round((apart - apart[:, :1]) @ one.lattice[1]).astype(np.int64)
+                place = (place + np.tile(cells, (copies, 1, 1))) % np.array(times)
                 item = item.with_target(item.target)
                 item.atoms = np.ravel_multi_index(tuple(np.moveaxis(place, -1, 0)), times) * n + base
             result.append(item)

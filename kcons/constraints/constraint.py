@@ -71,6 +71,10 @@ class Constraint(ABC):
     kind: RowKind = RowKind.INTERPRETED
     #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
     masses: FloatArray | None = None
+    #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
+    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.images`.
+    whole: NDArray[np.bool_] | None = None
+    windings: IntArray | None = None
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         self.atoms: IntArray = _atom_table(atoms, type(self).__name__, self.row_width)
@@ -146,8 +150,8 @@ class Constraint(ABC):
         return np.zeros((self.n_rows, 0))
 
     @property
-    def half_box_rows(self) -> bool:
-        """Whether minimum images need neighbouring atoms of a row to be closer than half the box."""
+    def relative(self) -> bool:
+        """Whether a row depends on where its atoms lie relative to each other, and so on their images."""
         return self.translation_invariant and self.width > 1
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:  # noqa: B027 (optional hook)
@@ -180,6 +184,8 @@ class Constraint(ABC):
             setattr(copy, name, getattr(self, name)[rows])
         if self.masses is not None:
             copy.masses = self.masses[rows]
+        copy.whole = None if self.whole is None else self.whole[rows]
+        copy.windings = None if self.windings is None else self.windings[rows]
         if isinstance(self.target, np.ndarray):
             copy.target = self.target[rows]
         elif self.target is not None:

@@ -234,7 +234,7 @@ class Flights:
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
-    if plan.driven or held.moving or plan.loose is not None:
+    if plan.driven or held.moving or plan.loose is not None or any(plan.whole):
         return None
     # Where few atoms are held, the engine works on a copy of these, and counts only them.
     compact = plan.constraint_set is not held
