@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +19,19 @@ from kcons.constraints.contradictions import refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 from kcons.images import find_images, image_error, minimum_image
+
+
+class Residuals(NamedTuple):
+    """How far positions and velocities are off the rows, and what counts as held, each shape (n_rows,).
+
+    `allowed` is for |sigma|: 1e-10 of the scale, or what rounding leaves of far atoms. `rates` is A v - c, `speeds`
+    the sum of what it is made of; both None without velocities.
+    """
+
+    sigma: FloatArray
+    allowed: FloatArray
+    rates: FloatArray | None
+    speeds: FloatArray | None
 
 
 class ConstraintSet:
@@ -368,15 +381,15 @@ class ConstraintSet:
         x = self._positions(x)
         y = self.whole(x)
 
-        def sigma(c: Constraint) -> FloatArray:
-            if not c.holonomic:
-                return np.zeros(c.n_rows)
-            difference = c.measure(self._gather(c, x, y), time) - c.target_at(time)
-            if c.period is not None:
-                difference -= c.period * np.round(difference / c.period)
-            return difference
+        return self._rows(lambda c: self._sigma(c, self._gather(c, x, y), time))
 
-        return self._rows(sigma)
+    def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
+        if not c.holonomic:
+            return np.zeros(c.n_rows)
+        difference = c.measure(r, time) - c.target_at(time)
+        if c.period is not None:
+            difference -= c.period * np.round(difference / c.period)
+        return difference
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
@@ -399,16 +412,15 @@ class ConstraintSet:
         x = self._positions(x)
         y = self.whole(x)
 
-        def c_of(c: Constraint) -> FloatArray:
-            if not c.holonomic:
-                return c.target_at(time)
-            rate = _rate_at(c, time)
-            if c.moving:
-                r = self._gather(c, x, y)
-                rate = rate - c.time_terms(r, np.zeros_like(r), time)[0]
-            return rate
+        return self._rows(lambda c: self._rate(c, self._gather(c, x, y) if c.moving else None, time))
 
-        return self._rows(c_of)
+    def _rate(self, c: Constraint, r: FloatArray | None, time: float) -> FloatArray:
+        if not c.holonomic:
+            return c.target_at(time)
+        rate = _rate_at(c, time)
+        if c.moving and r is not None:
+            rate = rate - c.time_terms(r, np.zeros_like(r), time)[0]
+        return rate
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
@@ -435,9 +447,25 @@ class ConstraintSet:
         floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
         return np.maximum(1e-14 * self.scale, floor)
 
-    def allowed(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
-        """What |sigma| may be where rows count as held: 1e-10 of the scale, or what rounding leaves of far atoms."""
-        return np.maximum(1e-10 * self.scale, 4 * self.tolerance(x, time))
+    def residuals(self, x: FloatArray, v: FloatArray | None = None, time: float = 0.0) -> Residuals:
+        """sigma, and A v - c, with what counts as held, in one pass over the constraint objects."""
+        y = self.whole(x)
+        sigma, reach, rates, speeds = [], [], [], []
+        for c in self.constraints:
+            r = self._gather(c, x, y)
+            gradient = c.gradient(r, time)
+            size = np.sqrt(np.einsum("kai,kai->ka", gradient, gradient))
+            sigma.append(self._sigma(c, r, time))
+            reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
+            if v is not None:
+                u = v[c.atoms]
+                wanted = self._rate(c, r, time)
+                rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
+                speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
+        allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * _joined(reach))
+        if v is None:
+            return Residuals(_joined(sigma), allowed, None, None)
+        return Residuals(_joined(sigma), allowed, _joined(rates), _joined(speeds))
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -487,7 +515,7 @@ class ConstraintSet:
         return other
 
     def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
-        return np.concatenate([function(c) for c in self.constraints] or [np.zeros(0)])
+        return _joined([function(c) for c in self.constraints])
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
         array = np.asarray(x, dtype=np.float64)
@@ -500,6 +528,10 @@ class ConstraintSet:
 
     def __repr__(self) -> str:
         return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
+
+
+def _joined(pieces: Sequence[FloatArray]) -> FloatArray:
+    return np.concatenate(pieces) if pieces else np.zeros(0)
 
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:

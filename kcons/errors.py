@@ -93,6 +93,33 @@ class ImageError(KconsError, ValueError):
         self.atoms = tuple(int(a) for a in atoms)
 
 
+class CertificateError(KconsError, RuntimeError):
+    """Results that a solver took for right are off the constraints as the set defines them.
+
+    Attributes
+    ----------
+    row : int
+        The worst row.
+    residual : float
+        |sigma| or |A v - c| of that row, in its natural units.
+    atoms : tuple of int
+    step : int or None
+        Step number, where known.
+    state : object
+        The last state that was certified, where a run knows one; None otherwise.
+    """
+
+    def __init__(
+        self, message: str, *, row: int = -1, residual: float = float("nan"), atoms: Iterable[int] = ()
+    ) -> None:
+        super().__init__(message)
+        self.row = row
+        self.residual = residual
+        self.atoms = tuple(int(a) for a in atoms)
+        self.step: int | None = None
+        self.state: object = None
+
+
 class ConvergenceError(KconsError, RuntimeError):
     """No solution was found within the tolerance; positions and velocities are unchanged.
 

@@ -202,8 +202,8 @@ class _Links:
         self.lengths = np.linalg.norm(nearest, axis=2)
         #: Held at one length for good.
         self.held = item.family == "Distance" and not item.moving
-        self.whole: BoolArray = np.zeros(item.n_rows, bool)
-        self.unsure: BoolArray = np.zeros(item.n_rows, bool)
+        self.whole: BoolArray = np.zeros(item.n_rows, np.bool_)
+        self.unsure: BoolArray = np.zeros(item.n_rows, np.bool_)
         self.windings = np.zeros((item.n_rows, item.width, 3), np.int64)
         if self.held:
             if item.target is None:
@@ -230,7 +230,7 @@ class _Links:
         wanted = pairs[..., 0] * n_atoms + pairs[..., 1]
         place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
         found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
-        self.whole = ~found.all(axis=1)
+        self.whole = np.logical_not(found.all(axis=1))
 
     def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""

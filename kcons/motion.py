@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 
 from kcons import diagnosis
 from kcons.arrays import as_array, check_multipliers, check_out
+from kcons.certificate import certify
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
-from kcons.flat_bodies import FlatBody
+from kcons.flat_bodies import MISFIT, FlatBody
 from kcons.plan import Plan, make_plan
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
@@ -514,7 +515,23 @@ class Motion:
         result[touched] = y * masses
         return result
 
-    # -- report ---------------------------------------------------------------------------------
+    # -- certificate and report ---------------------------------------------------------------------------------
+
+    def certify(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0) -> None:
+        """Raise unless positions (and velocities) are on the constraints as the set, and not a solver, defines them.
+
+        Where rows were converted, the rows that were given are looked at too.
+
+        Raises
+        ------
+        CertificateError
+        """
+        here = as_array(x, self._shape, "positions")
+        speed = None if v is None else as_array(v, self._shape, "velocities")
+        self.cell()
+        certify(self.constraint_set, here, speed, time)
+        if self.conversions:
+            certify(self._given, here, speed, time, slack=10 * MISFIT)
 
     def report(
         self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True

@@ -143,9 +143,9 @@ class Plan:
             return
         whole = self.constraint_set
         with np.errstate(invalid="ignore"):
-            miss = np.abs(whole.value(x, time))
-            allowed = whole.allowed(x, time)
-        bad = self.loose[~(miss[self.loose] <= allowed[self.loose])]
+            found = whole.residuals(x, None, time)
+        miss = np.abs(found.sigma)
+        bad = self.loose[~(miss[self.loose] <= found.allowed[self.loose])]
         if len(bad):
             row = int(bad[0])
             raise ContradictionError(

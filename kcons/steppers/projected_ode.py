@@ -39,6 +39,11 @@ class ProjectedOde:
     def __init__(self, *, project: bool = False) -> None:
         self.project = bool(project)
 
+    @property
+    def holds(self) -> bool:
+        """Whether states are on the constraints."""
+        return self.project
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({'project=True' if self.project else ''})"
 

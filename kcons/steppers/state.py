@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.certificate import Schedule
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError
@@ -198,6 +199,11 @@ class System:
         self.inverse_masses[fixed] = 0.0
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """When states of this system are certified."""
+        return Schedule(self.motion.certify)
 
     # -- states ---------------------------------------------------------------------------------
 

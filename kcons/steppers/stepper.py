@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
+from kcons.certificate import CHECK_EVERY
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers.state import State, System
 
@@ -81,6 +82,7 @@ class ReversibilityCheck:
         self.reversible = True
         self.symplectic = stepper.symplectic
         self.force_evaluations = 2 * stepper.force_evaluations
+        self.holds = getattr(stepper, "holds", True)
 
     def __repr__(self) -> str:
         return f"ReversibilityCheck({self.stepper!r})"
@@ -147,6 +149,7 @@ def run(
     stepper: Stepper | None = None,
     observers: Iterable[Observer] = (),
     every: int = 1,
+    check_every: int | None = None,
 ) -> State:
     """Make `steps` steps of `dt` and return the last state.
 
@@ -163,11 +166,17 @@ def run(
     observers : iterable of callable
         Each is called with the state at the start and after every `every` steps.
     every : int
+    check_every : int, optional
+        The first state, and one in so many, is certified: sigma and A v evaluated by the constraint set itself, beside
+        the solvers. The count goes on from one run of a `System` to the next. 0: never. By default one in 1000, or in
+        a multiple of that where certificates would take more than 1 % of the time.
 
     Raises
     ------
     InputError
-        Negative `steps`, or `every` below 1.
+        Negative `steps` or `check_every`, or `every` below 1.
+    CertificateError
+        A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
         The stepper may not be used with this system.
     KconsError
@@ -181,6 +190,12 @@ def run(
 
         stepper = Rattle()
     stepper.check(system)
+    spare, check_every = check_every is None, CHECK_EVERY if check_every is None else check_every
+    if check_every < 0:
+        raise InputError(f"check_every is {check_every}; give 0 (never) or more", item="check_every")
+    if dt == 0 or not getattr(stepper, "holds", True):
+        check_every = 0
+    schedule = system.schedule
     watching = tuple(observers)
     for observer in watching:
         observer(state)
@@ -188,13 +203,15 @@ def run(
     done = 0
     while done < steps:
         # Until somebody looks.
-        n = min(every, steps - done) if watching else steps
+        n = min(every - done % every, steps - done) if watching else steps - done
+        n = schedule.within(n, check_every)
         if march is not None:
             state = march(system, state, dt, n)
         else:
             for _ in range(n):
                 state = stepper.step(system, state, dt)
         done += n
+        schedule.made(n, check_every, state, spare=spare)
         if done % every == 0:
             for observer in watching:
                 observer(state)

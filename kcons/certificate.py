@@ -1,0 +1,128 @@
+"""A look at results that shares nothing with the solvers: sigma and A v as the constraint set defines them.
+
+The solvers check their own residuals; where a solver and the set do not mean the same, these say nothing. So a run
+has its states certified from time to time, by NumPy, row by row, with the measures and gradients of the constraint
+objects, as reports have them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import CertificateError
+
+#: Steps from one certificate to the next, if nothing else is asked for ...
+CHECK_EVERY = 1000
+#: ... and the part of a run's time that certificates may then take; where steps take microseconds, they come later.
+SHARE = 0.01
+#: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with.
+SPEED = 1e-9
+
+
+def certify(
+    held: ConstraintSet, x: FloatArray, v: FloatArray | None = None, time: float = 0.0, *, slack: float = 0.0
+) -> None:
+    """Raise unless `x` (and `v`) fulfil every row of `held`.
+
+    Parameters
+    ----------
+    held : ConstraintSet
+    x, v : ndarray, shape (n_atoms, 3)
+    time : float
+    slack : float
+        Added to what |sigma| may be, in parts of the rows' scale, and to what |A v - c| may be.
+
+    Raises
+    ------
+    CertificateError
+        Names the worst row. NaN counts as worst.
+    """
+    found = held.residuals(x, v, time)
+    allowed = found.allowed + slack * held.scale
+    _refuse(held, np.abs(found.sigma), allowed, "positions", "sigma")
+    if found.rates is not None and found.speeds is not None:
+        size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
+        _refuse(held, np.abs(found.rates), (SPEED + slack) * size, "velocities", "A v - c")
+
+
+def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: str, residual: str) -> None:
+    bad = ~(miss <= allowed)
+    if not bad.any():
+        return
+    with np.errstate(divide="ignore", invalid="ignore"):
+        row = int(np.argmax(np.where(bad, np.nan_to_num(miss / allowed, nan=np.inf), -1.0)))
+    raise CertificateError(
+        f"the {what} are off row {held.row_name(row)}: {residual} is {miss[row]:.3g}, allowed {allowed[row]:.3g}. "
+        "The solver took them for right; this is an error of kcons, or something changed the arrays, the cell or the "
+        "targets behind its back",
+        row=row,
+        residual=float(miss[row]),
+        atoms=held.row_atoms(row),
+    )
+
+
+class Schedule:
+    """When the states of a run are certified: the first, then every so many, over one run or several.
+
+    Parameters
+    ----------
+    certify : callable
+        Takes positions, velocities and time; raises `CertificateError`.
+
+    Attributes
+    ----------
+    last : Any
+        The last state that was certified, or None.
+    """
+
+    def __init__(self, certify: Callable[[FloatArray, FloatArray, float], None]) -> None:
+        self._certify = certify
+        self._left = 1
+        self._ended, self._cost = -math.inf, 0.0
+        self.last: Any = None
+
+    def within(self, steps: int, every: int) -> int:
+        """How many of `steps` may be made before the next certificate; `every` 0 stands for never."""
+        if not every:
+            return steps
+        self._left = min(self._left, every)
+        return min(steps, self._left)
+
+    def made(self, steps: int, every: int, state: Any, *, spare: bool = False) -> None:
+        """`state` is what so many steps led to: certify it if that is due.
+
+        With `spare` it waits for another `every` steps while it would take more than `SHARE` of the time.
+
+        Raises
+        ------
+        CertificateError
+            With the last certified state, and the number of the step.
+        """
+        if not every:
+            return
+        self._left -= steps
+        if self._left > 0:
+            return
+        self._left = every
+        begun = perf_counter()
+        if spare and self._cost > SHARE * (begun - self._ended):
+            return
+        try:
+            self._certify(state.positions, state.velocities, state.time)
+        except CertificateError as error:
+            error.step, error.state = state.step, self.last
+            where = (
+                "none was certified before" if self.last is None else f"the last certified is of step {self.last.step}"
+            )
+            error.add_note(f"at step {state.step}; error.state is the last certified state: {where}")
+            raise
+        self.last = state
+        self._ended = perf_counter()
+        self._cost = self._ended - begun
