@@ -16,12 +16,14 @@ import numpy as np
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError
+from kcons.errors import CertificateError, InputError
 
 #: Steps from one certificate to the next, if nothing else is asked for ...
 CHECK_EVERY = 1000
 #: ... and the part of a run's time that certificates may then take; where steps take microseconds, they come later.
 SHARE = 0.01
+#: That many times later at most, and then again.
+MOST = 100
 #: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with.
 SPEED = 1e-9
 
@@ -68,6 +70,21 @@ def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: st
     )
 
 
+def checked_every(check_every: int | None) -> tuple[int, bool]:
+    """The number of steps that `check_every` asks for, and whether it was left open.
+
+    Raises
+    ------
+    InputError
+        Less than 0.
+    """
+    if check_every is None:
+        return CHECK_EVERY, True
+    if check_every < 0:
+        raise InputError(f"check_every is {check_every}; give 0 (never) or more", item="check_every")
+    return int(check_every), False
+
+
 class Schedule:
     """When the states of a run are certified: the first, then every so many, over one run or several.
 
@@ -98,7 +115,7 @@ class Schedule:
     def made(self, steps: int, every: int, state: Any, *, spare: bool = False) -> None:
         """`state` is what so many steps led to: certify it if that is due.
 
-        With `spare` it waits for another `every` steps while it would take more than `SHARE` of the time.
+        With `spare` it waits while it would take more than `SHARE` of the time.
 
         Raises
         ------
@@ -112,7 +129,9 @@ class Schedule:
             return
         self._left = every
         begun = perf_counter()
-        if spare and self._cost > SHARE * (begun - self._ended):
+        passed = SHARE * (begun - self._ended)
+        if spare and self._cost > passed:
+            self._left = math.ceil(every * min(self._cost / passed - 1, MOST))
             return
         try:
             self._certify(state.positions, state.velocities, state.time)

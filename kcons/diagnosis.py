@@ -16,6 +16,9 @@ from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsErr
 from kcons.plan import Plan
 from kcons.solvers.outcome import Outcome
 
+#: Conversions that a printed report names.
+SHOWN = 4
+
 
 @dataclass(frozen=True)
 class KindReport:
@@ -60,6 +63,8 @@ class Report:
     worst_row : str
         Name of the row with the largest |sigma| for its scale.
     kinds : sequence of KindReport
+    conversions : sequence of str
+        Straight and flat groups whose rows were singular at second order, and what holds them instead.
     """
 
     rows: int
@@ -71,6 +76,7 @@ class Report:
     iterations: int
     worst_row: str
     kinds: Sequence[KindReport]
+    conversions: Sequence[str] = ()
 
     def __str__(self) -> str:
         lines = [
@@ -79,6 +85,9 @@ class Report:
         ]
         if not np.isnan(self.velocity_residual):
             lines.append(f"max |A v - c| {self.velocity_residual:.2e}")
+        lines += [f"converted: {what}" for what in self.conversions[:SHOWN]]
+        if len(self.conversions) > SHOWN:
+            lines.append(f"converted: {len(self.conversions) - SHOWN} more groups")
         titles = f"{'clusters':>9}{'rows':>9}{'rank':>9}{'condition':>11}{'iterations':>12}"
         lines.append(f"{'solver':<12}{titles}  for example")
         for k in self.kinds:
@@ -130,6 +139,7 @@ def make_report(
         iterations=max(iterations, default=0),
         worst_row=constraint_set.row_name(worst) if worst >= 0 else "no rows",
         kinds=kinds,
+        conversions=[str(body) for body in constraint_set.conversions],
     )
 
 

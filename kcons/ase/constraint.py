@@ -15,12 +15,13 @@ import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.host import Watch, require_on_surface
 from kcons.ase.virial import VOIGT, constraint_virial
+from kcons.certificate import CHECK_EVERY
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
-from kcons.errors import ConvergenceError, InputError, KconsError, UnsupportedError
+from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion import Motion
 
 __all__ = ["Constraints", "constrain"]
@@ -137,6 +138,8 @@ class Constraints(FixConstraint):
         """What is known of the positions is void."""
         self._on_surface = False
         self._watch = Watch()
+        #: Calls of each hook until its result is certified.
+        self._positions_due = self._momenta_due = 0
 
     # -- ASE's hooks ----------------------------------------------------------------------------
 
@@ -154,6 +157,9 @@ class Constraints(FixConstraint):
                 bound.motion.project_positions(new, old, out=new)
             else:
                 new[...] = bound.motion.project_positions(new, old)
+            if self._positions_due <= 0:
+                self._certify_positions(bound.motion, new, asked)
+            self._positions_due -= 1
         except ConvergenceError as error:
             error.add_note(
                 "In ASE: a smaller timestep or maxstep; or, if the atoms were placed anew, atoms.positions[:] = ... "
@@ -161,6 +167,14 @@ class Constraints(FixConstraint):
             )
             raise
         self._watch.accept(asked, new, bound.cell, atoms)
+
+    def _certify_positions(self, motion: Motion, new: FloatArray, asked: FloatArray) -> None:
+        try:
+            motion.certify(new)
+        except CertificateError:
+            new[...] = asked
+            raise
+        self._positions_due = CHECK_EVERY
 
     def adjust_momenta(self, atoms: Atoms, momenta: FloatArray) -> None:
         """Remove in place the part of the momenta that leaves the constraints: A M^-1 p = 0.
@@ -186,6 +200,10 @@ class Constraints(FixConstraint):
             masses, inverse_masses, velocities = bound.weights
             np.multiply(momenta, inverse_masses, velocities)
             bound.motion.project_velocities(atoms.arrays["positions"], velocities, out=velocities)
+            if self._momenta_due <= 0:
+                bound.motion.certify(atoms.arrays["positions"], velocities)
+                self._momenta_due = CHECK_EVERY
+            self._momenta_due -= 1
             np.multiply(velocities, masses, momenta)
         except InputError as error:
             if not np.isfinite(momenta).all():
@@ -350,7 +368,9 @@ class Constraints(FixConstraint):
         return lambda: {"name": REGISTERED_NAME, "kwargs": kwargs}
 
     def __repr__(self) -> str:
-        return f"Constraints({sum(c.n_rows for c in self.constraints)} rows on {len(self.get_indices())} atoms)"
+        converted = self._binding.motion.conversions if self._binding is not None else ()
+        what = f"; {len(converted)} groups converted to linear rows, the first: {converted[0]}" if converted else ""
+        return f"Constraints({sum(c.n_rows for c in self.constraints)} rows on {len(self.get_indices())} atoms{what})"
 
     # -- for people -----------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
 from kcons.ase.host import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
+from kcons.certificate import checked_every
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -60,6 +61,8 @@ class ConstrainedDynamics(MolecularDynamics):
         the number of steps are taken from it, `time` and `forces` are not looked at.
     degenerate : {'convert', 'raise'}
         See `Constraints`.
+    check_every : int, optional
+        As for `kcons.run`: steps from one certificate of the state to the next.
     trajectory, logfile, loginterval, **kwargs
         As for all dynamics of ASE.
 
@@ -91,9 +94,11 @@ class ConstrainedDynamics(MolecularDynamics):
         forces: ArrayLike | None = None,
         state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
+        check_every: int | None = None,
         **kwargs: Any,
     ) -> None:
         _check_timestep(timestep)
+        self._check_every, self._spare = checked_every(check_every)
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
@@ -164,6 +169,8 @@ class ConstrainedDynamics(MolecularDynamics):
         state = self._start(system)
         try:
             after = self.stepper.step(system, state, self.dt)
+            if self._check_every and self.dt and getattr(self.stepper, "holds", True):
+                system.schedule.made(1, self._check_every, after, spare=self._spare)
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta

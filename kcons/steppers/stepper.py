@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from kcons.certificate import CHECK_EVERY
+from kcons.certificate import checked_every
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers.state import State, System
 
@@ -190,9 +190,7 @@ def run(
 
         stepper = Rattle()
     stepper.check(system)
-    spare, check_every = check_every is None, CHECK_EVERY if check_every is None else check_every
-    if check_every < 0:
-        raise InputError(f"check_every is {check_every}; give 0 (never) or more", item="check_every")
+    check_every, spare = checked_every(check_every)
     if dt == 0 or not getattr(stepper, "holds", True):
         check_every = 0
     schedule = system.schedule
