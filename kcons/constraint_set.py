@@ -166,8 +166,14 @@ class ConstraintSet:
         norms = np.linalg.norm(self.lattice[1], axis=0)
         return 0.5 / float(norms.max())
 
-    def check_half_box(self, positions: FloatArray | None = None) -> None:
+    def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
         """Check against half the box that images are unambiguous; without `positions`, of held distances only.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (n_atoms, 3), optional
+        before : ndarray, shape (2, 3, 3), optional
+            The cell before it changed: atoms that nothing ties together must keep their images.
 
         Raises
         ------
@@ -189,7 +195,12 @@ class ConstraintSet:
             )
         if positions is None:
             return
-        self.refuse_loose_links(self.whole(positions))
+        whole = self.whole(positions)
+        if before is not None and self.images is not None:
+            whole = self.images.make_whole(positions, before)
+            moved = np.round((whole - positions) @ before[1])
+            whole = positions + moved @ self.lattice[0]
+        self.refuse_loose_links(whole)
         for item, start in zip(self.constraints, self.starts, strict=False):
             if not item.relative or item.family == "Distance" or item.n_rows == 0:
                 continue
@@ -363,7 +374,7 @@ class ConstraintSet:
             steps = minimum_image(np.diff(r[plain], axis=1), self.lattice)
             r[plain, 1:] = r[plain, :1] + np.cumsum(steps, axis=1)
         if item.windings is not None:
-            r += item.windings @ self.lattice[0]
+            r[item.whole] += item.windings[item.whole] @ self.lattice[0]
         return r
 
     def target(self, time: float = 0.0) -> FloatArray:
@@ -509,7 +520,9 @@ class ConstraintSet:
         other.n_atoms, other.masses, other.lattice = self.n_atoms, self.masses, self.lattice
         ends = np.cumsum([c.n_rows for c in constraints], dtype=np.int64)
         other.starts = np.concatenate([[0], ends]).astype(np.int64)
-        marked, other.images = find_images(constraints, other.starts, positions, self.lattice, self.half_width, time)
+        marked, other.images = find_images(
+            constraints, other.starts, positions, self.lattice, self.half_width, time, self.constraints
+        )
         other.constraints = tuple(marked)
         other._set_scale(positions, time)
         return other

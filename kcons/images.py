@@ -28,7 +28,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray
 from kcons.errors import ImageError, InputError
 
@@ -126,6 +126,7 @@ def find_images(
     lattice: FloatArray | None,
     half_width: float,
     time: float,
+    ties: Sequence[Constraint] = (),
 ) -> tuple[list[Constraint], Images | None]:
     """Sort rows into plain and whole ones and find the tree.
 
@@ -139,6 +140,8 @@ def find_images(
     lattice : ndarray, shape (2, 3, 3), or None
     half_width : float
     time : float
+    ties : sequence of Constraint
+        What the constraints replace: rows that are held still and tie atoms together.
 
     Returns
     -------
@@ -163,23 +166,26 @@ def find_images(
     if not tables or all(table.plain_at_once for table in tables):
         return given, None
     n_atoms = len(x)
-    held = [t for t in tables if t.held]
+    ties = [item for item in ties if item.family == "Distance" and not item.moving and item.n_rows]
+    others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
+    held = [t for t in [*tables, *others] if t.held]
     keys = np.sort(np.concatenate([t.keys(n_atoms)[t.short] for t in held] or [np.zeros(0, np.int64)]))
     for table in tables:
         table.sort_rows(keys, n_atoms)
     if not any(table.whole.any() or table.unsure.any() for table in tables):
         return given, None
-    images, longest, component = _tree(tables, given, x, lattice, half_width)
+    images, longest, component = _tree([*tables, *others], given, x, lattice, half_width)
     y = images.make_whole(x, lattice)
     frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
     for table in tables:
         table.find_closures(y, lattice, longest, component, frameworks)
     for table in tables:
         table.settle(component, frameworks)
-    marked = {id(table.item): table.marked() for table in tables}
-    needed = [table.item.atoms[table.whole].ravel() for table in tables]
-    comps = np.unique(component[np.concatenate(needed)]) if needed else np.zeros(0, np.int64)
-    keep = np.isin(component[images.atoms], comps)
+    needed = np.zeros(len(frameworks), bool)
+    for table in tables:
+        needed[component[table.item.atoms[table.whole].ravel()]] = True
+    marked = {id(t.item): t.marked(needed[component[t.item.atoms[:, 0]]]) for t in tables}
+    keep = needed[component[images.atoms]]
     result = [marked.get(id(item), item) for item in given]
     if not keep.any():
         return result, None
@@ -195,7 +201,7 @@ class _Links:
     def __init__(
         self, item: Constraint, start: int, x: FloatArray, lattice: FloatArray, half_width: float, time: float
     ) -> None:
-        self.item, self.start, self.half_width = item, start, half_width
+        self.item, self.start, self.half_width, self.time = item, start, half_width, time
         self.neighbours = np.stack([item.atoms[:, :-1], item.atoms[:, 1:]], axis=-1)
         raw = x[self.neighbours[..., 1]] - x[self.neighbours[..., 0]]
         nearest = minimum_image(raw, lattice)
@@ -211,6 +217,7 @@ class _Links:
             else:
                 self.lengths = item.target_at(time)[:, None]
             self.whole = ~self.unsure & (self.lengths[:, 0] >= half_width)
+        self._local: BoolArray | None = None
         self.plain_at_once = self.held and not (self.whole.any() or self.unsure.any())
 
     @property
@@ -230,7 +237,8 @@ class _Links:
         wanted = pairs[..., 0] * n_atoms + pairs[..., 1]
         place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
         found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
-        self.whole = np.logical_not(found.all(axis=1))
+        # The compiled solvers know minimum images of distances, angles and dihedrals only.
+        self.whole = np.logical_not(found.all(axis=1)) | (self.item.kind == RowKind.LINEAR)
 
     def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""
@@ -247,36 +255,46 @@ class _Links:
     def find_closures(
         self, y: FloatArray, lattice: FloatArray, longest: FloatArray, component: IntArray, frameworks: BoolArray
     ) -> None:
-        """Cells between minimum image and tree for each link, and which components close through the boundary."""
-        apart = y[self.neighbours[..., 1]] - y[self.neighbours[..., 0]]
-        self._cells = -np.round(apart @ lattice[1]).astype(np.int64)
-        self._nearest = np.linalg.norm(apart + self._cells @ lattice[0], axis=2)
-        self._apart = np.linalg.norm(apart, axis=2)
-        differs = self._cells.any(axis=2)
-        label = component[self.neighbours[..., 0]]
-        if self.held and self.item.target is not None:
+        """Rows that mean minimum images rather than those of the tree, and which components close by them."""
+        item = self.item
+        label = component[item.atoms[:, 0]]
+        r = y[item.atoms]
+        apart = np.diff(r, axis=1)
+        cells = -np.round(apart @ lattice[1]).astype(np.int64)
+        nearest = np.linalg.norm(apart + cells @ lattice[0], axis=2)
+        differs = cells.any(axis=2)
+        self.windings[:, 1:] = np.cumsum(cells, axis=1)
+        if item.target is not None and item.holonomic:
             # The target tells which of the two is meant.
-            closing = differs & (np.abs(self._nearest - self.lengths) < np.abs(self._apart - self.lengths))
+            other = r + self.windings @ lattice[0]
+            with np.errstate(all="ignore"):
+                closing = np.abs(self._sigma(other)) < 0.5 * np.abs(self._sigma(r))
         else:
-            closing = differs & (self._nearest < self.half_width) & (self._nearest <= BOND_LIKE * longest[label])
-        self._closing = closing
-        frameworks[label[closing]] = True
+            bonds = (nearest < self.half_width) & (nearest <= BOND_LIKE * longest[label][:, None])
+            closing = (bonds | ~differs).all(axis=1)
+            self._local = (nearest < self.half_width).all(axis=1)
+        self._closing = closing & differs.any(axis=1)
+        frameworks[label[self._closing]] = True
+
+    def _sigma(self, r: FloatArray) -> FloatArray:
+        difference = self.item.measure(r, self.time) - self.item.target_at(self.time)
+        if self.item.period is not None:
+            difference -= self.item.period * np.round(difference / self.item.period)
+        return difference
 
     def settle(self, component: IntArray, frameworks: BoolArray) -> None:
-        """Links beside the tree: in a body they have its images, in a framework they are local."""
-        local = self._closing
-        if not (self.held and self.item.target is not None):
-            label = component[self.neighbours[..., 0]]
-            local = local | (frameworks[label] & (self._nearest < self.half_width))
+        """Rows beside the tree: in a body they have its images, in a framework they are local."""
+        closing = self._closing
+        if self._local is not None:
+            closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
         if self.held:
-            beside = self._cells.any(axis=(1, 2)) & ~local[:, 0]
-            self.whole |= self.unsure & beside
-        cells = np.where(local[..., None], self._cells, 0)
-        self.windings[:, 1:] = np.cumsum(cells, axis=1)
-        self.windings[~self.whole] = 0
+            self.whole |= self.unsure & self.windings.any(axis=(1, 2)) & ~closing
+        self.windings[~closing] = 0
 
-    def marked(self) -> Constraint:
-        if not self.whole.any():
+    def marked(self, needed: BoolArray) -> Constraint:
+        """A copy that knows its whole rows, and the windings of all rows whose atoms are made whole."""
+        self.windings[~needed] = 0
+        if not self.whole.any() and not self.windings.any():
             return self.item
         copy = self.item.with_target(self.item.target)
         copy.whole = self.whole

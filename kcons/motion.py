@@ -140,7 +140,8 @@ class Motion:
         cell, pbc
             As for `ConstraintSet`.
         positions : array_like, shape (n_atoms, 3), optional
-            Where given, rows other than distances are checked against half the box too.
+            Where given, rows other than distances are checked against half the box too. Needed where rows hold
+            atoms that nothing else ties together.
 
         Raises
         ------
@@ -154,7 +155,16 @@ class Motion:
         before = held.lattice
         try:
             held.with_cell(cell, pbc)
-            held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"))
+            if positions is not None:
+                held.check_half_box(as_array(positions, self._shape, "positions"), before)
+            elif held.images is not None and np.any(held.images.loose >= 0):
+                raise InputError(
+                    "the images of rows among atoms that nothing ties together hang on the cell; give set_cell the "
+                    "positions",
+                    item="positions",
+                )
+            else:
+                held.check_half_box()
         except KconsError:
             held.lattice = before
             raise
