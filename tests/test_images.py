@@ -130,11 +130,12 @@ def test_a_polymer_that_closes_through_the_boundary(bonds_held):
     across = LinearCombination([0, 2], [[0, 0, 1.0], [0, 0, -1.0]])
     cell = np.diag([length, 9.0, 9.0])
     rows = ([Distance(bonds)] if bonds_held else [angles]) + [across]
-    there, shift = stored(x, cell, (True, True, True), 1)
+    there, _ = stored(x, cell, (True, True, True), 1)
     held = ConstraintSet(rows, there, np.ones(n), cell=cell)
     motion = Motion(held, there)
     # The same with six more atoms, moved along, on either side.
-    long = np.concatenate([x - [length, 0, 0], x, x + [length, 0, 0]])
+    along = np.array([length, 0.0, 0.0])
+    long = np.concatenate([x - along, x, x + along])
     inner = held.measure(there)[:n]
     if bonds_held:
         expected = [np.linalg.norm(long[n + k + 1] - long[n + k]) for k in range(n)]
