@@ -9,6 +9,7 @@ other; fixed atoms have infinite mass.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -326,7 +327,11 @@ def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
     m = [np.cross(q, r), np.cross(dq, r) + np.cross(q, dr), 2 * np.cross(dq, dr)]
     n = [np.cross(p, q), np.cross(dp, q) + np.cross(p, dq), 2 * np.cross(dp, dq)]
     t = [_dot(p, m[0]), _dot(dp, m[0]) + _dot(p, m[1]), 2 * _dot(dp, m[1]) + _dot(p, m[2])]
-    c = [_dot(n[0], m[0]), _dot(n[1], m[0]) + _dot(n[0], m[1]), _dot(n[2], m[0]) + 2 * _dot(n[1], m[1]) + _dot(n[0], m[2])]
+    c = [
+        _dot(n[0], m[0]),
+        _dot(n[1], m[0]) + _dot(n[0], m[1]),
+        _dot(n[2], m[0]) + 2 * _dot(n[1], m[1]) + _dot(n[0], m[2]),
+    ]
     return [g * t[0], g1 * t[0] + g * t[1], g2 * t[0] + 2 * g1 * t[1] + g * t[2]], c
 
 
@@ -358,7 +363,7 @@ def scheme(name: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float
         return (*_BM_B, 1 - 2 * sum(_BM_B), *_BM_B[::-1]), (*_BM_A, middle, middle, *_BM_A[::-1]), _FRACTIONS["Suzuki4"]
     g = _FRACTIONS[name]
     ends = [0.0, *g, 0.0]
-    return tuple(0.5 * (a + b) for a, b in zip(ends[:-1], ends[1:], strict=True)), g, (1.0,)
+    return tuple(0.5 * (a + b) for a, b in itertools.pairwise(ends)), g, (1.0,)
 
 
 def advance(rows: Dense, name: str, x: Array, v: Array, t: float, dt: float, force) -> tuple[Array, Array]:
