@@ -13,6 +13,7 @@ import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
 from ase.md.verlet import VelocityVerlet
+from cell_molecules import half_width
 from cell_oracle import EPS, Array, NoSolution, advance
 from cell_worlds import World, world, wrapping
 
@@ -65,6 +66,7 @@ class Judge:
             w.images = np.zeros_like(w.images)
         self.rng = np.random.default_rng([7, seed])
         self.verdicts: list[Verdict] = []
+        self.done = 0
         self.x = w.stored()
         self.motion: Motion | None = None
         self.held: ConstraintSet | None = None
@@ -121,18 +123,38 @@ class Judge:
         else:
             self.say(operation, "unfounded", words)
 
-    def attempt(self, operation: str, call: Callable[[], Any], given: list[Array], link: float, solvable: bool = True):
-        """The call's result, or None after an error; arguments must stay as they were."""
+    def attempt(
+        self,
+        operation: str,
+        call: Callable[[], Any],
+        given: list[Array],
+        link: float | list[float],
+        solvable: bool = True,
+    ) -> Any:
+        """The call's result, or None after an error; arguments must stay as they were.
+
+        `link` is how near half the cell is, or that before a run and after each of its steps.
+        """
         before = [a.copy() for a in given]
         result = None
         try:
             result = call()
         except Exception as error:
-            self.refusal(operation, error, link, solvable)
+            near = link
+            if isinstance(near, list):
+                reached = self._step_of(error, len(near))
+                solvable = solvable or reached < len(near)
+                near = max(near[:reached])
+            self.refusal(operation, error, near, solvable)
         if any(a.tobytes() != c.tobytes() for a, c in zip(before, given, strict=True)):
             self.say(operation, "silent", "arguments were changed")
             return None
         return result
+
+    def _step_of(self, error: Exception, steps: int) -> int:
+        """How many entries of the links an error concerns: those up to its step, and the next."""
+        step = getattr(error, "step", None)
+        return steps if step is None else max(1, step - self.done + 1)
 
     # -- operations -----------------------------------------------------------------------------
 
@@ -179,10 +201,10 @@ class Judge:
         moved = w.x + size * rng.normal(size=w.x.shape) / (w.masses / w.masses.min())[:, None] ** 0.5
         images = self.elsewhere(0.3)
         new = w.stored(moved, images)
-        links = max(w.nearness(w.x), w.nearness(moved))
+        links = max(w.nearness(w.x, every=True), w.nearness(moved, every=True))
         try:
             exact, allowed = self.spread(lambda a, b: rows.solve(a, b, t)[0], moved, w.x, stored=_top(new, here))
-            links, solvable = max(links, w.nearness(exact)), True
+            links, solvable = max(links, w.nearness(exact, every=True)), True
         except NoSolution:
             solvable = False
         found = self.attempt(
@@ -268,7 +290,12 @@ class Judge:
                         (i, j) = row.vectors[0]
                         expected.append(float(np.linalg.norm(moved[i] - moved[j])) - row.target)
         here = w.stored(moved, self.elsewhere(0.5))
-        found = self.attempt("value", lambda: self.held.value(here), [here], max(w.nearness(moved), w.nearness(w.x)))
+        found = self.attempt(
+            "value",
+            lambda: self.held.value(here),
+            [here],
+            max(w.nearness(moved, every=True), w.nearness(w.x, every=True)),
+        )
         if found is not None:
             self.compare("value", found, np.array(expected), 200 * EPS * _top(here, w.x) * _slope(rows, moved))
 
@@ -282,7 +309,7 @@ class Judge:
             exact, allowed = self.spread(lambda x: rows.restore(x, 0.0), moved, stored=_top(start))
         except NoSolution:
             return
-        link = max(w.nearness(moved), w.nearness(exact))
+        link = max(w.nearness(moved, every=True), w.nearness(exact, every=True))
         found = self.attempt("restore_positions", lambda: self.motion.restore_positions(start), [start], link)
         if found is not None:
             # The foot of the perpendicular is asked for to a part in 1e9 of the way.
@@ -311,11 +338,12 @@ class Judge:
         x, v = w.x, w.v
         twin = [x + EPS * _top(self.x) * rng.choice([-1.0, 1.0], x.shape), v]
         noise = rows.rounding(x, _top(self.x)) * rng.choice([-1.0, 1.0], len(rows.targets))
-        done, link, largest, name = 0, w.nearness(x), _top(self.x), f"run {w.stepper}"
+        done, largest, name = 0, _top(self.x), f"run {w.stepper}"
         for number, steps in enumerate(parts):
             if number and not w.drifting:
                 images, cell, state = self._between(state, images, cell, winds)
                 anchors[0] = w.anchors + images @ cell
+            self.done, link = done, [w.nearness(x, cell, every=True)]
             try:
                 for _ in range(steps):
                     t = done * w.dt
@@ -325,7 +353,8 @@ class Judge:
                         twin = list(advance(rows, w.stepper, *twin, t, w.dt, self._pull))
                     finally:
                         rows.targets = rows.targets - noise
-                    done, link = done + 1, max(link, w.nearness(x, cell))
+                    done += 1
+                    link.append(w.nearness(x, cell, every=True))
                 solvable = True
             except NoSolution:
                 solvable = False
@@ -355,7 +384,7 @@ class Judge:
             if not fine:
                 return
         if not np.array_equal(cell, w.cell):
-            self._use_cell(w.cell, w.nearness(w.x))
+            self._use_cell(w.cell)
 
     def _pull(self, x: Array) -> Array:
         return -self.w.springs * (x - self.w.anchors)
@@ -368,17 +397,25 @@ class Judge:
             images = np.where(w.placed[:, None], images, wrapping(whole, cell, w.pbc))
         else:
             changed = w.cell @ (np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3)))
-            if w.nearness(w.x, changed) < 1 and self._use_cell(changed, w.nearness(w.x, changed)):
+            if w.nearness(w.x, changed) < 1 and self._use_cell(changed):
                 cell = changed
         return images, cell, State(whole + images @ cell, state.velocities, state.time, step=state.step)
 
-    def _use_cell(self, cell: Array, link: float) -> bool:
+    def _use_cell(self, cell: Array) -> bool:
         def change() -> bool:
             self.motion.set_cell(cell, self.w.pbc)
             self.rows.set_cell(cell)
             return True
 
-        return bool(self.attempt("set_cell", change, [], link))
+        return bool(self.attempt("set_cell", change, [], self._cell_link(cell)))
+
+    def _cell_link(self, cell: Array) -> float:
+        """Rows are sorted once: a distance that becomes longer than half the cell may be refused as well."""
+        w = self.w
+        lengths = [r.target for i in w.items for r in i.arguments.get("pairs_as_rows", [])]
+        half, before = half_width(cell, w.pbc), half_width(w.cell, w.pbc)
+        grown = any(before > a >= half for a in lengths)
+        return max(w.nearness(w.x, cell), 2.0 if grown else 0.0)
 
     def new_cell(self) -> None:
         """set_cell, then everything once more; or a cell that is too small, and the old one still in use."""
@@ -399,7 +436,7 @@ class Judge:
                 self.motion.set_cell(cell, w.pbc, positions)
                 return True
 
-            accepted = self.attempt("set_cell", change, given, link)
+            accepted = self.attempt("set_cell", change, given, self._cell_link(cell))
         label = "after set_cell, "
         if accepted:
             self.rows.set_cell(cell)
@@ -442,7 +479,7 @@ class Judge:
                     twin = list(advance(rows, "Rattle", *twin, 0.0, w.dt, self._pull))
                 finally:
                     rows.targets = rows.targets - noise
-                link = max(link, w.nearness(x))
+                link = max(link, w.nearness(x, every=True))
             except NoSolution:
                 solvable = False
             if number and self.periodic:

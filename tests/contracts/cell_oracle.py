@@ -18,6 +18,8 @@ Array = np.ndarray
 EPS = float(np.finfo(float).eps)
 #: Singular values of the row-normalised B below this many times the largest are zero; `World` leaves a gap around it.
 RANK = 1e-8
+#: A correction longer than this, in units of the molecules' bonds, is no solution near the start.
+FAR = 20.0
 #: Which vectors a kind of row is made of, and whether it turns through a full circle.
 VECTORS = {"norm": 1, "angle": 2, "dihedral": 3, "linear": 0, "gyration": 0}
 
@@ -225,6 +227,8 @@ class Dense:
             unknown += step
             z = y + (spread @ unknown).reshape(-1, 3)
             length = float(np.abs(spread @ step).max(initial=0.0))
+            if float(np.abs(z - y).max()) > FAR:
+                break
             if length <= 1e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
                 return z, (spread @ unknown).reshape(-1, 3)
             last = length

@@ -9,6 +9,7 @@ distances of two or three atoms and by where the others lie between these.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,15 +85,24 @@ class World:
         """The rows in the package's words; new objects at each call."""
         return [_constraint(item, self) for item in self.items if item.family]
 
-    def links(self, x: Array, cell: Array | None = None) -> tuple[float, float]:
+    def links(self, x: Array, cell: Array | None = None, every: bool = False) -> tuple[float, float]:
         """The longest vectors whose image is taken as the shortest one, in units of half the cell's width.
 
-        First between neighbours in a row that nothing ties, then of what ties: for each molecule the longest of the
-        shortest distances that make it whole, and bonds through the boundary.
+        First between neighbours in a row (`every`: any two atoms of a row) that nothing ties, then of what ties: for
+        each molecule the longest of the shortest distances that make it whole, and bonds through the boundary.
         """
         cell = self.cell if cell is None else cell
         half = half_width(cell, self.pbc)
-        free, tied, parent = 0.0, 0.0, list(range(len(x)))
+        free, parent, tied = 0.0, *self.bodies(x, cell)
+        for item in self.items:
+            for i, j in _loose_pairs(item, every):
+                if _root(parent, i) != _root(parent, j):
+                    free = max(free, float(np.linalg.norm(x[i] - x[j])))
+        return free / half, tied / half
+
+    def bodies(self, x: Array, cell: Array) -> tuple[list[int], float]:
+        """Which atoms distances tie together, as a forest of parents, and the longest vector that this needs."""
+        tied, parent = 0.0, list(range(len(x)))
         bonds = [(r, *r.vectors[0]) for i in self.items for r in _tying(i)]
         for length, i, j in sorted((_length(r, x, cell), i, j) for r, i, j in bonds):
             a, b = _root(parent, i), _root(parent, j)
@@ -100,24 +110,14 @@ class World:
                 parent[a] = b
                 tied = max(tied, length)
         for item in self.items:
-            if (
-                item.family in ("FixedAtoms", "Sphere", "Plane", "CenterOfMass", "Distance")
-                or "place" in item.arguments
-            ):
-                continue
-            for atoms in item.arguments["listed"]:
-                for i, j in itertools.pairwise(atoms):
-                    if _root(parent, i) != _root(parent, j):
-                        free = max(free, float(np.linalg.norm(x[i] - x[j])))
-        for item in self.items:
             for row in item.rows:
                 if row.images and np.any(row.images):
                     tied = max(tied, _length(row, x, cell))
-        return free / half, tied / half
+        return parent, tied
 
-    def nearness(self, x: Array, cell: Array | None = None) -> float:
+    def nearness(self, x: Array, cell: Array | None = None, every: bool = False) -> float:
         """Above 1, a refusal since half the cell is near is justified."""
-        free, tied = self.links(x, cell)
+        free, tied = self.links(x, cell, every)
         return max(free / NEAR_FREE, tied / NEAR_TIED)
 
     @property
@@ -142,6 +142,14 @@ class World:
             "free links": self.links(self.x)[0] > 0,
         }
         return [name for name, present in found.items() if present]
+
+
+def _loose_pairs(item: Item, every: bool) -> Iterator[tuple[int, int]]:
+    """Pairs of atoms of rows that depend on differences of positions, but for distances."""
+    if item.family in ("FixedAtoms", "Sphere", "Plane", "CenterOfMass", "Distance") or "place" in item.arguments:
+        return
+    for atoms in item.arguments["listed"]:
+        yield from itertools.combinations(atoms, 2) if every else itertools.pairwise(atoms)
 
 
 def _tying(item: Item) -> list[Row]:
@@ -254,6 +262,7 @@ def _finished(b: Builder) -> World:
               b.flat, x, x, "Rattle", 0.01, 1)  # fmt: skip
     _scale_cell(w, rng, b.cell is not None)
     rows.set_cell(w.cell)
+    _settle_meaning(w)
     _set_targets(w, rng)
     s = _singular_values(rows, x)
     if np.any((s > DEPENDENT) & (s < s.max(initial=0.0) / WORST_CONDITION)):
@@ -329,6 +338,48 @@ def _scale_cell(w: World, rng: np.random.Generator, settled: bool) -> None:
         share = rng.uniform(0.3, 0.6)
     half = link * half_width(w.cell, w.pbc) / share if link > 0 else rng.uniform(2, 5)
     w.cell = w.cell * (half / half_width(w.cell, w.pbc))
+
+
+def _settle_meaning(w: World) -> None:
+    """Leave out what no one could tell from the rows.
+
+    A row within a molecule, two atoms of which are as near through the boundary as bonds are, may mean the one or the
+    other; a distance says which by its target. So does one longer than half the cell.
+    """
+    free, tied = w.links(w.x)
+    parent, longest = w.bodies(w.x, w.cell)
+    half = half_width(w.cell, w.pbc)
+    if free >= 1:
+        raise Unsuitable
+    for item in w.items:
+        if item.family == "Distance":
+            pairs = [tuple(r.vectors[0]) for r in _tying(item)]
+        else:
+            pairs = list(_loose_pairs(item, every=True))
+        for i, j in pairs:
+            if _root(parent, i) != _root(parent, j):
+                continue
+            d = w.x[j] - w.x[i]
+            near = shortest(d, w.cell, w.pbc)
+            if np.linalg.norm(near) < np.linalg.norm(d) - 1e-9 and np.linalg.norm(near) <= 1.6 * longest:
+                if item.family != "Distance" or item.how == "moving":
+                    raise Unsuitable
+                item.how = "given"
+        if tied >= 1 and item.family == "Distance":
+            if item.how == "moving":
+                raise Unsuitable
+            item.how = "given"
+    if tied >= 1 and longest < half:
+        raise Unsuitable
+
+
+def shortest(d: Array, cell: Array, pbc: Array) -> Array:
+    """The shortest periodic image of a vector, by trying all."""
+    images = d + _NEAR[np.all((_NEAR == 0) | pbc, axis=1)] @ cell
+    return images[np.argmin(np.einsum("ki,ki->k", images, images))]
+
+
+_NEAR = np.array(list(itertools.product(range(-3, 4), repeat=3)))
 
 
 def _set_targets(w: World, rng: np.random.Generator) -> None:
