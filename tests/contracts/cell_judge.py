@@ -421,11 +421,13 @@ class Judge:
         """set_cell, then everything once more; or a cell that is too small, and the old one still in use."""
         w, rng, old = self.w, self.rng, self.w.cell
         strain = np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3))
-        if rng.random() < 0.25:
+        too_small = rng.random() < 0.25
+        if too_small:
             strain = np.eye(3) * max(w.links(w.x)) / rng.uniform(1.02, 1.2)
         cell = old @ strain
         link = w.nearness(w.x, cell)
-        positions = w.stored(cell=cell) if rng.random() < 0.5 else None
+        # Without positions no one could tell that links which may grow are too long.
+        positions = w.stored(cell=cell) if too_small or rng.random() < 0.5 else None
         given = [] if positions is None else [positions]
         if rng.random() < 0.3 and link < 1:
             self.held.with_cell(cell, w.pbc)  # barostats may as well tell the set
