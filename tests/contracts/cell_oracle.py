@@ -1,0 +1,392 @@
+"""Dense mechanics of rows on whole molecules: what the engine is judged by in periodic cells.
+
+Nothing here comes from the package, and nothing here knows of minimum images: positions are those of whole molecules,
+and a row that leads through the boundary says by which lattice vectors. Every row is a function of a few vectors that
+are linear in the positions; values, gradients and second derivatives along a motion are taken from there by the
+product rule. Projections are least squares on the singular vectors of B = A M^-1/2, so that rows may depend on each
+other; fixed atoms have infinite mass.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Array = np.ndarray
+EPS = float(np.finfo(float).eps)
+#: Singular values of the row-normalised B below this many times the largest are zero; `World` leaves a gap around it.
+RANK = 1e-8
+#: A correction longer than this, in units of the molecules' bonds, is no solution near the start.
+FAR = 20.0
+#: Which vectors a kind of row is made of, and whether it turns through a full circle.
+VECTORS = {"norm": 1, "angle": 2, "dihedral": 3, "linear": 0, "gyration": 0}
+
+
+class NoSolution(Exception):
+    """Newton's method found nothing."""
+
+
+@dataclass
+class Row:
+    """One row: q(x) = target + amplitude (sin(rate t + phase) - sin(phase)).
+
+    Attributes
+    ----------
+    kind : str
+        'norm' |d|, 'angle' between d_1 and d_2, 'dihedral' of d_1, d_2, d_3, 'linear' sum c . x, 'gyration'.
+    vectors : list of dict
+        Each vector as {atom: weight}; for 'gyration' one entry, the weights of the atoms.
+    images : list of three int
+        What each vector has besides, in lattice vectors.
+    coefficients : dict
+        {atom: three numbers} of a linear row.
+    place : array, optional
+        What is subtracted from the vector of a 'norm' (the centre of a sphere).
+    """
+
+    kind: str
+    vectors: list[dict[int, float]] = field(default_factory=list)
+    images: list[tuple[int, int, int]] = field(default_factory=list)
+    coefficients: dict[int, Array] = field(default_factory=dict)
+    place: Array | None = None
+    target: float = 0.0
+    amplitude: float = 0.0
+    omega: float = 0.0
+    phase: float = 0.0
+
+    def renumbered(self, new: Array) -> Row:
+        """The same row where atom a is called new[a]."""
+        return Row(
+            self.kind,
+            [{int(new[a]): w for a, w in v.items()} for v in self.vectors],
+            list(self.images),
+            {int(new[a]): c for a, c in self.coefficients.items()},
+            self.place,
+        )
+
+
+def wave(amplitude: Array, omega: Array, phase: Array, time: float, derivative: int = 0) -> Array:
+    """amplitude (sin(omega t + phase) - sin(phase)), or a derivative with respect to t."""
+    argument = omega * time + phase
+    if derivative == 0:
+        return amplitude * (np.sin(argument) - np.sin(phase))
+    return amplitude * omega * np.cos(argument) if derivative == 1 else -amplitude * omega**2 * np.sin(argument)
+
+
+class Dense:
+    """All rows on all atoms.
+
+    Parameters
+    ----------
+    rows : list of Row
+    masses : array, shape (n,)
+    cell : array, shape (3, 3)
+    pinned : array of int
+        Fixed atoms; `places` and their waves (amplitude, omega, phase, each of shape (n_pinned, 3)) say where they are.
+    """
+
+    def __init__(self, rows: list[Row], masses: Array, cell: Array, pinned: Array, places: Array, waves: Array) -> None:
+        self.n, self.masses, self.pinned, self.places, self.waves = len(masses), masses, pinned, places, waves
+        order = list(VECTORS)
+        self.rows = sorted(rows, key=lambda r: order.index(r.kind))
+        self.weights = 1.0 / masses
+        self.weights[pinned] = 0.0
+        self.root = np.sqrt(np.repeat(self.weights, 3))
+        self.blocks = {}
+        for kind, count in VECTORS.items():
+            mine = [r for r in self.rows if r.kind == kind]
+            if not mine:
+                continue
+            table = np.zeros((max(count, 1), len(mine), self.n))
+            for k, row in enumerate(mine):
+                for slot, vector in enumerate(row.vectors):
+                    for atom, weight in vector.items():
+                        table[slot, k, atom] = weight
+            extra = np.zeros((max(count, 1), len(mine), 3))
+            for k, row in enumerate(mine):
+                if row.place is not None:
+                    extra[0, k] -= row.place
+            linear = np.zeros((len(mine), self.n, 3))
+            for k, row in enumerate(mine):
+                for atom, c in row.coefficients.items():
+                    linear[k, atom] = c
+            images = np.array([r.images or [(0, 0, 0)] * max(count, 1) for r in mine], dtype=float)
+            self.blocks[kind] = (table, extra, linear, images)
+        self.set_cell(cell)
+        self.waving = np.array([[r.amplitude, r.omega, r.phase] for r in self.rows]).reshape(-1, 3).T
+        self.targets = np.array([r.target for r in self.rows])
+        self.turns = np.array([r.kind == "dihedral" for r in self.rows], dtype=bool)
+
+    def set_cell(self, cell: Array) -> None:
+        """Lattice vectors as rows; rows through the boundary follow."""
+        self.shifts = {k: np.moveaxis(images @ cell, 1, 0) for k, (_, _, _, images) in self.blocks.items()}
+
+    # -- rows -----------------------------------------------------------------------------------
+
+    def _vectors(self, kind: str, x: Array, moving: bool = False) -> Array:
+        table, extra, _, _ = self.blocks[kind]
+        return table @ x if moving else table @ x + extra + self.shifts[kind]
+
+    def measure(self, x: Array) -> Array:
+        """q of every row."""
+        return np.concatenate([self._measure(kind, x) for kind in self.blocks] or [np.zeros(0)])
+
+    def _measure(self, kind: str, x: Array) -> Array:
+        if kind == "linear":
+            return np.einsum("kai,ai->k", self.blocks[kind][2], x)
+        if kind == "gyration":
+            return np.sqrt(self._spread(x, x))
+        d = self._vectors(kind, x)
+        if kind == "norm":
+            return np.linalg.norm(d[0], axis=1)
+        s, c = _angle(*d)[:2] if kind == "angle" else _dihedral(*d)[:2]
+        return np.arctan2(s, c)
+
+    def _spread(self, x: Array, y: Array) -> Array:
+        w = self.blocks["gyration"][0][0]
+        return np.einsum("ka,ai,ai->k", w, x, y) - np.einsum("ki,ki->k", w @ x, w @ y)
+
+    def value(self, x: Array, t: float) -> Array:
+        """sigma of every row, dihedrals to the nearest turn."""
+        difference = self.measure(x) - self.targets - wave(*self.waving, t)
+        return np.where(self.turns, (difference + np.pi) % (2 * np.pi) - np.pi, difference)
+
+    def jacobian(self, x: Array) -> Array:
+        """A, shape (rows, 3 n)."""
+        parts = [self._gradient(kind, x).reshape(-1, 3 * self.n) for kind in self.blocks]
+        return np.concatenate(parts) if parts else np.zeros((0, 3 * self.n))
+
+    def _gradient(self, kind: str, x: Array) -> Array:
+        table, _, linear, _ = self.blocks[kind]
+        if kind == "linear":
+            return linear
+        if kind == "gyration":
+            w = table[0]
+            q = np.sqrt(self._spread(x, x))
+            return w[:, :, None] * (x[None] - (w @ x)[:, None]) / q[:, None, None]
+        d = self._vectors(kind, x)
+        if kind == "norm":
+            slopes = d / np.linalg.norm(d, axis=2, keepdims=True)
+        else:
+            s, c, ds, dc = (_angle if kind == "angle" else _dihedral)(*d)
+            slopes = (c[:, None] * ds - s[:, None] * dc) / (s * s + c * c)[:, None]
+        return np.einsum("ska,ski->kai", table, slopes)
+
+    def curvature(self, x: Array, v: Array) -> Array:
+        """The second derivative of q along x + s v."""
+        return np.concatenate([self._curvature(kind, x, v) for kind in self.blocks] or [np.zeros(0)])
+
+    def _curvature(self, kind: str, x: Array, v: Array) -> Array:
+        if kind == "linear":
+            return np.zeros(len(self.blocks[kind][2]))
+        if kind == "gyration":
+            q = np.sqrt(self._spread(x, x))
+            return (self._spread(v, v) - (self._spread(x, v) / q) ** 2) / q
+        d, u = self._vectors(kind, x), self._vectors(kind, v, moving=True)
+        if kind == "norm":
+            q = np.linalg.norm(d[0], axis=1)
+            return (_dot(u[0], u[0]) - (_dot(d[0], u[0]) / q) ** 2) / q
+        s, c = _angle_along(d, u) if kind == "angle" else _dihedral_along(d, u)
+        square = s[0] ** 2 + c[0] ** 2
+        rate = (c[0] * s[1] - s[0] * c[1]) / square
+        return (c[0] * s[2] - s[0] * c[2]) / square - rate * 2 * (c[0] * c[1] + s[0] * s[1]) / square
+
+    # -- mechanics ------------------------------------------------------------------------------
+
+    def basis(self, x: Array) -> tuple[Array, Array, float]:
+        """Orthonormal basis of the rows of B, A itself, and the condition of B."""
+        a = self.jacobian(x)
+        b = a * self.root
+        size = np.linalg.norm(b, axis=1, keepdims=True)
+        _, s, vh = np.linalg.svd(b / np.where(size > 0, size, 1.0), full_matrices=False)
+        rank = int(np.sum(s > RANK * s.max(initial=0.0)))
+        return vh[:rank], a, float(s[0] / s[rank - 1]) if rank else 1.0
+
+    def pin(self, x: Array, t: float, derivative: int = 0) -> None:
+        """Put fixed atoms where they are, or give them their velocity or acceleration, in place."""
+        moved = wave(*self.waves, t, derivative)
+        x[self.pinned] = moved + self.places if derivative == 0 else moved
+
+    def solve(self, x_new: Array, x_ref: Array, t: float) -> tuple[Array, Array]:
+        """x_new + M^-1 A(x_ref)^T Lambda on the rows, and that correction."""
+        y = x_new.copy()
+        self.pin(y, t)
+        basis = self.basis(x_ref)[0]
+        spread = (basis * self.root).T
+        unknown = np.zeros(len(basis))
+        z, last = y, np.inf
+        for _ in range(30):
+            a, miss = self.jacobian(z), self.value(z, t)
+            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(miss))):
+                break
+            size = np.linalg.norm(a, axis=1)
+            size[size == 0] = 1.0
+            step = np.linalg.lstsq((a @ spread) / size[:, None], -miss / size, rcond=1e-10)[0]
+            unknown += step
+            z = y + (spread @ unknown).reshape(-1, 3)
+            length = float(np.abs(spread @ step).max(initial=0.0))
+            if float(np.abs(z - y).max()) > FAR:
+                break
+            if length <= 1e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
+                return z, (spread @ unknown).reshape(-1, 3)
+            last = length
+        raise NoSolution("Newton's method for positions")
+
+    def _admissible(self, x: Array, y: Array, wanted: Array) -> Array:
+        """The nearest to y, in the mass metric, with A y = wanted; fixed atoms stay."""
+        basis, a, _ = self.basis(x)
+        spread = (basis * self.root).T
+        size = np.linalg.norm(a, axis=1)
+        size[size == 0] = 1.0
+        miss = (wanted - a @ y.ravel()) / size
+        return y + (spread @ np.linalg.lstsq((a @ spread) / size[:, None], miss, rcond=1e-10)[0]).reshape(-1, 3)
+
+    def velocities(self, x: Array, v: Array, t: float) -> Array:
+        """A v = c."""
+        v = v.copy()
+        self.pin(v, t, 1)
+        return self._admissible(x, v, wave(*self.waving, t, 1))
+
+    def acceleration(self, x: Array, v: Array, f: Array, t: float) -> Array:
+        """A a = b, with the least constraint force."""
+        a = f * self.weights[:, None]
+        self.pin(a, t, 2)
+        return self._admissible(x, a, wave(*self.waving, t, 2) - self.curvature(x, v))
+
+    def restore(self, x: Array, t: float) -> Array:
+        """The nearest point on the rows in the mass metric."""
+        start = x.copy()
+        self.pin(start, t)
+        z, last = start.copy(), np.inf
+        for _ in range(200):
+            a = self.jacobian(z)
+            wanted = a @ (z - start).ravel() - self.value(z, t)
+            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(wanted))):
+                break
+            basis = self.basis(z)[0]
+            spread = (basis * self.root).T
+            size = np.linalg.norm(a, axis=1)
+            size[size == 0] = 1.0
+            push = np.linalg.lstsq((a @ spread) / size[:, None], wanted / size, rcond=1e-10)[0]
+            following = start + (spread @ push).reshape(-1, 3)
+            length = float(np.abs(following - z).max())
+            z = following
+            if length <= 2e-15 * np.abs(z).max() or (length >= last and length <= 1e-12 * np.abs(z).max()):
+                return z
+            last = length
+        raise NoSolution("the nearest point")
+
+    def amplification(self, x: Array, x_ref: Array) -> Array:
+        """By how much each coordinate moves, at most, where each sigma is off by one: shape (3 n, rows)."""
+        spread = (self.basis(x_ref)[0] * self.root).T
+        a = self.jacobian(x)
+        size = np.linalg.norm(a, axis=1)
+        size[size == 0] = 1.0
+        return np.abs(spread @ np.linalg.pinv((a @ spread) / size[:, None], rcond=1e-10)) / size
+
+    def rounding(self, x: Array, stored: float) -> Array:
+        """What double precision leaves of each sigma where coordinates are as large as `stored`."""
+        reach = np.abs(self.jacobian(x)).sum(axis=1) * stored
+        return 1e-14 * np.maximum(np.abs(self.targets), 1.0) + 8 * EPS * reach
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("ki,ki->k", a, b)
+
+
+def _angle(u: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    """|u x w|, u . w, and their gradients with respect to u and w."""
+    n = np.cross(u, w)
+    s = np.linalg.norm(n, axis=1)
+    return s, _dot(u, w), np.stack([np.cross(w, n), np.cross(n, u)]) / s[:, None], np.stack([w, u])
+
+
+def _dihedral(p: Array, q: Array, r: Array) -> tuple[Array, Array, Array, Array]:
+    """|q| p . (q x r), (p x q) . (q x r), and their gradients with respect to p, q and r."""
+    g = np.linalg.norm(q, axis=1)
+    qr = np.cross(q, r)
+    triple = _dot(p, qr)
+    pq_, qr_, pr_, qq = _dot(p, q)[:, None], _dot(q, r)[:, None], _dot(p, r)[:, None], _dot(q, q)[:, None]
+    ds = np.stack([qr, np.cross(r, p), np.cross(p, q)]) * g[:, None]
+    ds[1] += triple[:, None] * q / g[:, None]
+    dc = np.stack([qr_ * q - qq * r, qr_ * p + pq_ * r - 2 * pr_ * q, pq_ * q - qq * p])
+    return g * triple, (pq_ * qr_ - pr_ * qq)[:, 0], ds, dc
+
+
+def _angle_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
+    (u, w), (du, dw) = d, v
+    n, n1, n2 = np.cross(u, w), np.cross(du, w) + np.cross(u, dw), 2 * np.cross(du, dw)
+    s = np.linalg.norm(n, axis=1)
+    s1 = _dot(n, n1) / s
+    return [s, s1, (_dot(n1, n1) + _dot(n, n2) - s1**2) / s], [_dot(u, w), _dot(du, w) + _dot(u, dw), 2 * _dot(du, dw)]
+
+
+def _dihedral_along(d: Array, v: Array) -> tuple[list[Array], list[Array]]:
+    (p, q, r), (dp, dq, dr) = d, v
+    g = np.linalg.norm(q, axis=1)
+    g1 = _dot(q, dq) / g
+    g2 = (_dot(dq, dq) - g1**2) / g
+    m = [np.cross(q, r), np.cross(dq, r) + np.cross(q, dr), 2 * np.cross(dq, dr)]
+    n = [np.cross(p, q), np.cross(dp, q) + np.cross(p, dq), 2 * np.cross(dp, dq)]
+    t = [_dot(p, m[0]), _dot(dp, m[0]) + _dot(p, m[1]), 2 * _dot(dp, m[1]) + _dot(p, m[2])]
+    c = [
+        _dot(n[0], m[0]),
+        _dot(n[1], m[0]) + _dot(n[0], m[1]),
+        _dot(n[2], m[0]) + 2 * _dot(n[1], m[1]) + _dot(n[0], m[2]),
+    ]
+    return [g * t[0], g1 * t[0] + g * t[1], g2 * t[0] + 2 * g1 * t[1] + g * t[2]], c
+
+
+# -- motion -------------------------------------------------------------------------------------
+
+_S = 1.0 / (4.0 - 4.0 ** (1 / 3))
+_Y = 1.0 / (2.0 - 2.0 ** (1 / 3))
+_KL = (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)
+_BM_B = (0.0829844064174052, 0.396309801498368, -0.0390563049223486)
+_BM_A = (0.245298957184271, 0.604872665711080)
+#: Kicks, drifts and the parts of each drift, as fractions of the step (Suzuki 1990; Yoshida 1990; Kahan and Li 1997;
+#: Blanes and Moan 2002, SRKN 6b).
+_FRACTIONS = {
+    "Suzuki4": (_S, _S, 1 - 4 * _S, _S, _S),
+    "Yoshida4": (_Y, 1 - 2 * _Y, _Y),
+    "KahanLi6": (*_KL, 1 - 2 * sum(_KL), *_KL[::-1]),
+}
+
+
+def scheme(name: str) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Kicks, drifts and parts of a drift of a stepper."""
+    if name == "Rattle":
+        return (0.5, 0.5), (1.0,), (1.0,)
+    if name.startswith("Geodesic"):
+        parts = int(name[8:])
+        return (0.5, 0.5), (1.0,), (1 / parts,) * parts
+    if name == "BlanesMoan4":
+        middle = 0.5 - sum(_BM_A)
+        return (*_BM_B, 1 - 2 * sum(_BM_B), *_BM_B[::-1]), (*_BM_A, middle, middle, *_BM_A[::-1]), _FRACTIONS["Suzuki4"]
+    g = _FRACTIONS[name]
+    ends = [0.0, *g, 0.0]
+    return tuple(0.5 * (a + b) for a, b in itertools.pairwise(ends)), g, (1.0,)
+
+
+def advance(rows: Dense, name: str, x: Array, v: Array, t: float, dt: float, force) -> tuple[Array, Array]:
+    """One step of kicks and drifts; `force(x)` is that on whole molecules."""
+    if name == "ProjectedVerlet":
+        a = rows.acceleration(x, v, force(x), t)
+        half = v + 0.5 * dt * a
+        y = rows.solve(x + dt * half, x, t + dt)[0]
+        v = half + 0.5 * dt * rows.acceleration(y, half + 0.5 * dt * a, force(y), t + dt)
+        return y, rows.velocities(y, v, t + dt)
+    kicks, drifts, parts = scheme(name)
+    weights = rows.weights[:, None]
+    end = t + dt
+    v = v + kicks[0] * dt * weights * force(x)
+    for kick, drift in zip(kicks[1:], drifts, strict=True):
+        for part in parts:
+            h = drift * part * dt
+            t += h
+            x, push = rows.solve(x + h * v, x, t)
+            v = v + push / h
+        v = v + kick * dt * weights * force(x)
+    return x, rows.velocities(x, v, end)

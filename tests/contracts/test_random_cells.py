@@ -1,0 +1,152 @@
+"""The engine in random periodic cells: right, or refused for a reason that holds. And that the judge can tell."""
+
+from __future__ import annotations
+
+import cell_judge
+import numpy as np
+import pytest
+import random_cells
+from cell_judge import judge
+from cell_molecules import KINDS
+from cell_oracle import Dense, advance
+from cell_worlds import world
+
+from kcons import Motion
+from kcons.errors import ConvergenceError
+
+FAST = 150
+
+
+def test_a_share_of_the_cases():
+    found = random_cells.summary([judge(seed) for seed in range(FAST)])
+    assert found["faults"] == {}
+    assert found["outcomes"]["right"] > 0.8 * FAST
+    assert set(found["kinds"]) == set(KINDS)
+    assert found["features"]["longer than the cell"]["right"] > 3
+    assert found["features"]["drifting"]["refused"] > 0
+    assert found["allowed"]["largest"] < 1e-7
+
+
+@pytest.mark.validation
+def test_ten_thousand_cases(tmp_path):
+    """The same as ``python tests/contracts/random_cells.py --cases 10000 --out FILE``."""
+    assert random_cells.main(["--cases", "10000", "--out", str(tmp_path / "random_cells.json")]) == 0
+
+
+def test_without_a_cell_the_engine_and_the_oracle_agree():
+    """What the judge finds in cells is therefore due to the cells."""
+    cases = [
+        judge(seed, periodic=False) for seed in range(60) if not {"winding", "fixed pair"} & set(world(seed).kinds)
+    ]
+    assert {case.outcome for case in cases} <= {"right", "refused"}
+    assert sum(case.outcome == "right" for case in cases) > 0.9 * len(cases)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_gradients_and_second_derivatives_of_the_oracle(seed):
+    """Against central differences of the values: error h^2 with h = 1e-4, and rounding of 1e-16/h^2."""
+    w = world(seed)
+    rng = np.random.default_rng(seed)
+    x, v = w.x + 0.01 * rng.normal(size=w.x.shape), rng.normal(size=w.x.shape)
+    h = 1e-4
+    ahead, here, behind = (w.rows.value(x + k * h * v, 0.0) for k in (1, 0, -1))
+    np.testing.assert_allclose(w.rows.jacobian(x) @ v.ravel(), (ahead - behind) / (2 * h), rtol=0, atol=2e-5)
+    np.testing.assert_allclose(w.rows.curvature(x, v), (ahead - 2 * here + behind) / h**2, rtol=0, atol=2e-4)
+
+
+def test_the_oracle_turns_a_rotor_as_rattle_does():
+    """Free rotor: exactly asin(omega dt) a step of RATTLE."""
+    from cell_oracle import Row
+
+    rows = Dense(
+        [Row("norm", [{0: 1.0, 1: -1.0}], target=2.0)],
+        np.ones(2),
+        np.eye(3),
+        np.zeros(0, int),
+        np.zeros((0, 3)),
+        np.zeros((3, 0, 3)),
+    )
+    x, v = np.array([[1.0, 0, 0], [-1.0, 0, 0]]), np.array([[0, 0.3, 0], [0, -0.3, 0]])
+    y, u = advance(rows, "Rattle", x, v, 0.0, 1.0, np.zeros_like)
+    turn = np.arcsin(0.3)
+    np.testing.assert_allclose(y[0], [np.cos(turn), np.sin(turn), 0], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(u[0], [-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0], rtol=0, atol=1e-14)
+
+
+def _seed_of(kind: str) -> int:
+    return next(s for s in range(1000) if world(s).kinds == [kind] and judge(s).outcome == "right")
+
+
+@pytest.mark.parametrize("off", [1e-6, np.nan])
+def test_the_judge_sees_wrong_positions(monkeypatch, off):
+    seed = _seed_of("chain")
+    honest = Motion.project_positions
+
+    def shifted(self, *args, **kwargs):
+        out = honest(self, *args, **kwargs)
+        out[0, 0] += off
+        return out
+
+    monkeypatch.setattr(Motion, "project_positions", shifted)
+    assert "silent" in {v.outcome for v in judge(seed).verdicts if v.operation == "project_positions"}
+
+
+def test_the_judge_sees_atoms_in_another_image(monkeypatch):
+    """A result that is right up to a lattice vector is not the atom that was given."""
+    seed = _seed_of("rigid")
+    honest, cell = Motion.project_positions, world(seed).cell[np.argmax(world(seed).pbc)]
+
+    def elsewhere(self, *args, **kwargs):
+        out = honest(self, *args, **kwargs)
+        out[-1] += cell
+        return out
+
+    monkeypatch.setattr(Motion, "project_positions", elsewhere)
+    assert judge(seed).outcome == "silent"
+
+
+def test_the_judge_sees_errors_without_a_cause(monkeypatch):
+    """A refusal where there is a solution; one that blames half the cell where nothing is near; an untyped one."""
+    seed = _seed_of("chain")
+    for error, outcome in (
+        (ConvergenceError("time step too large"), "unfounded"),
+        (ConvergenceError("longer than half the box"), "unfounded"),
+        (ZeroDivisionError("division by zero"), "silent"),
+    ):
+
+        def refuse(self, *args, error=error, **kwargs):
+            raise error
+
+        monkeypatch.setattr(Motion, "project_velocities", refuse)
+        said = {v.outcome for v in judge(seed).verdicts if v.operation == "project_velocities"}
+        assert said == {outcome}
+
+
+def test_the_judge_sees_arguments_that_were_changed(monkeypatch):
+    seed = _seed_of("chain")
+    honest = Motion.project_velocities
+
+    def careless(self, x, v, **kwargs):
+        out = honest(self, x, v, **kwargs)
+        v *= 1.0 + 1e-15
+        return out
+
+    monkeypatch.setattr(Motion, "project_velocities", careless)
+    assert "arguments were changed" in {v.why for v in judge(seed).verdicts}
+
+
+def test_the_judge_wants_the_true_remedy():
+    """No smaller time step where a link nears half the cell."""
+    w = world(0)
+    by = cell_judge.Judge(w, 0)
+    by.refusal("run", ConvergenceError("time step too large"), 1.1)
+    by.refusal("run", ConvergenceError("atoms 1 and 2 come near half the box; use a larger cell"), 1.1)
+    by.refusal("run", ConvergenceError("time step too large"), 1.1, solvable=False)
+    assert [v.outcome for v in by.verdicts] == ["silent", "refused", "refused"]
+
+
+def test_cases_repeat():
+    def verdicts(seed):
+        return [(v.operation, v.outcome, v.off) for v in judge(seed).verdicts]
+
+    assert verdicts(3) == verdicts(3)
