@@ -1,4 +1,4 @@
-"""States are certified by the set itself: what a solver gets wrong without knowing raises, and names the last good state."""
+"""States are certified by the set: what a solver gets wrong without knowing raises, and names the last good state."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_what_is_allowed_scales_with_rounding():
     motion = Motion(ConstraintSet(Distance([[0, 1], [1, 2]]), far, MASSES), far)
     motion.certify(far, motion.project_velocities(far, V))
     with pytest.raises(CertificateError, match=r"Distance\(0, 1\)"):
-        motion.certify([*far, [1e-06, 0, 0], [0, 0, 0], [0, 0, 0]])
+        motion.certify(far + np.array([[1e-06, 0, 0], [0, 0, 0], [0, 0, 0]]))
     with pytest.raises(CertificateError):
         motion.certify(np.full_like(X, np.nan))
     on = np.array([[1.0, 0, 0]])
