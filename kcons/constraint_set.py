@@ -195,12 +195,9 @@ class ConstraintSet:
             )
         if positions is None:
             return
-        whole = self.whole(positions)
-        if before is not None and self.images is not None:
-            whole = self.images.make_whole(positions, before)
-            moved = np.round((whole - positions) @ before[1])
-            whole = positions + moved @ self.lattice[0]
-        self.refuse_loose_links(whole)
+        self.refuse_loose_links(self.whole(positions))
+        if before is not None:
+            self.refuse_other_images(positions, before, None)
         for item, start in zip(self.constraints, self.starts, strict=False):
             if not item.relative or item.family == "Distance" or item.n_rows == 0:
                 continue
@@ -228,6 +225,38 @@ class ConstraintSet:
         if link >= 0:
             pair = np.array([self.images.parents[link], self.images.atoms[link]])
             row = int(self.images.loose[link])
+            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
+
+    def refuse_other_images(
+        self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
+    ) -> None:
+        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before.
+
+        Positions may have been moved along with the cell or not: other images are right if with them the rows are
+        fulfilled, or much nearer to that. Where the time is not known (None), moving rows are not.
+        """
+        if self.images is None or self.lattice is None:
+            return
+        y = self.whole(x)
+        cells = np.round((self.images.make_whole(x, before) - x) @ before[1])
+        changed = np.any(cells != np.round((y - x) @ self.lattice[1]), axis=1)
+        if not changed.any():
+            return
+        as_before = x + cells @ self.lattice[0]
+
+        def miss(c: Constraint, whole: FloatArray) -> FloatArray:
+            if time is None and c.moving:
+                return np.ones(c.n_rows)
+            return np.abs(self._sigma(c, self._gather(c, x, whole), 0.0 if time is None else time))
+
+        here = self._rows(lambda c: miss(c, y)) / self.scale
+        there = self._rows(lambda c: miss(c, as_before)) / self.scale
+        other = np.concatenate([changed[c.atoms].any(axis=1) for c in self.constraints if c.n_rows])
+        bad = other & (here > np.maximum(1e-9, 0.5 * there))
+        if bad.any():
+            row = int(np.argmax(np.where(bad, here, -1.0)))
+            atoms = self.row_atoms(row)
+            pair = atoms[[0, int(np.argmax(changed[atoms]))]]
             raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
 
     @cached_property

@@ -263,6 +263,7 @@ class _Links:
         cells = -np.round(apart @ lattice[1]).astype(np.int64)
         nearest = np.linalg.norm(apart + cells @ lattice[0], axis=2)
         differs = cells.any(axis=2)
+        self._long = np.linalg.norm(apart, axis=2)[:, 0] >= self.half_width
         self.windings[:, 1:] = np.cumsum(cells, axis=1)
         if item.target is not None and item.holonomic:
             # The target tells which of the two is meant.
@@ -288,7 +289,7 @@ class _Links:
         if self._local is not None:
             closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
         if self.held:
-            self.whole |= self.unsure & self.windings.any(axis=(1, 2)) & ~closing
+            self.whole |= self.unsure & ~closing & (self.windings.any(axis=(1, 2)) | self._long)
         self.windings[~closing] = 0
 
     def marked(self, needed: BoolArray) -> Constraint:

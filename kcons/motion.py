@@ -98,6 +98,8 @@ class Motion:
         # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
         self._flat: IntArray = (3 * touched[:, None] + np.arange(3)).ravel() if self._atoms is not None else touched
         self._lattice = self._local.lattice
+        #: A cell before the present one, until positions have shown that no row has another image for it.
+        self._unchecked: FloatArray | None = None
         self._moving = self._local.moving
         self._several = len(self.plan.solvers) > 1 or len(self.plan.pinned) > 0
         self._iterations = [0] * len(self.plan.solvers)
@@ -140,8 +142,8 @@ class Motion:
         cell, pbc
             As for `ConstraintSet`.
         positions : array_like, shape (n_atoms, 3), optional
-            Where given, rows other than distances are checked against half the box too. Needed where rows hold
-            atoms that nothing else ties together.
+            Positions in the new cell; where given, rows other than distances are checked against half the box at
+            once, and not when they are first projected.
 
         Raises
         ------
@@ -155,21 +157,13 @@ class Motion:
         before = held.lattice
         try:
             held.with_cell(cell, pbc)
-            if positions is not None:
-                held.check_half_box(as_array(positions, self._shape, "positions"), before)
-            elif held.images is not None and np.any(held.images.loose >= 0):
-                raise InputError(
-                    "the images of rows among atoms that nothing ties together hang on the cell; give set_cell the "
-                    "positions",
-                    item="positions",
-                )
-            else:
-                held.check_half_box()
+            held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"), before)
         except KconsError:
             held.lattice = before
             raise
         # The solvers take the lattice at each call.
         self._given.lattice = self._local.lattice = self._lattice = held.lattice
+        self._unchecked = before if positions is None else None
 
     # -- positions ------------------------------------------------------------------------------
 
@@ -275,6 +269,9 @@ class Motion:
                 if plan.loose is not None:
                     plan.check_loose_rows(x, time)
             if images is not None and lattice is not None:
+                if self._unchecked is not None:
+                    self._local.refuse_other_images(ref, self._unchecked, reference_time, self._atoms)
+                    self._unchecked = None
                 stored, ref = ref, images.make_whole(ref, lattice)
                 shifts = images.follow(x, stored, ref, lattice)
                 x[images.atoms] += shifts
@@ -321,6 +318,7 @@ class Motion:
             return self._lattice
         for source in (self._given, self.constraint_set):
             if source.lattice is not self._lattice:
+                self._unchecked = self._lattice
                 self._lattice = source.lattice
                 self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
         return self._lattice

@@ -13,7 +13,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
-from kcons.images import minimum_image
+from kcons.images import BoolArray, minimum_image
 from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances, lengths_resolved
 from kcons.solvers.general import RANK_TOLERANCE, GeneralClusters
@@ -24,6 +24,10 @@ from kcons.solvers.water import RigidTriangles
 
 #: Rounds of Newton that a chain may take until its stored positions show the lengths.
 MAX_ROUNDS = 4
+#: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
+ORDERED_ROWS = 400
+#: Rows of clusters of one kind among which that is done.
+ORDERED_IN_ALL = 20_000
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
 
@@ -100,6 +104,8 @@ class Plan:
         Rows of each cluster in which rows may depend on each other.
     loose : ndarray of int or None
         Rows between fixed atoms that motion of these may break.
+    late : ndarray of bool, shape (n_rows,)
+        Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
         For each solver, whether it takes positions that were made whole, without a cell (see `kcons.images`).
     """
@@ -117,6 +123,7 @@ class Plan:
     dependent: list[IntArray] = field(default_factory=list)
     loose: IntArray | None = None
     whole: list[bool] = field(default_factory=list)
+    late: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
 
     def cell_for(self, solver: int, lattice: FloatArray | None) -> FloatArray | None:
@@ -247,6 +254,7 @@ def make_plan(
     driven = constraint_set.moving or not bool(constraint_set.holonomic.all())
     rank = len(pinned_rows)
     plan = Plan(constraint_set, named, [], labels, pinned, pinned_rows, inverse_masses, rank, driven)
+    plan.late = np.zeros(constraint_set.n_rows, np.bool_)
     loose = labels < 0
     loose[pinned_rows] = False
     if loose.any():
@@ -262,16 +270,23 @@ def make_plan(
         else:
             lattice = None if whole else constraint_set.lattice
             rank = _rank(constraint_set, shape, inverse_masses, whole_positions, lattice, solver, time)
+        clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
+        if shape.kind in ("sparse", "mixed") and _small_enough(clusters):
+            # The pivots of an order that knows nothing of dependence say less.
+            rank = _ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
         if rank < shape.rows.size:
-            plan.dependent += _by_cluster(shape.rows.ravel(), labels)
+            plan.dependent += clusters
             if shape.kind in ("water", "lanes"):
                 # The lanes have no cut for dependent rows; sparse elimination has.
                 flat = shape.rows.ravel()
                 ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
                 shape = Shape("sparse", flat, shape.clusters, False, pairs=ends)
-                solver = _solver(shape, constraint_set, inverse_masses, labels, time)
+            if not isinstance(solver, GeneralClusters):
+                if shape.kind == "sparse" and not plan.late[shape.rows].any() and _small_enough(clusters):
+                    _ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
+                solver = _solver(shape, constraint_set, inverse_masses, labels, time, plan.late)
         plan.solvers.append(solver)
-        plan.whole.append(whole and not isinstance(solver, GeneralClusters))
+        plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
         plan.rank += rank
         example = named.row_name(int(shape.rows.ravel()[0]))
         plan.kinds.append(ClusterKind(solver.name, shape.clusters, shape.rows.size, rank, example))
@@ -302,6 +317,40 @@ def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
     order = np.argsort(labels[rows], kind="stable")
     cuts = np.flatnonzero(np.diff(labels[rows[order]])) + 1
     return [np.sort(part) for part in np.split(rows[order], cuts)]
+
+
+def _small_enough(clusters: list[IntArray]) -> bool:
+    sizes = [len(rows) for rows in clusters]
+    return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
+
+
+def _ranked(
+    constraint_set: ConstraintSet,
+    clusters: list[IntArray],
+    inverse_masses: FloatArray,
+    positions: FloatArray,
+    time: float,
+    late: BoolArray,
+) -> int:
+    """Independent rows of small clusters, by pivoted QR; marks in `late` what the best conditioned rows leave over."""
+    from scipy.linalg import qr  # slow to import
+
+    jacobian = constraint_set.jacobian(positions, time)
+    root_w = np.repeat(np.sqrt(inverse_masses), 3)
+    rank = 0
+    for rows in clusters:
+        part = jacobian[rows]
+        columns, place = np.unique(part.indices, return_inverse=True)
+        b = np.zeros((len(rows), len(columns)))
+        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
+        size = np.linalg.norm(b, axis=1, keepdims=True)
+        triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
+        diagonal = np.zeros(len(rows))
+        diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
+        left_over = diagonal <= RANK_TOLERANCE * diagonal[0]
+        late[rows[order]] = left_over
+        rank += int(np.sum(~left_over))
+    return rank
 
 
 def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
@@ -428,14 +477,19 @@ class DistanceSolver(Protocol):
 
 
 def _solver(
-    shape: Shape, constraint_set: ConstraintSet, inverse_masses: FloatArray, labels: IntArray, time: float
+    shape: Shape,
+    constraint_set: ConstraintSet,
+    inverse_masses: FloatArray,
+    labels: IntArray,
+    time: float,
+    late: BoolArray | None = None,
 ) -> ClusterSolver:
     """The table: which solver serves which shape."""
     rows = shape.rows
     if shape.kind == "general":
         return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
     if shape.kind == "mixed":
-        return SparseRows(constraint_set, rows, inverse_masses)
+        return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
     targets = constraint_set.target(time)
     solver: DistanceSolver
     if shape.kind == "water":
@@ -446,7 +500,7 @@ def _solver(
         chains = Chains(rows, shape.starts, shape.atoms, targets[rows], inverse_masses[shape.atoms])
         return LongChains(chains, shape.pairs, targets)
     else:
-        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses)
+        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses, None if late is None else late[rows])
     return DistanceClusters(solver, targets)
 
 

@@ -191,3 +191,23 @@ def test_too_large_for_the_dense_rescue() -> None:
     with pytest.raises(UnsupportedError, match="cluster of 19 rows around #0 Distance"):
         plan.general_for_all(18)
     assert len(plan.general_for_all(19).rows) == 19
+
+
+def test_dependent_rows_are_eliminated_last():
+    """15 distances of rank 12: in an unlucky order a vanishing pivot is left at 1e-9, and multipliers of 1e9 with it."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        x = rng.normal(size=(6, 3)) * [1.0, 1.0, 0.4]
+        pairs = np.array([[i, j] for i in range(6) for j in range(i + 1, 6)])
+        masses = rng.uniform(1.0, 20.0, 6)
+        motion = Motion(ConstraintSet(Distance(pairs), x, masses), x)
+        assert motion.rank == 12
+        assert motion.plan.late.sum() == 3
+        lam = np.zeros(15)
+        start = x + 1e-2 * rng.normal(size=x.shape)
+        out = motion.project_positions(start, x, multipliers=lam)
+        assert np.abs(lam).max() < 10.0
+        # The shift is a combination of the gradients: it moves no centre of mass and turns nothing.
+        push = masses[:, None] * (out - start)
+        assert np.abs(push.sum(axis=0)).max() < 1e-14 * masses.sum()
+        assert np.abs(np.cross(x, push).sum(axis=0)).max() < 1e-13 * masses.sum()

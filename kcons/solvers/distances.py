@@ -58,6 +58,8 @@ class SparseDistances:
     lengths : ndarray, shape (n_rows,)
     inverse_masses : ndarray, shape (n_atoms,)
         0 for atoms of infinite mass.
+    late : ndarray of bool, shape (n_rows,), optional
+        Rows that depend on the others of their cluster, see `make_pattern`.
     small : bool
         Whether to find order and pattern by what need not be compiled, for few rows.
     """
@@ -65,7 +67,14 @@ class SparseDistances:
     name = "sparse"
 
     def __init__(
-        self, rows: IntArray, pairs: IntArray, lengths: FloatArray, inverse_masses: FloatArray, *, small: bool = False
+        self,
+        rows: IntArray,
+        pairs: IntArray,
+        lengths: FloatArray,
+        inverse_masses: FloatArray,
+        late: NDArray[np.bool_] | None = None,
+        *,
+        small: bool = False,
     ) -> None:
         atoms, local = np.unique(pairs, return_inverse=True)
         local = local.reshape(pairs.shape)
@@ -73,7 +82,10 @@ class SparseDistances:
         keep = movable[local]
         row_start = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
         row_atoms = local[keep].astype(np.int64)
-        pattern = make_small_pattern(row_start, row_atoms) if small else make_pattern(row_start, row_atoms, len(atoms))
+        if small:
+            pattern = make_small_pattern(row_start, row_atoms, late)
+        else:
+            pattern = make_pattern(row_start, row_atoms, len(atoms), late)
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
         self.lengths = lengths[pattern.order].copy()

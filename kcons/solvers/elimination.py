@@ -66,7 +66,9 @@ class Pattern:
     targets: UIntArray
 
 
-def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Pattern:
+def make_pattern(
+    row_start: IntArray, row_atoms: IntArray, n_atoms: int, late: NDArray[np.bool_] | None = None
+) -> Pattern:
     """Order the rows and find the pattern of their factors.
 
     Parameters
@@ -76,13 +78,17 @@ def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Patt
         through which rows are coupled: atoms of infinite mass are left out.
     n_atoms : int
         Number of atoms.
+    late : ndarray of bool, optional
+        Rows to be eliminated after all others: those that depend on them, whose pivots then vanish to rounding. In
+        another order the rows before them may be nearly dependent, and what is left of their pivots is no longer small.
 
     Raises
     ------
     UnsupportedError
         So many rows share an atom that the factors would not fit into memory.
     """
-    position, struct_start, struct = _minimum_degree(row_start, row_atoms, n_atoms)
+    late = np.zeros(len(row_start) - 1, np.bool_) if late is None else late
+    position, struct_start, struct = _minimum_degree(row_start, row_atoms, n_atoms, late)
     sizes = np.diff(struct_start).astype(np.float64)
     updates = float(np.sum(sizes * (sizes - 1) / 2))
     if updates > MOST_UPDATES:
@@ -96,7 +102,7 @@ def make_pattern(row_start: IntArray, row_atoms: IntArray, n_atoms: int) -> Patt
     return Pattern(order, clusters, start, columns, target_start, targets)
 
 
-def make_small_pattern(row_start: IntArray, row_atoms: IntArray) -> Pattern:
+def make_small_pattern(row_start: IntArray, row_atoms: IntArray, late: NDArray[np.bool_] | None = None) -> Pattern:
     """The same for few rows, without anything to compile: sets in Python."""
     n = len(row_start) - 1
     members: dict[int, list[int]] = {}
@@ -111,7 +117,7 @@ def make_small_pattern(row_start: IntArray, row_atoms: IntArray) -> Pattern:
     later: list[set[int]] = [set()] * n
     remaining, eliminated = set(range(n)), []
     while remaining:
-        k = min(remaining, key=lambda row: (len(coupled[row]), row))
+        k = min(remaining, key=lambda row: (late is not None and bool(late[row]), len(coupled[row]), row))
         remaining.discard(k)
         eliminated.append(k)
         later[k] = coupled[k] - {k}
@@ -143,7 +149,7 @@ def make_small_pattern(row_start: IntArray, row_atoms: IntArray) -> Pattern:
 
 
 @nb.njit(cache=True)
-def _minimum_degree(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-def]
+def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-untyped-def]
     """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
     n = len(row_start) - 1
     atom_start = np.zeros(n_atoms + 1, np.int64)
@@ -181,13 +187,13 @@ def _minimum_degree(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-d
                     count[k] += 1
         room[k] = count[k]
 
-    # Doubly linked buckets of rows by degree; first in, first out peels all ends of a tree evenly.
-    head = np.full(n + 1, -1, np.int32)
-    tail = np.full(n + 1, -1, np.int32)
+    # Doubly linked buckets of rows by degree, then of late ones; first in, first out peels all ends of a tree evenly.
+    head = np.full(2 * n + 2, -1, np.int32)
+    tail = np.full(2 * n + 2, -1, np.int32)
     following = np.full(n, -1, np.int32)
     preceding = np.full(n, -1, np.int32)
     for k in range(n):
-        _push(head, tail, following, preceding, count[k], k)
+        _push(head, tail, following, preceding, count[k] + (n + 1) * late[k], k)
     position = np.full(n, -1, np.int64)
     struct_start = np.zeros(n + 1, np.int64)
     struct = np.empty(max(16, 4 * n), np.int32)
@@ -243,10 +249,11 @@ def _minimum_degree(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-d
                     new += 1
             count[i] = new
             if new != old:
-                _unlink(head, tail, following, preceding, old, i)
-                _push(head, tail, following, preceding, new, i)
-                if new < lowest:
-                    lowest = new
+                behind = (n + 1) * late[i]
+                _unlink(head, tail, following, preceding, old + behind, i)
+                _push(head, tail, following, preceding, new + behind, i)
+                if new + behind < lowest:
+                    lowest = new + behind
         # mark holds row numbers i; rows are marked afresh for each i, but k must not look known.
         struct_used += size
     struct_start[n] = struct_used

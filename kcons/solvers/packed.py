@@ -51,6 +51,7 @@ def packed(
     places: FloatArray,
     *more: NDArray[Any],
     numbers: IntArray | None = None,
+    late: NDArray[np.bool_] | None = None,
 ) -> Packed:
     """What `packed_positions` and `packed_tangents` need to know.
 
@@ -70,6 +71,8 @@ def packed(
         Pieces number `MORE` and on, for the caller's own kernels.
     numbers : ndarray of int, optional
         What the atoms that `chains` knows are called here; None where they are called the same.
+    late : ndarray of bool, shape (n_rows,), optional
+        Which of `pairs` depend on others, see `kcons.solvers.elimination.make_pattern`.
 
     Returns
     -------
@@ -80,7 +83,7 @@ def packed(
     """
     pieces: list[NDArray[Any]]
     if len(pairs):
-        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses, small=True)
+        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses, late, small=True)
         tables, rooms = solver.tables()
         pieces = [solver.lengths, pairs[solver.rows].astype(np.uint32).ravel(), *tables, *rooms]
     else:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
@@ -57,17 +58,26 @@ class SparseRows:
         Row numbers, sorted; whole clusters only.
     inverse_masses : ndarray, shape (n_atoms,)
         0 for atoms of infinite mass.
+    late : ndarray of bool, shape (len(rows),), optional
+        Rows that depend on the others of their cluster, see `make_pattern`.
     """
 
     name = "mixed"
 
-    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray) -> None:
+    def __init__(
+        self,
+        constraint_set: ConstraintSet,
+        rows: IntArray,
+        inverse_masses: FloatArray,
+        late: NDArray[np.bool_] | None = None,
+    ) -> None:
         incidence = constraint_set.incidence[rows]
         start = incidence.indptr.astype(np.int64)
         atoms = incidence.indices.astype(np.int64)
         keep = inverse_masses[atoms] > 0
         counts = np.add.reduceat(keep, start[:-1]) if len(rows) else np.zeros(0, np.int64)
-        pattern = make_pattern(np.concatenate([[0], np.cumsum(counts)]), atoms[keep], constraint_set.n_atoms)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        pattern = make_pattern(starts, atoms[keep], constraint_set.n_atoms, late)
         order = pattern.order
         self.rows: IntArray = rows[order]
         widths = np.diff(start)[order]

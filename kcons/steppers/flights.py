@@ -264,7 +264,8 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
     lengths = held.target(0.0)[others]
     places, numbers = plan.pinned_targets(None), held.touched if compact else None
-    return packed(triangles, chains, pairs, lengths, inverse_masses, pinned, places, *more, numbers=numbers)
+    late = plan.late[others]
+    return packed(triangles, chains, pairs, lengths, inverse_masses, pinned, places, *more, numbers=numbers, late=late)
 
 
 def _worth_it(chains: Chains, others: int) -> bool:

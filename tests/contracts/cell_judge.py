@@ -412,7 +412,8 @@ class Judge:
     def _cell_link(self, cell: Array) -> float:
         """Rows are sorted once: a distance that becomes longer than half the cell may be refused as well."""
         w = self.w
-        lengths = [r.target for i in w.items for r in i.arguments.get("pairs_as_rows", [])]
+        rows = (r for i in w.items for r in (i.arguments.get("pairs_as_rows") or i.rows))
+        lengths = [r.target for r in rows if r.kind == "norm" and not r.amplitude]
         half, before = half_width(cell, w.pbc), half_width(w.cell, w.pbc)
         grown = any(before > a >= half for a in lengths)
         return max(w.nearness(w.x, cell), 2.0 if grown else 0.0)
