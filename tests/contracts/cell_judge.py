@@ -22,7 +22,7 @@ from kcons.ase import ConstrainedDynamics, constrain
 from kcons.errors import KconsError
 
 OUTCOMES = ("right", "refused", "unfounded", "silent")
-#: Seconds that a case may take.
+#: Seconds of computing that a case may take.
 LIMIT = 5.0
 #: Differences beyond this many times what a rounding of the input makes are wrong.
 ROOM = 50.0
@@ -557,8 +557,8 @@ def judge(seed: int, periodic: bool = True) -> Case:
 def _judged(seed: int, periodic: bool) -> Case:
     w = world(seed)
     judge = Judge(w, seed, periodic)
-    start = time.perf_counter()
+    start = time.process_time()
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         verdicts = judge.all()
-    return Case(seed, w.kinds, w.families, w.features, w.stepper, time.perf_counter() - start, verdicts)
+    return Case(seed, w.kinds, w.families, w.features, w.stepper, time.process_time() - start, verdicts)
