@@ -185,6 +185,12 @@ class ConstraintSet:
         if self.lattice is None:
             return
         longest, row = self._longest_plain
+        if self.images is not None and self.images.longest >= self.half_width > longest:
+            raise InputError(
+                f"distances of {self.images.longest:g} tie the atoms of longer rows together, and are not shorter than "
+                f"half the box ({self.half_width:g}); use a larger cell, or make a new ConstraintSet in this one",
+                item="cell",
+            )
         if longest >= self.half_width:
             raise InputError(
                 f"row {self.row_name(row)}: target {longest:g} is not shorter than half the box "

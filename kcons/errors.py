@@ -86,11 +86,14 @@ class ImageError(KconsError, ValueError):
     ----------
     atoms : tuple of int
         The two atoms whose distance has reached half the cell.
+    step : int or None
+        Step number, where a stepper knows it.
     """
 
     def __init__(self, message: str, *, atoms: Iterable[int] = ()) -> None:
         super().__init__(message)
         self.atoms = tuple(int(a) for a in atoms)
+        self.step: int | None = None
 
 
 class CertificateError(KconsError, RuntimeError):

@@ -52,11 +52,14 @@ class Images:
         Parents come before their children; a root is its own parent and keeps the image it is stored in.
     loose : ndarray of int, shape (k,)
         For loose links the row they come from, -1 for others.
+    longest : float
+        The longest of the other links.
     """
 
     atoms: IntArray
     parents: IntArray
     loose: IntArray
+    longest: float = 0.0
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
         """Copy of `x`, shape (n_atoms, 3), with `atoms` in the images of the tree."""
@@ -96,7 +99,7 @@ class Images:
         parents = np.where(kept[parents], parents, here)
         # A loose link may come from a row that is not among these; any of them may name it.
         place = np.minimum(np.searchsorted(rows, loose), max(len(rows) - 1, 0))
-        return Images(numbers[here], numbers[parents], np.where(loose < 0, -1, place))
+        return Images(numbers[here], numbers[parents], np.where(loose < 0, -1, place), self.longest)
 
     def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
         """`needed` and the atoms by which they are made whole."""
@@ -163,9 +166,10 @@ def find_images(
         for item, start in zip(given, starts, strict=False)
         if item.relative and item.n_rows
     ]
+    n_atoms = len(x)
+    _accept_small_pieces(tables, n_atoms, half_width)
     if not tables or all(table.plain_at_once for table in tables):
         return given, None
-    n_atoms = len(x)
     ties = [item for item in ties if item.family == "Distance" and not item.moving and item.n_rows]
     others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
     held = [t for t in [*tables, *others] if t.held]
@@ -189,7 +193,7 @@ def find_images(
     result = [marked.get(id(item), item) for item in given]
     if not keep.any():
         return result, None
-    return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep])
+    return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep], images.longest)
 
 
 class _Links:
@@ -213,12 +217,16 @@ class _Links:
         self.windings = np.zeros((item.n_rows, item.width, 3), np.int64)
         if self.held:
             if item.target is None:
-                self.unsure = np.abs(raw - nearest).max(axis=(1, 2)) > 1e-9 * half_width
+                # Until the tree is known: the length found may be that of another image.
+                self.unsure[:] = True
             else:
                 self.lengths = item.target_at(time)[:, None]
             self.whole = ~self.unsure & (self.lengths[:, 0] >= half_width)
         self._local: BoolArray | None = None
-        self.plain_at_once = self.held and not (self.whole.any() or self.unsure.any())
+
+    @property
+    def plain_at_once(self) -> bool:
+        return self.held and not (self.whole.any() or self.unsure.any())
 
     @property
     def short(self) -> BoolArray:
@@ -303,6 +311,21 @@ class _Links:
         return copy
 
 
+def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
+    """Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell."""
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
+    held = [table for table in tables if table.held]
+    if not any(table.unsure.any() for table in held):
+        return
+    pairs = np.concatenate([table.item.atoms for table in held])
+    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    piece = connected_components(graph, directed=False)[1]
+    reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
+    for table in held:
+        table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
+
+
 def _unmarked(item: Constraint) -> Constraint:
     copy = item.with_target(item.target)
     copy.whole = copy.windings = None
@@ -358,7 +381,8 @@ def _tree(
         roots, start, ends[by_atom, 1], np.concatenate([loose, loose])[by_atom], n_atoms
     )
     tied = start[atoms + 1] > start[atoms]
-    return Images(atoms[tied], parents[tied], through[tied]), longest, component
+    ties = float(np.max(length[link][held[link]], initial=0.0))
+    return Images(atoms[tied], parents[tied], through[tied], ties), longest, component
 
 
 def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:

@@ -21,7 +21,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
-from kcons.errors import InputError, KconsError
+from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
 from kcons.flat_bodies import MISFIT, FlatBody
 from kcons.plan import Plan, make_plan
@@ -291,11 +291,15 @@ class Motion:
             if images is not None:
                 self._local.refuse_loose_links(x, self._atoms)
                 x[images.atoms] -= shifts
-        except KconsError:
+        except KconsError as error:
+            asked = x.copy() if images is not None else x
             if saved is not None:
                 np.copyto(x, saved[0])
                 if velocities is not None and saved[1] is not None:
                     np.copyto(velocities, saved[1])
+            if isinstance(error, ConvergenceError):
+                # Atoms that have reached half the cell are the cause, and no step size a remedy.
+                self._local.refuse_loose_links(asked, self._atoms)
             raise
         if multipliers is not None:
             self._collect(found, multipliers)

@@ -271,7 +271,7 @@ def make_plan(
             lattice = None if whole else constraint_set.lattice
             rank = _rank(constraint_set, shape, inverse_masses, whole_positions, lattice, solver, time)
         clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
-        if shape.kind in ("sparse", "mixed") and _small_enough(clusters):
+        if clusters and shape.kind in ("sparse", "mixed") and _small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
             rank = _ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
         if rank < shape.rows.size:

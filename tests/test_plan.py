@@ -200,7 +200,7 @@ def test_dependent_rows_are_eliminated_last():
         x = rng.normal(size=(6, 3)) * [1.0, 1.0, 0.4]
         pairs = np.array([[i, j] for i in range(6) for j in range(i + 1, 6)])
         masses = rng.uniform(1.0, 20.0, 6)
-        motion = Motion(ConstraintSet(Distance(pairs), x, masses), x)
+        motion = Motion(ConstraintSet(held.Distance(pairs), x, masses), x)
         assert motion.rank == 12
         assert motion.plan.late.sum() == 3
         lam = np.zeros(15)

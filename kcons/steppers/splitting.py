@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
@@ -215,6 +215,9 @@ class Splitting:
         except ConvergenceError as error:
             step.refuse_unsound()
             raise explained(error, system, start, dt, step.number) from error
+        except ImageError as error:
+            error.step = step.number
+            raise
         except (InputError, NonFiniteError):
             step.refuse_overflow()
             raise

@@ -26,6 +26,8 @@ OUTCOMES = ("right", "refused", "unfounded", "silent")
 LIMIT = 5.0
 #: Differences beyond this many times what a rounding of the input makes are wrong.
 ROOM = 50.0
+#: A step that would carry atoms this many times as far apart as may be is too long, in whatever cell.
+FAR_JUMP = 3.0
 ABOUT_HALF = re.compile(r"half\b.{0,30}\b(box|cell)|minimum image|ambiguous|image", re.IGNORECASE)
 
 
@@ -118,10 +120,10 @@ class Judge:
             self.say(operation, "refused" if link > 1 else "unfounded", f"half the cell, link {link:.2f}: {words}")
         elif not solvable:
             self.say(operation, "refused", words)
-        elif link > 1:
+        elif 1 < link < FAR_JUMP:
             self.say(operation, "silent", f"wrong remedy, link {link:.2f}: {words}")
         else:
-            self.say(operation, "unfounded", words)
+            self.say(operation, "refused" if link >= FAR_JUMP else "unfounded", words)
 
     def attempt(
         self,
