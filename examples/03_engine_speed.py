@@ -2,6 +2,7 @@
 
     python examples/03_engine_speed.py                  small systems, a minute
     python examples/03_engine_speed.py --full --out F   all sizes and slow peers, twenty minutes; F receives JSON
+    python examples/03_engine_speed.py --certificates   only what certificates take of a run
 
 Times are medians of repeats in one process, one thread, warm. P is the position projection, V the velocity
 projection, both through the public calls of `Motion`, checks included; each P starts from a fresh thermal
@@ -29,7 +30,8 @@ from ase.constraints import FixBondLengths
 from ase.md.verlet import VelocityVerlet
 from rich.console import Console
 
-from kcons import compare, measuring
+import kcons
+from kcons import State, System, compare, measuring
 from kcons.ase import constrain
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
@@ -410,6 +412,60 @@ def first_call() -> dict:
     }
 
 
+def certificate(name: str, x: np.ndarray, masses: np.ndarray, constraints: list[Constraint], seconds: float) -> dict:
+    """What certificates take of a run without forces, by RATTLE with the default of `check_every`."""
+    motion = Motion(ConstraintSet(constraints, x, masses), x)
+    certify, spent = motion.certify, []
+
+    def timed(*args: Any) -> None:
+        begin = time.perf_counter()
+        certify(*args)
+        spent.append(time.perf_counter() - begin)
+
+    motion.certify = timed  # type: ignore[method-assign]
+    v = motion.project_velocities(x, 1e-3 * np.random.default_rng(3).normal(size=x.shape))
+    system, state = System(motion), State(x, v)
+    state = kcons.run(system, state, 0.5, 1001)  # the first is not representative: caches are cold
+    spent.clear()
+    done, begin = 0, time.perf_counter()
+    while (passed := time.perf_counter() - begin) < seconds:
+        state = kcons.run(system, state, 0.5, 2000)
+        done += 2000
+    return {
+        "name": name, "rows": motion.constraint_set.n_rows, "steps": done, "step_us": passed / done * 1e6,
+        "certificates": len(spent), "certificate_us": float(np.median(spent)) * 1e6, "share": sum(spent) / passed,
+    }  # fmt: skip
+
+
+def certificates(full: bool) -> dict:
+    seconds = 10.0 if full else 0.2
+    bent = np.array([[0.0, 0, 0], [1.1, 0.2, 0], [1.5, 1.3, 0.3], [2.6, 1.5, 1.1]])
+    angles = [Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])]
+    rows = [
+        certificate("one bond", bent[:2], np.array([12.0, 16.0]), [Distance([[0, 1]])], seconds),
+        certificate("four atoms, bonds and angles", bent, np.full(4, 12.0), angles, seconds),
+        certificate("rigid water, 100 molecules", *water(100), seconds),
+        certificate("chain, zigzag, 1000 bonds", *chain(1000, "zigzag"), seconds),
+    ]
+    if full:
+        rows.append(certificate("rigid water, 10000 molecules", *water(10_000), seconds))
+    return {"machine": compare.environment(), "full": full, "certificates": rows}
+
+
+def show_certificates(result: dict, console: Console) -> None:
+    headings = ("system", "rows", "steps", "step", "certificates", "each", "share")
+    table = measuring.table("Certificates in a run without forces", headings, {"system"})
+    table.add_row("", "", "", "µs", "", "µs", "%", end_section=True)
+    for r in result["certificates"]:
+        table.add_row(
+            r["name"], f"{r['rows']:,}", f"{r['steps']:,}", f"{r['step_us']:.1f}", f"{r['certificates']:,}",
+            f"{r['certificate_us']:.0f}", f"{100 * r['share']:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    machine = result["machine"]
+    console.print(f"{machine['cpu']}, one thread; commit {machine['commit']}, {machine['date']}")
+
+
 # -- the run --------------------------------------------------------------------------------------
 
 
@@ -493,7 +549,12 @@ def show(result: dict, console: Console) -> None:
 def main() -> None:
     console = Console(width=150)
     parser = measuring.options(__doc__, full="all sizes and the slow peers")
-    measuring.script(parser, lambda options: run(options.full, console), lambda result: show(result, console))
+    parser.add_argument("--certificates", action="store_true", help="only what certificates take of a run")
+    measuring.script(
+        parser,
+        lambda options: certificates(options.full) if options.certificates else run(options.full, console),
+        lambda result: (show_certificates if "certificates" in result else show)(result, console),
+    )
 
 
 if __name__ == "__main__":

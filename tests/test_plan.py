@@ -194,7 +194,7 @@ def test_too_large_for_the_dense_rescue() -> None:
 
 
 def test_dependent_rows_are_eliminated_last():
-    """15 distances of rank 12: in an unlucky order a vanishing pivot is left at 1e-9, and multipliers of 1e9 with it."""
+    """15 distances of rank 12: in an unlucky order a vanishing pivot is left at 1e-9, and multipliers of 1e9."""
     rng = np.random.default_rng(5)
     for _ in range(20):
         x = rng.normal(size=(6, 3)) * [1.0, 1.0, 0.4]
