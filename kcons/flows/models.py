@@ -11,6 +11,7 @@ from scipy.special import ellipj, ellipkinc
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.hamiltonian import HamiltonianFlow
+from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_block
 from kcons.flows.linear import LinearFlow
 
 
@@ -41,9 +42,28 @@ class DampedOscillator(LinearFlow):
         return "oscillating" if self.eta < 2 * self.omega else "overdamped"
 
     def eigenvalues(self) -> tuple[complex, complex]:
-        """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2 (notes eq. 23)."""
-        a = np.sqrt(complex((self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)))
-        return complex(0.5 * (-self.eta - a)), complex(0.5 * (-self.eta + a))
+        """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2, in this order (notes eq. 23).
+
+        Each to its own last digits: the slow one of two real ones is Omega^2 over the fast one, without a difference.
+        """
+        a = np.sqrt(complex(self.eta - 2 * self.omega)) * np.sqrt(self.eta + 2 * self.omega)
+        first = complex(-0.5 * (self.eta + a))
+        return first, (first.conjugate() if a.imag else self.omega * (self.omega / first))
+
+    def jordan_form(self) -> JordanForm:
+        """T and J in closed form (notes eqs. 17, 24); one block at critical damping, where T of (24) is singular."""
+        first, second = self.eigenvalues()
+        if first == second:
+            return JordanForm(
+                np.array([[-1.0, -1.0 / self.omega], [1.0, 0.0]], dtype=np.complex128),
+                jordan_block(first, 2).astype(np.complex128),
+                [JordanBlocks(first, (2,), True, 0.0)],
+            )
+        return JordanForm(
+            np.array([[second / self.omega, first / self.omega], [1.0, 1.0]]),
+            np.diag([first, second]),
+            [JordanBlocks(first, (1,), True, 0.0), JordanBlocks(second, (1,), True, 0.0)],
+        )
 
     def closed_form(self, t: float) -> FloatArray:
         """exp(At), shape (2, 2), in one formula for all regimes (notes eq. 25, derived anew).
