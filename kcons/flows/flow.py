@@ -105,7 +105,7 @@ class Flow:
 
 def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float = STEP) -> FloatArray:
     """dV/dX by central differences with steps h, h/2, h/4, extrapolated to order six; shape (n, n)."""
-    X = np.asarray(X, dtype=np.float64)
+    X = numbers(X, "X")
     columns = []
     for k in range(len(X)):
         h = step * max(1.0, abs(X[k]))
@@ -114,7 +114,7 @@ def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float
             e = np.zeros(len(X))
             e[k] = part
             up, down = X + e, X - e
-            ends = [np.asarray(velocity(t, at), dtype=np.float64) for at in (up, down)]
+            ends = [numbers(velocity(t, lent(at)), "velocity") for at in (up, down)]
             slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
         first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
         columns.append((16 * second - first) / 15)
@@ -167,7 +167,7 @@ def phase_volume(
     ConvergenceError
         If the integration fails.
     """
-    wanted = np.asarray(times, dtype=np.float64)
+    wanted = numbers(times, "times")
     if wanted.ndim != 1 or len(wanted) < 1 or np.any(np.diff(wanted) <= 0):
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
+from kcons.arrays import lent, numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.hamiltonian import HamiltonianFlow
@@ -97,7 +98,8 @@ class HarmonicOscillator(DampedOscillator):
     def circle(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) on its circle, shape (2,) or (k, 2) (notes eqs. 18, 19)."""
         x1, x2 = self._state(X0)
-        c, s = np.cos(self.omega * np.asarray(t)), np.sin(self.omega * np.asarray(t))
+        angle = self.omega * numbers(t, "t")
+        c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * x1 + s * x2, c * x2 - s * x1], axis=-1)
 
 
@@ -130,7 +132,7 @@ class Pendulum(HamiltonianFlow):
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
         """
         theta0, rate0 = self._state(X0)
-        times = np.asarray(t, dtype=np.float64)
+        times = numbers(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
         # Measured from the nearest lowest position.
         turns = np.round(theta0 / (2 * np.pi))
@@ -182,16 +184,16 @@ class ParticleOnSphere(Flow):
 
     def acceleration(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """The acceleration on the sphere, shape (3,) (notes eq. 110)."""
-        x, v = np.asarray(x, dtype=np.float64), np.asarray(v, dtype=np.float64)
+        x, v = numbers(x, "x"), numbers(v, "v")
         a = -(v @ v) / self.radius**2 * x
         if self.force is not None:
-            f = np.asarray(self.force(x), dtype=np.float64) / self.mass
+            f = numbers(self.force(lent(x)), "force") / self.mass
             a = a + f - x * (x @ f) / self.radius**2
         return np.asarray(a)
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
         """The free motion x(t), shape (3,) or (k, 3); v0 is tangent to the sphere."""
-        x0, v0 = np.asarray(x0, dtype=np.float64), np.asarray(v0, dtype=np.float64)
+        x0, v0 = numbers(x0, "x0"), numbers(v0, "v0")
         speed = float(np.linalg.norm(v0))
-        angle = np.asarray(t, dtype=np.float64)[..., None] * speed / self.radius
+        angle = numbers(t, "t")[..., None] * speed / self.radius
         return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
+from kcons.arrays import numbers
 from kcons.errors import BudgetError, InputError
 from kcons.growth.compensated_sums import compensated_sum
 from kcons.growth.mixture import Mixture
@@ -88,7 +89,7 @@ class Relaxation(EntropyLaw):
     feedback = True
 
     def __init__(self, tau: float | FloatArray, budget: float | None = None, *, partial: bool = False) -> None:
-        self.tau: FloatArray = np.array(tau, dtype=np.float64)
+        self.tau: FloatArray = numbers(tau, "tau").copy()
         if not np.all(np.isfinite(self.tau) & (self.tau > 0)):
             raise InputError(f"tau is a positive time, not {tau}", item="tau")
         if budget is not None and not (np.isfinite(budget) and budget >= 0):
