@@ -195,9 +195,9 @@ def _of_unit_length(chain: ComplexArray) -> ComplexArray:
 def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, ComplexArray, float, float] | None:
     """Null spaces of a nilpotent matrix and of what is left of it, one after the other.
 
-    Returns the dimensions of them, never growing; W, strictly upper triangular by blocks of these sizes, and the
-    unitary V with V W V^H = N but for what was neglected; the norm of that; and the least singular value that was not
-    taken as zero. None if N is not nilpotent to this accuracy.
+    Returns the dimensions of them, which never grow, as singular values interlace; W, strictly upper triangular by
+    blocks of these sizes, and the unitary V with V W V^H = N but for what was neglected; the norm of that; and the
+    least singular value that was not taken as zero. None if N is not nilpotent to this accuracy.
     """
     m = len(N)
     W, V = N.copy(), np.eye(m, dtype=np.complex128)
@@ -206,7 +206,7 @@ def _staircase(N: ComplexArray, zero: float) -> tuple[list[int], ComplexArray, C
     while start < m:
         _, singular, vh = np.linalg.svd(W[start:, start:])
         null = int(np.sum(singular <= zero))
-        if null == 0 or (widths and null > widths[-1]):
+        if null == 0:
             return None
         if null < len(singular):
             kept = min(kept, float(singular[-null - 1]))

@@ -105,6 +105,12 @@ def test_neighbours_that_rounding_joins_are_told_as_uncertain():
     found = jordan_blocks(A)
     assert not all(b.certain for b in found)
     assert sum(sum(b.sizes) for b in found) == 5
+    # Two blocks so near that their errors overlap, though no matrix within rounding has all four equal.
+    for apart in (2.0**-20, 2.0**-21):
+        pair = in_skew_basis(np.random.default_rng(1), [jordan_block(1.0, 2), jordan_block(1.0 + apart, 2)])
+        found = jordan_blocks(pair)
+        assert sum(sum(b.sizes) for b in found) == 4
+        assert not any(b.certain for b in found)
     # Both are farther apart than they scatter: nothing is joined.
     near = in_skew_basis(np.random.default_rng(2), [[[1.0]], [[1.0 + 2**-20]]])
     assert [(b.sizes, b.certain) for b in jordan_blocks(near)] == [((1,), True), ((1,), True)]
