@@ -2,6 +2,8 @@
 
 Pure functions on arrays. A is s x 3N, one row a constraint; M is diagonal, given as the masses of the
 N atoms (or as 3N numbers); f and accelerations have length 3N or shape (N, 3) and come back as they came.
+Generalized inverses, solvability and the projectors P take complex matrices too (appendix A.1); a mechanical system
+is real, and its functions refuse complex numbers.
 Cost grows as the cube of 3N: for systems of up to some hundred atoms, and for reading.
 
 The mass-weighted matrix is B = A M^-1/2. Written with B+ in place of an inverse, every formula holds
@@ -18,7 +20,7 @@ Gauss, J. reine angew. Math. 4, 232 (1829). Kneller, J. Chem. Phys. 125, 114107 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -27,6 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.errors import ContradictionError, InputError
 
 FloatArray = NDArray[np.float64]
+#: float64, or complex128 where a matrix or vector given is complex.
+NumberArray = NDArray[Any]
 
 #: Singular values of the row-normalised matrix below this part of the largest count as zero.
 RANK_TOLERANCE = 1e-10
@@ -37,7 +41,7 @@ SOLVABILITY_TOLERANCE = 1e-9
 class PseudoInverse(NamedTuple):
     """A Moore-Penrose inverse A+, shape (n, s), and the rank of A."""
 
-    matrix: FloatArray
+    matrix: NumberArray
     rank: int
 
 
@@ -64,11 +68,12 @@ def pseudo_inverse(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> PseudoInv
     """A+, through the singular values of the row-normalised matrix (notes eqs. 154-158).
 
     The rank is found on rows of unit length, so that it does not depend on the units of the rows. With V
-    an orthonormal basis of the row space, A = (A V) V^T is a full-rank factorisation and A+ = V (A V)+.
+    an orthonormal basis of the row space, A = (A V) V^H is a full-rank factorisation and A+ = V (A V)+.
 
     Parameters
     ----------
     matrix : array_like, shape (s, n)
+        Real or complex.
     rtol : float
         Singular values below this part of the largest count as zero.
 
@@ -87,48 +92,49 @@ def rank(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> int:
     return int(row_space(matrix, rtol).shape[1])
 
 
-def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
-    """Orthonormal basis V of the space that the rows span, shape (n, rank); A+A = V V^T."""
+def row_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+    """Orthonormal basis V of the space that the (conjugate) rows span, shape (n, rank); A+A = V V^H."""
     _, singular, vt = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
-    return np.ascontiguousarray(vt[: _count(singular, rtol)].T)
+    return np.ascontiguousarray(vt[: _count(singular, rtol)].conj().T)
 
 
-def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def column_space(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """Orthonormal basis of the range of the row-normalised matrix, shape (s, rank)."""
     w, singular, _ = np.linalg.svd(_unit_rows(_matrix(matrix)), full_matrices=False)
     return np.ascontiguousarray(w[:, : _count(singular, rtol)])
 
 
-def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[FloatArray, FloatArray]:
+def full_rank_factors(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> tuple[NumberArray, NumberArray]:
     """A = F G with F (s, r) and G (r, n), both of rank r (notes eq. 159).
 
     By QR with row exchanges, without any singular values: a second way to the rank and to A+.
     """
     A = _matrix(matrix)
     if A.size == 0:
-        return np.zeros((len(A), 0)), np.zeros((0, A.shape[1]))
+        return np.zeros((len(A), 0), dtype=A.dtype), np.zeros((0, A.shape[1]), dtype=A.dtype)
     sizes = _row_sizes(A)
-    Q, R, order = scipy.linalg.qr((A / sizes[:, None]).T, mode="economic", pivoting=True)
+    Q, R, order = scipy.linalg.qr((A / sizes[:, None]).conj().T, mode="economic", pivoting=True)
     pivots = np.abs(np.diag(R))
     r = int(np.sum(pivots > rtol * pivots[0])) if pivots[0] > 0 else 0
-    F = np.empty((len(A), r))
-    F[order] = R[:r].T
-    return F * sizes[:, None], np.ascontiguousarray(Q[:, :r].T)
+    F = np.empty((len(A), r), dtype=A.dtype)
+    F[order] = R[:r].conj().T
+    return F * sizes[:, None], np.ascontiguousarray(Q[:, :r].conj().T)
 
 
-def full_rank_pseudo_inverse(F: ArrayLike, G: ArrayLike) -> FloatArray:
-    """A+ = G^T (G G^T)^-1 (F^T F)^-1 F^T of A = F G (notes eq. 160, corrected).
+def full_rank_pseudo_inverse(F: ArrayLike, G: ArrayLike) -> NumberArray:
+    """A+ = G^H (G G^H)^-1 (F^H F)^-1 F^H of A = F G (notes eq. 160, corrected; H is T for real factors).
 
     As it is printed: the condition numbers of F and G enter squared.
     """
     F, G = _matrix(F), _matrix(G)
-    return np.asarray(G.T @ np.linalg.solve(G @ G.T, np.linalg.solve(F.T @ F, F.T)))
+    Fh, Gh = F.conj().T, G.conj().T
+    return np.asarray(Gh @ np.linalg.solve(G @ Gh, np.linalg.solve(Fh @ F, Fh)))
 
 
 def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> PenroseResiduals:
     """How far X is from being A+ (notes eqs. 154-157).
 
-    The four conditions A X A = A, X A X = X, (A X)^T = A X, (X A)^T = X A. Each residual is taken with the
+    The four conditions A X A = A, X A X = X, (A X)^H = A X, (X A)^H = X A. Each residual is taken with the
     rows of A scaled to unit length (and X accordingly), relative to the size of the products it is made of:
     it counts roundings, whatever the units of the rows.
     """
@@ -146,15 +152,18 @@ def penrose_residuals(matrix: ArrayLike, inverse: ArrayLike) -> PenroseResiduals
     return PenroseResiduals(
         inner=_relative(UY @ U - U, u * y * u + u),
         outer=_relative(YU @ Y - Y, y * u * y + y),
-        left_symmetry=_relative((ratio * UY - (ratio * UY).T) / (ratio + ratio.T), u * y),
-        right_symmetry=_relative(YU - YU.T, u * y),
+        left_symmetry=_relative((ratio * UY - (ratio * UY).conj().T) / (ratio + ratio.T), u * y),
+        right_symmetry=_relative(YU - YU.conj().T, u * y),
     )
 
 
-def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
-    """x = A+ b + (1 - A+ A) y, every solution of A x = b as y runs over all vectors (notes eq. 163)."""
+def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
+    """x = A+ b + (1 - A+ A) y, every solution of A x = b as y runs over all vectors (notes eq. 163).
+
+    Where A x = b has none, every x that makes the residual b - A x least; A+ b is the shortest (notes eqs. 167, 168).
+    """
     A = _matrix(matrix)
-    y = np.asarray(y, dtype=np.float64)
+    y = _numbers(y, "y")
     x = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b") + parallel_projector(A, rtol) @ y.ravel()
     return np.asarray(x).reshape(y.shape)
 
@@ -162,12 +171,12 @@ def general_solution(matrix: ArrayLike, b: ArrayLike, y: ArrayLike, rtol: float 
 # -- solvability (eq. 95) ---------------------------------------------------------------------------
 
 
-def solvability_residual(matrix: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def solvability_residual(matrix: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """A A+ b - b row by row, rows of A scaled to unit length, shape (s,) (notes eqs. 95, 162)."""
     A = _matrix(matrix)
     b = _vector(b, len(A), "b") / _row_sizes(A)
     W = column_space(A, rtol)
-    return np.asarray(W @ (W.T @ b) - b)
+    return np.asarray(W @ (W.conj().T @ b) - b)
 
 
 def is_solvable(
@@ -205,13 +214,13 @@ def require_solvable(
 # -- projectors (eqs. 96, 97) -----------------------------------------------------------------------
 
 
-def perpendicular_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def perpendicular_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """P_perp = A+ A onto the space of constraint forces (notes eq. 97)."""
     V = row_space(matrix, rtol)
-    return np.asarray(V @ V.T)
+    return np.asarray(V @ V.conj().T)
 
 
-def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
+def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> NumberArray:
     """P_par = 1 - A+ A onto the space of admissible displacements (notes eq. 96)."""
     P = perpendicular_projector(matrix, rtol)
     return np.eye(len(P)) - P
@@ -219,7 +228,7 @@ def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> Float
 
 def velocity_projector(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
     """M_par+ M = 1 - M^-1/2 B+ B M^1/2, the projector of velocities, orthogonal in the mass metric."""
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
     V = row_space(A / root_m, rtol)
     return np.asarray(np.eye(A.shape[1]) - (V / root_m[:, None]) @ (V.T * root_m))
@@ -229,10 +238,10 @@ def project_velocities(
     matrix: ArrayLike, masses: ArrayLike, v: ArrayLike, c: ArrayLike | float = 0.0, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
-    flat = _vector(v, A.shape[1], "v")
-    correction = pseudo_inverse(A / root_m, rtol).matrix @ (A @ flat - np.broadcast_to(c, (len(A),)))
+    flat = _real_vector(v, A.shape[1], "v")
+    correction = pseudo_inverse(A / root_m, rtol).matrix @ (A @ flat - np.broadcast_to(_real(c, "c"), (len(A),)))
     return (flat - correction / root_m).reshape(np.shape(v))
 
 
@@ -244,7 +253,7 @@ def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK
 
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
     return parallel_projector(A / root_m, rtol) / np.outer(root_m, root_m)
 
@@ -256,10 +265,10 @@ def multipliers(
 
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     m = _mass_diagonal(masses, A.shape[1])
     B_plus = pseudo_inverse(A / np.sqrt(m), rtol).matrix
-    right = _vector(b, len(A), "b") - A @ (_vector(f, A.shape[1], "f") / m)
+    right = _real_vector(b, len(A), "b") - A @ (_real_vector(f, A.shape[1], "f") / m)
     return np.asarray(B_plus.T @ (B_plus @ right))
 
 
@@ -267,10 +276,10 @@ def constraint_force(
     matrix: ArrayLike, masses: ArrayLike, f: ArrayLike, b: ArrayLike, rtol: float = RANK_TOLERANCE
 ) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     m = _mass_diagonal(masses, A.shape[1])
     root_m = np.sqrt(m)
-    right = _vector(b, len(A), "b") - A @ (_vector(f, A.shape[1], "f") / m)
+    right = _real_vector(b, len(A), "b") - A @ (_real_vector(f, A.shape[1], "f") / m)
     z = root_m * (pseudo_inverse(A / root_m, rtol).matrix @ right)
     return np.asarray(z).reshape(np.shape(f))
 
@@ -282,10 +291,10 @@ def acceleration(
 
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
-    free = constrained_inverse(A, masses, rtol) @ _vector(f, A.shape[1], "f")
-    driven = (pseudo_inverse(A / root_m, rtol).matrix @ _vector(b, len(A), "b")) / root_m
+    free = constrained_inverse(A, masses, rtol) @ _real_vector(f, A.shape[1], "f")
+    driven = (pseudo_inverse(A / root_m, rtol).matrix @ _real_vector(b, len(A), "b")) / root_m
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
@@ -298,14 +307,14 @@ def bott_duffin(
     a_par = P_par u and z = P_perp u, and (M P_par - P_perp) u = f - M A+ b has one solution. No mass-weighted
     matrix and no multipliers: an independent way to the same answer.
     """
-    A = _matrix(matrix)
+    A = _real_matrix(matrix)
     m = _mass_diagonal(masses, A.shape[1])
     P_perp = perpendicular_projector(A, rtol)
     P_par = np.eye(len(m)) - P_perp
-    a_perp = pseudo_inverse(A, rtol).matrix @ _vector(b, len(A), "b")
+    a_perp = pseudo_inverse(A, rtol).matrix @ _real_vector(b, len(A), "b")
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
     unit = float(np.exp(np.mean(np.log(m))))
-    u = np.linalg.solve(m[:, None] * P_par - unit * P_perp, _vector(f, len(m), "f") - m * a_perp)
+    u = np.linalg.solve(m[:, None] * P_par - unit * P_perp, _real_vector(f, len(m), "f") - m * a_perp)
     shape = np.shape(f)
     return BottDuffinSolution((P_par @ u + a_perp).reshape(shape), unit * (P_perp @ u).reshape(shape))
 
@@ -315,16 +324,36 @@ def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
 
     Among all accelerations with A a = b the true one has the least; there it is (1/2) z^T M^-1 z.
     """
-    a = np.asarray(trial, dtype=np.float64).ravel()
+    a = _real(trial, "trial").ravel()
     m = _mass_diagonal(masses, len(a))
-    return float(0.5 * np.sum((m * a - _vector(f, len(a), "f")) ** 2 / m))
+    return float(0.5 * np.sum((m * a - _real_vector(f, len(a), "f")) ** 2 / m))
 
 
 # -- pieces -----------------------------------------------------------------------------------------
 
 
-def _matrix(values: ArrayLike) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
+def _numbers(values: ArrayLike, item: str) -> NumberArray:
+    """float64 or complex128; nothing of a number is dropped."""
+    if isinstance(values, np.ma.MaskedArray):
+        raise InputError(f"{item} is a masked array: give its numbers, filled or left out", item=item)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+    if array.dtype.kind not in "biufc":
+        raise InputError(f"{item} holds {array.dtype}, not numbers", item=item)
+    return array.astype(np.complex128 if array.dtype.kind == "c" else np.float64, copy=False)
+
+
+def _real(values: ArrayLike, item: str) -> FloatArray:
+    array = _numbers(values, item)
+    if array.dtype.kind == "c":
+        raise InputError(f"{item} is complex, but a mechanical system is real: give the real part", item=item)
+    return np.asarray(array, dtype=np.float64)
+
+
+def _matrix(values: ArrayLike) -> NumberArray:
+    array = _numbers(values, "matrix")
     if array.ndim != 2:
         raise InputError(f"a matrix has two axes, not shape {array.shape}", item="matrix")
     if not np.all(np.isfinite(array)):
@@ -333,16 +362,24 @@ def _matrix(values: ArrayLike) -> FloatArray:
     return array
 
 
-def _vector(values: ArrayLike, length: int, item: str) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64).ravel()
+def _real_matrix(values: ArrayLike) -> FloatArray:
+    return np.asarray(_matrix(_real(values, "matrix")), dtype=np.float64)
+
+
+def _vector(values: ArrayLike, length: int, item: str) -> NumberArray:
+    array = _numbers(values, item).ravel()
     if len(array) != length:
         raise InputError(f"{item} must have {length} entries, not {len(array)}", item=item)
     return array
 
 
+def _real_vector(values: ArrayLike, length: int, item: str) -> FloatArray:
+    return np.asarray(_vector(_real(values, item), length, item), dtype=np.float64)
+
+
 def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
     """The diagonal of M, shape (n,), from n/3 or n masses (notes eq. 79)."""
-    m = np.asarray(masses, dtype=np.float64).ravel()
+    m = _real(masses, "masses").ravel()
     if 3 * len(m) == n:
         m = np.repeat(m, 3)
     if len(m) != n:
@@ -352,13 +389,15 @@ def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
     return m
 
 
-def _row_sizes(A: FloatArray) -> FloatArray:
+def _row_sizes(A: NumberArray) -> FloatArray:
     """Lengths of the rows, 1 for rows that vanish, shape (s,)."""
-    sizes = np.linalg.norm(A, axis=1)
+    # In parts of a power of two near the largest entry, lest squares overflow or vanish.
+    unit = np.exp2(np.frexp(np.max(np.abs(A), axis=1, initial=0.0))[1] - 1.0)
+    sizes = np.asarray(unit * np.linalg.norm(A / unit[:, None], axis=1))
     return np.where(sizes > 0, sizes, 1.0)
 
 
-def _unit_rows(A: FloatArray) -> FloatArray:
+def _unit_rows(A: NumberArray) -> NumberArray:
     return A / _row_sizes(A)[:, None]
 
 
@@ -366,20 +405,20 @@ def _count(singular: FloatArray, rtol: float) -> int:
     return int(np.sum(singular > rtol * singular[0])) if len(singular) and singular[0] > 0 else 0
 
 
-def _left_inverse(F: FloatArray) -> FloatArray:
-    """F+ = (F^T F)^-1 F^T of a matrix with independent columns.
+def _left_inverse(F: NumberArray) -> NumberArray:
+    """F+ = (F^H F)^-1 F^H of a matrix with independent columns.
 
     By QR with the long rows first and columns exchanged, which keeps the digits of short rows.
     """
     if F.size == 0:
-        return np.zeros(F.shape[::-1])
-    order = np.argsort(-np.linalg.norm(F, axis=1), kind="stable")
+        return np.zeros(F.shape[::-1], dtype=F.dtype)
+    order = np.argsort(-_row_sizes(F) * np.any(F, axis=1), kind="stable")
     Q, R, columns = scipy.linalg.qr(F[order], mode="economic", pivoting=True)
-    inverse = np.empty(F.shape[::-1])
-    inverse[np.ix_(columns, order)] = scipy.linalg.solve_triangular(R, Q.T)
+    inverse = np.empty(F.shape[::-1], dtype=F.dtype)
+    inverse[np.ix_(columns, order)] = scipy.linalg.solve_triangular(R, Q.conj().T)
     return inverse
 
 
-def _relative(residual: FloatArray, size: float) -> float:
+def _relative(residual: NumberArray, size: float) -> float:
     largest = float(np.max(np.abs(residual)))
     return largest / size if size > 0 else (np.inf if largest > 0 else 0.0)

@@ -15,7 +15,7 @@ from kcons import projection
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
-LAST = 166
+LAST = 168
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
     for line in TEXT.split("## All equations")[1].splitlines()

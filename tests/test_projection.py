@@ -146,6 +146,117 @@ def test_rank_does_not_depend_on_units() -> None:
         assert projection.full_rank_factors(scaled)[0].shape[1] == 4
 
 
+def complex_matrix(seed: int, rows: int, columns: int, rank: int, decades: float = 2.0) -> np.ndarray:
+    """A complex matrix of this rank, its rows in units of their own, some of them turned in the complex plane."""
+    rng = np.random.default_rng(seed)
+
+    def numbers(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+    return 10 ** rng.uniform(-decades, decades, (rows, 1)) * (numbers(rows, rank) @ numbers(rank, columns))
+
+
+@pytest.mark.parametrize(("rows", "columns", "rank"), [(4, 3, 3), (3, 4, 3), (5, 4, 2), (2, 2, 1), (3, 3, 0)])
+def test_complex_matrices(rows: int, columns: int, rank: int) -> None:
+    """Penrose's conditions are stated for complex matrices (appendix A.1): every function of it keeps both parts."""
+    A = complex_matrix(rows + 7 * rank, rows, columns, rank)
+    rng = np.random.default_rng(1)
+    inverse = projection.pseudo_inverse(A)
+    assert inverse.rank == projection.rank(A) == rank
+    assert max(projection.penrose_residuals(A, inverse.matrix)) < 2e-14
+    # A X A, X A X, (A X)^H, (X A)^H written out, on rows of one size.
+    U = A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300)
+    X = projection.pseudo_inverse(U).matrix
+    np.testing.assert_allclose(X, np.linalg.pinv(U, rcond=1e-10), atol=1e-12)
+    for left, right in ((U @ X @ U, U), (X @ U @ X, X), ((U @ X).conj().T, U @ X), ((X @ U).conj().T, X @ U)):
+        np.testing.assert_allclose(left, right, atol=1e-12)
+    F, G = projection.full_rank_factors(U)
+    assert (F.shape, G.shape) == ((rows, rank), (rank, columns))
+    np.testing.assert_allclose(F @ G, U, atol=1e-13)
+    np.testing.assert_allclose(projection.full_rank_pseudo_inverse(F, G), X, atol=1e-11)
+    V, W = projection.row_space(A), projection.column_space(U)
+    np.testing.assert_allclose(V.conj().T @ V, np.eye(rank), atol=1e-14)
+    np.testing.assert_allclose(W @ (W.conj().T @ U), U, atol=1e-13)
+    across, along = projection.perpendicular_projector(A), projection.parallel_projector(A)
+    np.testing.assert_allclose(across, X @ U, atol=1e-12)
+    np.testing.assert_allclose(U @ along, 0.0, atol=1e-13)
+    # Solvability and all solutions, with complex right sides and vectors y.
+    b = U @ (rng.normal(size=columns) + 1j * rng.normal(size=columns))
+    y = rng.normal(size=columns) + 1j * rng.normal(size=columns)
+    assert projection.is_solvable(U, b)
+    np.testing.assert_allclose(U @ projection.general_solution(U, b, y), b, atol=1e-12)
+    np.testing.assert_allclose(projection.general_solution(U, b, X @ b + along @ y), X @ b + along @ y, atol=1e-12)
+    if rank < rows:
+        off = b + 1j * (np.eye(rows) - W @ W.conj().T) @ rng.normal(size=rows)
+        assert not projection.is_solvable(U, off)
+        with pytest.raises(ContradictionError):
+            projection.require_solvable(U, off)
+
+
+def test_an_imaginary_part_alone_decides() -> None:
+    # Rows 1 and i are one row; (1, i) and (1, -i) are two, though their real parts agree.
+    assert projection.rank([[1.0, 1.0], [1j, 1j]]) == 1
+    assert projection.rank([[1.0, 1j], [1.0, -1j]]) == 2
+    np.testing.assert_allclose(projection.pseudo_inverse([[2j]]).matrix, [[-0.5j]], atol=1e-16)
+    assert not projection.is_solvable([[1.0], [1.0]], [1.0, 1.0 + 1e-3j])
+
+
+def test_mechanics_is_real() -> None:
+    """Masses, forces and rows of a mechanical system that are complex are refused; nothing is dropped."""
+    A, m, f, b = np.array([[1.0, 2.0, 0.5]]), [2.0], np.ones(3), [0.3]
+    calls = {
+        "velocity_projector": (A, m),
+        "project_velocities": (A, m, f, b),
+        "constrained_inverse": (A, m),
+        "multipliers": (A, m, f, b),
+        "constraint_force": (A, m, f, b),
+        "acceleration": (A, m, f, b),
+        "bott_duffin": (A, m, f, b),
+        "gauss_function": (f, m, f),
+    }
+    for name, arguments in calls.items():
+        function = getattr(projection, name)
+        function(*arguments)
+        for k, argument in enumerate(arguments):
+            unreal = [*arguments[:k], np.asarray(argument) * (1 + 1e-3j), *arguments[k + 1 :]]
+            with pytest.raises(InputError, match="complex"):
+                function(*unreal)
+
+
+def test_what_is_no_array_of_numbers_is_refused() -> None:
+    masked = np.ma.masked_array([[1.0, 2.0]], mask=[[False, True]])
+    for bad in (masked, [["a", "b"]], np.array([[object(), 1.0]]), [[1.0], [1.0, 2.0]]):
+        with pytest.raises(InputError) as caught:
+            projection.pseudo_inverse(bad)
+        assert caught.value.item == "matrix"
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1e-200, 1e200, 1e290])
+def test_rows_whose_squares_leave_the_numbers(scale: float) -> None:
+    A = np.array([[1.0, 2.0, 2.0], [scale, 0.0, scale], [3 * scale, 0.0, 3 * scale]])
+    inverse = projection.pseudo_inverse(A)
+    assert inverse.rank == projection.full_rank_factors(A)[0].shape[1] == 2
+    assert max(projection.penrose_residuals(A, inverse.matrix)) < 1e-14
+    assert projection.is_solvable(A, [0.0, scale, 3 * scale])
+    assert not projection.is_solvable(A, [0.0, scale, 2 * scale])
+
+
+@PROPERTY
+@given(problems())
+def test_least_squares_where_there_is_no_solution(p: Problem) -> None:
+    """(167), (168): with b off the range every x of (163) leaves the least residual, across the range of A."""
+    b = p.A @ p.rng.normal(size=p.A.shape[1]) + p.rng.normal(size=len(p.A))
+    shortest = projection.general_solution(p.A, b, np.zeros(p.A.shape[1]))
+    other = projection.general_solution(p.A, b, p.rng.normal(size=p.A.shape[1]))
+    residual = b - p.A @ shortest
+    np.testing.assert_allclose(p.A.T @ residual, 0.0, atol=1e-10)
+    np.testing.assert_allclose(p.A @ other, p.A @ shortest, atol=1e-10)
+    assert np.linalg.norm(shortest) <= np.linalg.norm(other) + 1e-12
+    for _ in range(5):
+        off = shortest + p.rng.normal(size=p.A.shape[1])
+        assert np.linalg.norm(b - p.A @ off) >= np.linalg.norm(residual) - 1e-12
+
+
 @PROPERTY
 @given(problems())
 def test_general_solution_solves_and_reaches_every_solution(p: Problem) -> None:

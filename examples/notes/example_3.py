@@ -1,6 +1,6 @@
 """Example 3: the pendulum, from its Lagrangian to Hamilton's equations (section 2).
 
-python examples/notes/example_3.py        writes example_3.png
+python examples/notes/example_3.py        writes example_3.png and example_3.pdf
 """
 
 import matplotlib.pyplot as plt
@@ -8,7 +8,7 @@ import numpy as np
 
 from kcons.flows import HamiltonianFlow, Pendulum, hamiltonian, lagrange_residual, momentum
 
-m, length, g = 1.5, 0.8, 9.81
+m, length, g = 1.5, 0.8, 9.81  # kg, m, m/s^2
 omega = np.sqrt(g / length)
 
 
@@ -34,15 +34,16 @@ flow = HamiltonianFlow(
     lambda q, p: p / (m * length**2),
     separable=True,
 )
-fig, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+fig, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
 for theta0 in (0.5, 1.5, 2.5, 3.1):
     found = flow.symplectic(theta0, 0.0, 0.01, 400, "suzuki4")
     exact = Pendulum(omega).exact(found.t, [theta0, 0.0])
-    axes.plot(found.q, found.p / (m * length**2 * omega), label=rf"$\theta(0) = {theta0}$")
+    axes.plot(found.q, found.p / (m * length**2 * omega), label=rf"$\theta(0) = {theta0}$ rad")
     print(
         f"theta(0) = {theta0}: off the exact solution by {abs(found.q[:, 0] - exact[:, 0]).max():.1e}, "
         f"energy kept to {np.ptp(found.energy) / found.energy[0]:.1e}"
     )
-axes.set(xlabel=r"$x_1 = \theta$", ylabel=r"$x_2 = p_\theta/(m l^2 \Omega)$")
-axes.legend(fontsize=8)
-fig.savefig("example_3.png", dpi=120)
+axes.set(xlabel=r"$x_1 = \theta$ (rad)", ylabel=r"$x_2 = p_\theta/(m l^2 \Omega)$ (rad)")
+fig.legend(loc="outside upper center", ncols=4, fontsize=9)
+for ending in ("png", "pdf"):
+    fig.savefig(f"example_3.{ending}", dpi=120)

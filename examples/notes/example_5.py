@@ -1,10 +1,11 @@
 """Example 5: a thermostat that keeps the kinetic energy (eqs. 111-113), and what it does to phase space.
 
-python examples/notes/example_5.py        writes example_5.png
+python examples/notes/example_5.py        writes example_5.png and example_5.pdf
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.integrate import cumulative_simpson
 
 from kcons.flows import Thermostat
 
@@ -26,12 +27,14 @@ print(
     f"-(g - 1) times the integral of alpha {found.predicted[-1]:.8f}"
 )
 
-fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-left.plot(t, alpha)
+fig, (left, right) = plt.subplots(1, 2, figsize=(9.5, 4), layout="constrained")
+left.plot(t, alpha, color="0.2")
 left.axhline(0, color="0.6", linewidth=0.8)
-left.set(xlabel="$t$", ylabel=r"$\alpha(t)$")
-right.plot(found.t, found.predicted, label=r"$-(g-1)\int\alpha\,dt$")
-right.plot(found.t, found.log_volume, "o", label="ln volume, measured")
-right.set(xlabel="$t$")
-right.legend()
-fig.savefig("example_5.png", dpi=120)
+left.set(xlabel="time $t$ (reduced units)", ylabel=r"friction $\alpha$ (reduced units)")
+predicted = -(found.g - 1) * cumulative_simpson(alpha, x=t, initial=0.0)
+right.plot(t, predicted, color="royalblue", label=r"$-(g-1)\int\alpha\,dt$")
+right.plot(found.t, found.log_volume, "o", color="crimson", fillstyle="none", label="measured on tangent vectors")
+right.set(xlabel="time $t$ (reduced units)", ylabel="ln of the phase volume (dimensionless)")
+fig.legend(loc="outside upper center", ncols=2)
+for ending in ("png", "pdf"):
+    fig.savefig(f"example_5.{ending}", dpi=120)

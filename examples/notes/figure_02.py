@@ -1,6 +1,6 @@
 """Figure 2: velocity field and a trajectory of the oscillator with friction (eqs. 22, 25).
 
-python examples/notes/figure_02.py        writes figure_02.png
+python examples/notes/figure_02.py        writes figure_02.png and figure_02.pdf
 """
 
 import matplotlib.pyplot as plt
@@ -10,7 +10,7 @@ from kcons.flows import DampedOscillator
 
 oscillator = DampedOscillator(omega=1.0, eta=0.2)
 
-fig, (left, right) = plt.subplots(1, 2, figsize=(8, 4), layout="constrained")
+fig, (left, right) = plt.subplots(1, 2, figsize=(9, 4.5), layout="constrained")
 
 x1, x2 = np.meshgrid(np.linspace(-2, 2, 17), np.linspace(-2, 2, 17))
 V = np.einsum("kl,lij->kij", oscillator.matrix, np.array([x1, x2]))
@@ -23,6 +23,7 @@ right.plot(*X.T)
 right.plot(1, 0, "ko")
 
 for axes in (left, right):
-    axes.set(xlabel="$x_1$", ylabel="$x_2$", aspect="equal")
-fig.savefig("figure_02.png", dpi=120)
+    axes.set(xlabel=r"$x_1 = \Omega x$ (arbitrary units)", ylabel=r"$x_2 = \dot x$ (arbitrary units)", aspect="equal")
+for ending in ("png", "pdf"):
+    fig.savefig(f"figure_02.{ending}", dpi=120)
 print(f"{oscillator.regime}: eigenvalues {oscillator.eigenvalues()}; {oscillator.classification()}")

@@ -2,7 +2,7 @@
 
 The action of a pendulum is least on its true path q(t), among all paths with the same ends.
 
-python examples/notes/figure_03.py        writes figure_03.png
+python examples/notes/figure_03.py        writes figure_03.png and figure_03.pdf
 """
 
 import matplotlib.pyplot as plt
@@ -23,13 +23,16 @@ bump = np.sin(np.pi * t / t[-1])  # zero at both ends
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
 sizes = np.linspace(-0.3, 0.3, 13)
 for size in sizes:
-    left.plot(t, true + size * bump, "--", color="0.6", linewidth=0.8)
-left.plot(t, true, "k")
+    (variation,) = left.plot(t, true + size * bump, "--", color="0.6", linewidth=0.8)
+variation.set_label("variations with the same ends")
+left.plot(t, true, "k", label="true path")
 left.plot(t[[0, -1]], true[[0, -1]], "ko")
-left.set(xlabel="$t$", ylabel="$q(t)$")
+left.set(xlabel=r"time $\Omega t$ (dimensionless)", ylabel="$q$ (rad)")
 
 S = [action(lagrangian, t, true + size * bump) for size in sizes]
 right.plot(sizes, S, "k.-")
-right.set(xlabel="size of the variation", ylabel="action $S$")
-fig.savefig("figure_03.png", dpi=120)
+right.set(xlabel="size of the variation (rad)", ylabel=r"action $S$ (in units of $m l^2 \Omega$)")
+fig.legend(loc="outside upper center", ncols=2)
+for ending in ("png", "pdf"):
+    fig.savefig(f"figure_03.{ending}", dpi=120)
 print(f"the action is least at a variation of {sizes[np.argmin(S)]:.2f}: S = {min(S):.6f}")

@@ -1,6 +1,6 @@
 """Figure 4: the pendulum and its coordinates.
 
-python examples/notes/figure_04.py        writes figure_04.png
+python examples/notes/figure_04.py        writes figure_04.png and figure_04.pdf
 """
 
 import matplotlib.pyplot as plt
@@ -24,6 +24,9 @@ axes.annotate("$l$", (0.36, 0.62))
 axes.annotate("$m$", (mass[0] + 0.08, mass[1] - 0.02))
 axes.annotate("", (mass[0], mass[1] - 0.3), mass, arrowprops={"arrowstyle": "->"})
 axes.annotate("$mg$", (mass[0] + 0.03, mass[1] - 0.25))
-axes.set(xlabel="$x$", ylabel="$z$", aspect="equal", xlim=(-0.5, 1.1), ylim=(-0.25, 1.1))
-fig.savefig("figure_04.png", dpi=120)
+axes.set(
+    xlabel="$x$ (in units of $l$)", ylabel="$z$ (in units of $l$)", aspect="equal", xlim=(-0.5, 1.1), ylim=(-0.25, 1.1)
+)
+for ending in ("png", "pdf"):
+    fig.savefig(f"figure_04.{ending}", dpi=120)
 print(f"distance from the pivot: {np.linalg.norm(mass - pivot):.15g}")

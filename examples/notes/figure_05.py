@@ -1,6 +1,6 @@
 """Figure 5: the linear oscillator and the pendulum, at small and at large amplitude.
 
-python examples/notes/figure_05.py        writes figure_05.png
+python examples/notes/figure_05.py        writes figure_05.png and figure_05.pdf
 """
 
 import matplotlib.pyplot as plt
@@ -11,13 +11,15 @@ from kcons.flows import HarmonicOscillator, Pendulum
 linear, pendulum = HarmonicOscillator(1.0), Pendulum(1.0)
 t = np.linspace(0, 20, 600)
 
-fig, panels = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+fig, panels = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
 for axes, theta0 in zip(panels, (0.2, 2.8), strict=True):
     start = [theta0, 0.0]
-    axes.plot(t, linear.circle(t, start)[:, 0], color="mediumorchid", label="linear")
-    axes.plot(t, pendulum.exact(t, start)[:, 0], color="royalblue", label="pendulum")
-    axes.set(xlabel="$t$", ylabel=r"$\theta(t)$", title=rf"$\theta(0) = {theta0}$")
-panels[0].legend()
-fig.savefig("figure_05.png", dpi=120)
+    lines = axes.plot(t, linear.circle(t, start)[:, 0], color="mediumorchid", label="linear oscillator")
+    lines += axes.plot(t, pendulum.exact(t, start)[:, 0], color="royalblue", linestyle="--", label="pendulum")
+    axes.set(xlabel=r"time $\Omega t$ (dimensionless)", ylabel=r"$\theta$ (rad)", xticks=range(0, 21, 5))
+    axes.set_title(rf"$\theta(0) = {theta0}$ rad, $\dot\theta(0) = 0$")
+fig.legend(handles=lines, loc="outside upper center", ncols=2)
+for ending in ("png", "pdf"):
+    fig.savefig(f"figure_05.{ending}", dpi=120)
 gap = [abs(linear.circle(t, [a, 0.0])[:, 0] - pendulum.exact(t, [a, 0.0])[:, 0]).max() / a for a in (0.2, 2.8)]
 print(f"largest difference in parts of the amplitude: {gap[0]:.3f} at 0.2 rad, {gap[1]:.3f} at 2.8 rad")

@@ -2,29 +2,43 @@
 
 No trajectory crosses the lines x_1 = 0 and x_2 = 0.
 
-python examples/notes/figure_09.py        writes figure_09.png
+python examples/notes/figure_09.py        writes figure_09.png and figure_09.pdf
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import Flow, find_equilibria
+from kcons.flows import Flow, Stability, find_equilibria
 from kcons.growth import LotkaVolterra
 
 model = LotkaVolterra(alpha1=1, beta1=1, alpha2=1, beta2=2)
-fig, panels = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
-for axes, low in zip(panels, (0.0, -3.0), strict=True):
-    x = np.array(np.meshgrid(np.linspace(low, 5, 21), np.linspace(low, 4, 21)))
-    V = model.velocity(0.0, x.reshape(2, -1)).reshape(2, 21, 21)
-    # Arrows of equal length; where nothing moves there is none.
-    length = np.hypot(*V)
-    axes.quiver(*x, *(V / np.where(length > 0, length, 1.0)), length, cmap="viridis")
+fig, panels = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
+for axes, low, number in zip(panels, (0.0, -3.0), (17, 21), strict=True):
+    x = np.array(np.meshgrid(np.linspace(low, 5, number), np.linspace(low, 5, number)))
+    V = model.velocity(0.0, x.reshape(2, -1)).reshape(2, number, number)
+    # Arrows of equal length, colours for their speed; where nothing moves there is none.
+    speed = np.hypot(*V)
+    arrows = axes.quiver(
+        *x, *(V / np.where(speed > 0, speed, 1.0)), speed, cmap="viridis", angles="xy", pivot="mid", width=0.004
+    )
+    arrows.set_clim(0, 30)
     axes.axhline(0, color="0.5", linewidth=0.8)
     axes.axvline(0, color="0.5", linewidth=0.8)
-    axes.set(xlabel="$x_1$", ylabel="$x_2$")
+    axes.set(xlabel="prey $x_1$ (arbitrary units)", ylabel="predators $x_2$ (arbitrary units)", aspect="equal")
+panels[0].set_title("$x_1, x_2 \\geq 0$")
+panels[1].set_title("with the region that has no meaning")
 
 flow = Flow(model.velocity, 2, model.jacobian)
 for point in find_equilibria(flow, [[-1, 5], [-1, 5]]):
-    panels[1].plot(*point.position, "o", color="crimson")
+    stable = point.classification.stability is not Stability.UNSTABLE
+    for axes in panels:
+        axes.plot(*point.position, "o" if stable else "s", color="royalblue" if stable else "crimson", zorder=3)
     print(f"X_s = {np.round(point.position, 6) + 0.0}: {point.classification}")
-fig.savefig("figure_09.png", dpi=120)
+marks = [
+    plt.Line2D([], [], marker=m, color=c, linestyle="", label=name)
+    for m, c, name in (("o", "royalblue", "stable: a centre"), ("s", "crimson", "unstable: a saddle"))
+]
+fig.legend(handles=marks, loc="outside upper center", ncols=2)
+fig.colorbar(arrows, ax=panels, extend="max", label="speed $|V|$ (arbitrary units per a.t.u.)")
+for ending in ("png", "pdf"):
+    fig.savefig(f"figure_09.{ending}", dpi=120)

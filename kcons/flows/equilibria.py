@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
+from kcons.arrays import numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.stability import Classification, classify
@@ -63,7 +64,7 @@ def find_equilibria(
     InputError
         A box that is not finite or has the wrong shape.
     """
-    edges = np.asarray(box, dtype=np.float64)
+    edges = numbers(box, "box")
     if edges.shape != (flow.n, 2) or not np.all(np.isfinite(edges)) or np.any(edges[:, 0] >= edges[:, 1]):
         raise InputError(f"the box has shape ({flow.n}, 2), its lower edges first", item="box")
     if starts < 1:
@@ -104,10 +105,18 @@ def find_equilibria(
 
 
 def equilibrium_at(flow: Flow, position: ArrayLike, time: float = 0.0) -> Equilibrium:
-    """What the flow does around a point where it vanishes."""
-    X = np.asarray(position, dtype=np.float64)
-    A = flow.jacobian(time, X)
-    return Equilibrium(X, A, classify(A), float(np.linalg.norm(flow.velocity(time, X))))
+    """What the flow does around a point where it vanishes.
+
+    The Jacobian counts as known to the accuracy of its differences and of the point. So a centre of a flow that is
+    given without its Jacobian is a centre whose stability cannot be told.
+    """
+    X = numbers(position, "position")
+    A, V = flow.jacobian(time, X), flow.velocity(time, X)
+    # One more Newton step says how far the point may be off, and that what the Jacobian would be there; at a root of
+    # order k it goes only a k-th part of the way.
+    there = X - np.linalg.lstsq(A, V, rcond=1e-10)[0]
+    moved = 4.0 * np.abs(flow.jacobian(time, there) - A) if np.all(np.isfinite(there)) else np.zeros_like(A)
+    return Equilibrium(X, A, classify(A, moved + flow.jacobian_error(time, X)), float(np.linalg.norm(V)))
 
 
 def _polished(flow: Flow, time: float, X: FloatArray) -> FloatArray:

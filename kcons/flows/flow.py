@@ -13,10 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
+from kcons.arrays import lent, numbers
 from kcons.errors import ConvergenceError, InputError
 
 FloatArray = NDArray[np.float64]
 Field = Callable[[float, FloatArray], ArrayLike]
+
+#: Longest of the steps of `jacobian_by_differences`, in parts of the variable where that is larger than 1.
+STEP = 0.02
 
 
 class Flow:
@@ -47,7 +51,7 @@ class Flow:
     def velocity(self, t: float, X: ArrayLike) -> FloatArray:
         """V(X, t), shape (n,) (notes eqs. 2, 3)."""
         X = self._state(X)
-        V = np.asarray(self._velocity(t, X), dtype=np.float64)
+        V = numbers(self._velocity(t, lent(X)), "velocity")
         if V.shape != (self.n,):
             raise InputError(f"V has shape {V.shape}, not ({self.n},)", item="velocity")
         return V
@@ -57,10 +61,19 @@ class Flow:
         X = self._state(X)
         if self._jacobian is None:
             return jacobian_by_differences(self._velocity, t, X)
-        A = np.asarray(self._jacobian(t, X), dtype=np.float64)
+        A = numbers(self._jacobian(t, lent(X)), "jacobian")
         if A.shape != (self.n, self.n):
             raise InputError(f"the Jacobian has shape {A.shape}, not ({self.n}, {self.n})", item="jacobian")
         return A
+
+    def jacobian_error(self, t: float, X: ArrayLike) -> FloatArray:
+        """How far `jacobian` may be off, shape (n, n): 0 where it is given, else what half the steps change."""
+        if self._jacobian is not None:
+            return np.zeros((self.n, self.n))
+        X = self._state(X)
+        whole, half = (jacobian_by_differences(self._velocity, t, X, step) for step in (STEP, STEP / 2))
+        # Beyond truncation: the rounding of V, which half the steps double.
+        return np.asarray(2.0 * np.abs(whole - half) + 1e-12 * np.max(np.abs(whole)))
 
     def divergence(self, t: float, X: ArrayLike) -> float:
         """div V = tr A (notes eqs. 36, 37)."""
@@ -82,7 +95,7 @@ class Flow:
         return solve_ivp(self.velocity, tuple(t_span), self._state(X0), method, rtol=rtol, atol=atol, **options)
 
     def _state(self, X: ArrayLike) -> FloatArray:
-        array = np.asarray(X, dtype=np.float64)
+        array = numbers(X, "X")
         if array.shape != (self.n,):
             raise InputError(f"a state of this flow has shape ({self.n},), not {array.shape}", item="X")
         if not np.all(np.isfinite(array)):
@@ -90,9 +103,9 @@ class Flow:
         return array
 
 
-def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float = 0.02) -> FloatArray:
+def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float = STEP) -> FloatArray:
     """dV/dX by central differences with steps h, h/2, h/4, extrapolated to order six; shape (n, n)."""
-    X = np.asarray(X, dtype=np.float64)
+    X = numbers(X, "X")
     columns = []
     for k in range(len(X)):
         h = step * max(1.0, abs(X[k]))
@@ -101,7 +114,7 @@ def jacobian_by_differences(velocity: Field, t: float, X: ArrayLike, step: float
             e = np.zeros(len(X))
             e[k] = part
             up, down = X + e, X - e
-            ends = [np.asarray(velocity(t, at), dtype=np.float64) for at in (up, down)]
+            ends = [numbers(velocity(t, lent(at)), "velocity") for at in (up, down)]
             slopes.append((ends[0] - ends[1]) / (up[k] - down[k]))
         first, second = (4 * slopes[1] - slopes[0]) / 3, (4 * slopes[2] - slopes[1]) / 3
         columns.append((16 * second - first) / 15)
@@ -154,7 +167,7 @@ def phase_volume(
     ConvergenceError
         If the integration fails.
     """
-    wanted = np.asarray(times, dtype=np.float64)
+    wanted = numbers(times, "times")
     if wanted.ndim != 1 or len(wanted) < 1 or np.any(np.diff(wanted) <= 0):
         raise InputError("times are one-dimensional and increase", item="times")
     n = flow.n

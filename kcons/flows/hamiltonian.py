@@ -8,11 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import lent, numbers
 from kcons.errors import ConvergenceError, InputError
 from kcons.flows.flow import FloatArray, Flow, jacobian_by_differences
 
-Energy = Callable[[FloatArray, FloatArray], float]
-Gradient = Callable[[FloatArray, FloatArray], ArrayLike]
+#: (q, p) -> float, or (q, p, t) -> float where H depends on time.
+Energy = Callable[..., float]
+#: (q, p) -> (f,), or (q, p, t) -> (f,).
+Gradient = Callable[..., ArrayLike]
 
 #: Gauss-Legendre collocation with three points: order 6, symplectic, for any H.
 _ROOT = np.sqrt(15.0)
@@ -24,13 +27,14 @@ GAUSS_A = np.array(
     ]
 )
 GAUSS_B = np.array([5 / 18, 4 / 9, 5 / 18])
+GAUSS_C = np.array([0.5 - _ROOT / 10, 0.5, 0.5 + _ROOT / 10])
 #: Parts of a step of leapfrog that make it of order 4 (Suzuki).
 _PART = 1 / (4 - 4 ** (1 / 3))
 SUZUKI = (_PART, _PART, 1 - 4 * _PART, _PART, _PART)
 
 
 class SymplecticTrajectory(NamedTuple):
-    """Times, shape (k,), coordinates and momenta, shape (k, f), and energies, shape (k,)."""
+    """Times, shape (k,), coordinates and momenta, shape (k, f), and energies H(q, p, t), shape (k,)."""
 
     t: FloatArray
     q: FloatArray
@@ -39,7 +43,7 @@ class SymplecticTrajectory(NamedTuple):
 
 
 class HamiltonianFlow(Flow):
-    """The flow of H(q, p) on X = (q, p).
+    """The flow of H(q, p) or H(q, p, t) on X = (q, p).
 
     Parameters
     ----------
@@ -50,7 +54,10 @@ class HamiltonianFlow(Flow):
     dH_dq, dH_dp : callable (q, p) -> (f,), optional
         Gradients; by differences where they are not given.
     separable : bool
-        Whether H = T(p) + U(q): then explicit integrators apply.
+        Whether H = T(p) + U(q), or T(p, t) + U(q, t): then explicit integrators apply.
+    time_dependent : bool
+        Whether H and its gradients take the time as a third argument, (q, p, t). The energy then changes, by
+        dH/dt = the derivative of H with respect to its third argument (notes eq. 51).
 
     Raises
     ------
@@ -66,40 +73,56 @@ class HamiltonianFlow(Flow):
         dH_dp: Gradient | None = None,
         *,
         separable: bool = False,
+        time_dependent: bool = False,
     ) -> None:
         if f < 1:
             raise InputError(f"there is at least one degree of freedom, not {f}", item="f")
         self.f = int(f)
         self.hamiltonian = hamiltonian
-        self.separable = separable
+        self.separable, self.time_dependent = separable, time_dependent
         self._dH_dq, self._dH_dp = dH_dq, dH_dp
-        super().__init__(lambda t, X: self._field(X), 2 * self.f)
+        super().__init__(self._field, 2 * self.f)
 
-    def energy(self, X: ArrayLike) -> float:
-        """H(q, p)."""
-        X = self._state(X)
-        return float(self.hamiltonian(X[: self.f], X[self.f :]))
+    def _at(self, t: float) -> tuple[float, ...]:
+        """What the user's functions take after q and p."""
+        return (t,) if self.time_dependent else ()
 
-    def gradient_q(self, q: FloatArray, p: FloatArray) -> FloatArray:
+    def energy(self, X: ArrayLike, t: float = 0.0) -> float:
+        """H(q, p), or H(q, p, t)."""
+        X = lent(self._state(X))
+        return float(self.hamiltonian(X[: self.f], X[self.f :], *self._at(t)))
+
+    def gradient_q(self, q: FloatArray, p: FloatArray, t: float = 0.0) -> FloatArray:
         """dH/dq, shape (f,)."""
         if self._dH_dq is not None:
-            return np.asarray(self._dH_dq(q, p), dtype=np.float64)
-        return jacobian_by_differences(lambda t, x: [self.hamiltonian(x, p)], 0.0, q)[0]
+            return numbers(self._dH_dq(lent(q), lent(p), *self._at(t)), "dH_dq")
+        return jacobian_by_differences(lambda s, x: [self.hamiltonian(x, lent(p), *self._at(s))], t, q)[0]
 
-    def gradient_p(self, q: FloatArray, p: FloatArray) -> FloatArray:
+    def gradient_p(self, q: FloatArray, p: FloatArray, t: float = 0.0) -> FloatArray:
         """dH/dp, shape (f,)."""
         if self._dH_dp is not None:
-            return np.asarray(self._dH_dp(q, p), dtype=np.float64)
-        return jacobian_by_differences(lambda t, x: [self.hamiltonian(q, x)], 0.0, p)[0]
+            return numbers(self._dH_dp(lent(q), lent(p), *self._at(t)), "dH_dp")
+        return jacobian_by_differences(lambda s, x: [self.hamiltonian(lent(q), x, *self._at(s))], t, p)[0]
 
-    def _field(self, X: FloatArray) -> FloatArray:
+    def _field(self, t: float, X: FloatArray) -> FloatArray:
         q, p = X[: self.f], X[self.f :]
-        return np.concatenate([self.gradient_p(q, p), -self.gradient_q(q, p)])
+        return np.concatenate([self.gradient_p(q, p, t), -self.gradient_q(q, p, t)])
 
     def symplectic(
-        self, q0: ArrayLike, p0: ArrayLike, dt: float, steps: int, method: str = "gauss6", every: int = 1
+        self,
+        q0: ArrayLike,
+        p0: ArrayLike,
+        dt: float,
+        steps: int,
+        method: str = "gauss6",
+        every: int = 1,
+        *,
+        t0: float = 0.0,
     ) -> SymplecticTrajectory:
         """A trajectory with a fixed step and a symplectic method: its energy error does not grow.
+
+        Where H depends on time, it is the error of the energy and of the momentum that goes with the time, -H, taken
+        together; the steps are symmetric in time, and keep their order.
 
         Parameters
         ----------
@@ -110,6 +133,8 @@ class HamiltonianFlow(Flow):
             'gauss6' for any H, implicit; 'leapfrog' (order 2) and 'suzuki4' (order 4) for a separable one, explicit.
         every : int
             Each so many steps are kept.
+        t0 : float
+            The time of the start.
 
         Raises
         ------
@@ -122,38 +147,40 @@ class HamiltonianFlow(Flow):
             raise InputError(f"there is no method {method!r}; choose gauss6, leapfrog or suzuki4", item="method")
         if method != "gauss6" and not self.separable:
             raise InputError(f"{method} needs H = T(p) + U(q): say separable=True, or use gauss6", item="method")
-        if not np.isfinite(dt) or dt == 0.0 or steps < 0 or every < 1:
-            raise InputError("dt is finite and not zero, steps not negative, every at least 1", item="dt")
-        X = self._state(np.concatenate([np.atleast_1d(q0), np.atleast_1d(p0)]).astype(np.float64))
+        if not np.isfinite(dt) or dt == 0.0 or steps < 0 or every < 1 or not np.isfinite(t0):
+            raise InputError("dt is finite and not zero, steps not negative, every at least 1, t0 finite", item="dt")
+        X = self._state(np.concatenate([np.atleast_1d(numbers(q0, "q0")), np.atleast_1d(numbers(p0, "p0"))]))
         parts = [1.0] if method == "leapfrog" else list(SUZUKI)
         kept = [X]
         for step in range(1, steps + 1):
+            t = t0 + (step - 1) * dt
             if method == "gauss6":
-                X = self._gauss(X, dt)
+                X = self._gauss(t, X, dt)
             else:
                 for part in parts:
-                    X = self._leapfrog(X, part * dt)
+                    X = self._leapfrog(t, X, part * dt)
+                    t += part * dt
             if step % every == 0:
                 kept.append(X)
         states = np.array(kept)
-        times: FloatArray = np.asarray(dt * every * np.arange(len(states)), dtype=np.float64)
+        times: FloatArray = np.asarray(t0 + dt * every * np.arange(len(states)), dtype=np.float64)
         return SymplecticTrajectory(
-            times, states[:, : self.f], states[:, self.f :], np.array([self.energy(X) for X in states])
+            times, states[:, : self.f], states[:, self.f :], np.array(list(map(self.energy, states, times)))
         )
 
-    def _leapfrog(self, X: FloatArray, dt: float) -> FloatArray:
+    def _leapfrog(self, t: float, X: FloatArray, dt: float) -> FloatArray:
         q, p = X[: self.f], X[self.f :]
-        p = p - 0.5 * dt * self.gradient_q(q, p)
-        q = q + dt * self.gradient_p(q, p)
-        p = p - 0.5 * dt * self.gradient_q(q, p)
+        p = p - 0.5 * dt * self.gradient_q(q, p, t)
+        q = q + dt * self.gradient_p(q, p, t + 0.5 * dt)
+        p = p - 0.5 * dt * self.gradient_q(q, p, t + dt)
         return np.concatenate([q, p])
 
-    def _gauss(self, X: FloatArray, dt: float) -> FloatArray:
-        K = np.repeat(self._field(X)[None, :], 3, axis=0)
+    def _gauss(self, t: float, X: FloatArray, dt: float) -> FloatArray:
+        K = np.repeat(self._field(t, X)[None, :], 3, axis=0)
         change, before = np.inf, np.inf
         for _ in range(100):
             with np.errstate(all="ignore"):
-                new = np.array([self._field(X + dt * (row @ K)) for row in GAUSS_A])
+                new = np.array([self._field(t + GAUSS_C[k] * dt, X + dt * (GAUSS_A[k] @ K)) for k in range(3)])
                 change = float(np.max(np.abs(new - K))) * abs(dt)
             if not np.isfinite(change):
                 break

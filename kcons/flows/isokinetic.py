@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import lent, numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow, phase_volume
 
@@ -59,7 +60,7 @@ class Thermostat(Flow):
     def __init__(
         self, masses: ArrayLike, force: Callable[[FloatArray], ArrayLike], *, momentum_removed: int = 0
     ) -> None:
-        m = np.array(masses, dtype=np.float64)
+        m = numbers(masses, "masses").copy()
         if m.ndim != 1 or m.size < 2 or not np.all(np.isfinite(m) & (m > 0)):
             raise InputError("masses are positive, one for each of at least two Cartesian components", item="masses")
         if momentum_removed and m.size % momentum_removed:
@@ -81,7 +82,7 @@ class Thermostat(Flow):
         InputError
             Without kinetic energy, or with a total momentum although it was said to be removed.
         """
-        x, v = np.asarray(x, dtype=np.float64).ravel(), np.asarray(v, dtype=np.float64).ravel()
+        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
         if not v @ (self.masses * v) > 1e-290:
             raise InputError("an isokinetic thermostat needs non-zero kinetic energy", item="v")
         if self.removed:
@@ -96,13 +97,16 @@ class Thermostat(Flow):
 
     def friction(self, X: ArrayLike) -> float:
         """alpha = v.f/(v^T M v) (notes eq. 113)."""
-        X = np.asarray(X, dtype=np.float64)
+        X = numbers(X, "X")
         w = X[self.masses.size :]
-        return float(w @ (np.asarray(self.force(self.positions(X))) / self.root) / (w @ w))
+        return float(w @ (self._force(self.positions(X)) / self.root) / (w @ w))
+
+    def _force(self, x: FloatArray) -> FloatArray:
+        return numbers(self.force(lent(x)), "force")
 
     def _field(self, t: float, X: FloatArray) -> FloatArray:
         w = X[self.masses.size :]
-        return np.concatenate([w, np.asarray(self.force(self.positions(X))) / self.root - self.friction(X) * w])
+        return np.concatenate([w, self._force(self.positions(X)) / self.root - self.friction(X) * w])
 
     def tangents(self, X: FloatArray) -> FloatArray:
         """Orthonormal vectors along the surface of constant K and momentum, shape (2n, 2g - 1)."""
@@ -125,7 +129,7 @@ class Thermostat(Flow):
         """Measure the compression of phase space along a trajectory, and predict it from alpha."""
         X0 = self._state(X0)
         extended = Flow(lambda t, Y: np.append(self.velocity(t, Y[:-1]), self.friction(Y[:-1])), self.n + 1)
-        wanted = np.asarray(times, dtype=np.float64)
+        wanted = numbers(times, "times")
         Y, volume, rows = np.append(X0, 0.0), 0.0, [(0.0, 0.0)]
         for a, b in pairwise(wanted):
             for c, d in pairwise(np.linspace(a, b, pieces + 1)):
@@ -146,8 +150,8 @@ class Thermostat(Flow):
         v(t) = (v + s f/m)/s', with s' = cosh(ct) + (a/c) sinh(ct), c^2 = f.M^-1 f/2K, a = v.f/2K. The positions follow
         from integral s/s' = (ln s' - a I)/c^2, I = integral 1/s'.
         """
-        x, v = np.asarray(x, dtype=np.float64).ravel(), np.asarray(v, dtype=np.float64).ravel()
-        f = np.asarray(self.force(x), dtype=np.float64)
+        x, v = numbers(x, "x").ravel(), numbers(v, "v").ravel()
+        f = self._force(x)
         two_K = float(v @ (self.masses * v))
         a, c = float(v @ f) / two_K, float(np.sqrt(f @ (f / self.masses) / two_K))
         if c == 0.0:

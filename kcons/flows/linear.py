@@ -6,8 +6,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.flows.flow import FloatArray, Flow
-from kcons.flows.stability import Classification, JordanBlocks, _square, classify, jordan_blocks
+from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_form
+from kcons.flows.spectrum import square_matrix
+from kcons.flows.stability import Classification, classify
 
 
 class LinearFlow(Flow):
@@ -23,43 +26,33 @@ class LinearFlow(Flow):
     Raises
     ------
     InputError
-        A matrix that is not square or not finite.
+        A matrix that is not square, real and finite.
     """
 
     def __init__(self, matrix: ArrayLike) -> None:
-        self.matrix: FloatArray = _square(matrix)
+        self.matrix: FloatArray = square_matrix(matrix).copy()
         super().__init__(lambda t, X: self.matrix @ X, len(self.matrix), lambda t, X: self.matrix)
 
     def propagator(self, t: float) -> FloatArray:
-        """exp(At), shape (n, n) (notes eqs. 9, 13)."""
+        """exp(At), shape (n, n) (notes eq. 9)."""
         return np.asarray(scipy.linalg.expm(self.matrix * t))
 
     def exact(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) = exp(At) X(0), shape (n,) or (k, n) (notes eq. 8)."""
         X0 = self._state(X0)
-        times = np.asarray(t, dtype=np.float64)
+        times = numbers(t, "t")
         if times.ndim == 0:
             return self.propagator(float(times)) @ X0
         return np.array([self.propagator(float(s)) @ X0 for s in times])
 
+    def jordan_form(self) -> JordanForm:
+        """T and J with A = T J T^-1, as far as double precision allows (notes eqs. 10-13)."""
+        return jordan_form(self.matrix)
+
     def jordan_blocks(self) -> list[JordanBlocks]:
         """Eigenvalues with the sizes of their blocks (notes eqs. 10-12)."""
-        return jordan_blocks(self.matrix)
+        return self.jordan_form().blocks
 
     def classification(self) -> Classification:
         """Kind and stability (notes eq. 14, completed)."""
         return classify(self.matrix)
-
-
-def jordan_block(eigenvalue: float, size: int) -> FloatArray:
-    """lambda on the diagonal, ones above it, shape (size, size) (notes eq. 12)."""
-    return np.asarray(eigenvalue * np.eye(size) + np.eye(size, k=1))
-
-
-def jordan_block_propagator(eigenvalue: float, size: int, t: float) -> FloatArray:
-    """exp(J t) of one block in closed form: e^(lambda t) t^k/k! on the k-th diagonal, shape (size, size)."""
-    terms = np.cumprod(np.concatenate([[1.0], t / np.arange(1.0, size)]))
-    propagator = np.zeros((size, size))
-    for k in range(size):
-        propagator += np.diag(np.full(size - k, terms[k]), k)
-    return np.asarray(np.exp(eigenvalue * t) * propagator)

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
+from kcons.arrays import lent, numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.hamiltonian import HamiltonianFlow
+from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_block
 from kcons.flows.linear import LinearFlow
 
 
@@ -41,9 +43,28 @@ class DampedOscillator(LinearFlow):
         return "oscillating" if self.eta < 2 * self.omega else "overdamped"
 
     def eigenvalues(self) -> tuple[complex, complex]:
-        """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2 (notes eq. 23)."""
-        a = np.sqrt(complex((self.eta - 2 * self.omega) * (self.eta + 2 * self.omega)))
-        return complex(0.5 * (-self.eta - a)), complex(0.5 * (-self.eta + a))
+        """(-eta -+ a)/2, a = (eta^2 - 4 Omega^2)^1/2, in this order (notes eq. 23).
+
+        Each to its own last digits: the slow one of two real ones is Omega^2 over the fast one, without a difference.
+        """
+        a = np.sqrt(complex(self.eta - 2 * self.omega)) * np.sqrt(self.eta + 2 * self.omega)
+        first = complex(-0.5 * (self.eta + a))
+        return first, (first.conjugate() if a.imag else self.omega * (self.omega / first))
+
+    def jordan_form(self) -> JordanForm:
+        """T and J in closed form (notes eqs. 17, 24); one block at critical damping, where T of (24) is singular."""
+        first, second = self.eigenvalues()
+        if first == second:
+            return JordanForm(
+                np.array([[-1.0, -1.0 / self.omega], [1.0, 0.0]], dtype=np.complex128),
+                jordan_block(first, 2).astype(np.complex128),
+                [JordanBlocks(first, (2,), True, 0.0)],
+            )
+        return JordanForm(
+            np.array([[second / self.omega, first / self.omega], [1.0, 1.0]]),
+            np.diag([first, second]),
+            [JordanBlocks(first, (1,), True, 0.0), JordanBlocks(second, (1,), True, 0.0)],
+        )
 
     def closed_form(self, t: float) -> FloatArray:
         """exp(At), shape (2, 2), in one formula for all regimes (notes eq. 25, derived anew).
@@ -77,7 +98,8 @@ class HarmonicOscillator(DampedOscillator):
     def circle(self, t: ArrayLike, X0: ArrayLike) -> FloatArray:
         """X(t) on its circle, shape (2,) or (k, 2) (notes eqs. 18, 19)."""
         x1, x2 = self._state(X0)
-        c, s = np.cos(self.omega * np.asarray(t)), np.sin(self.omega * np.asarray(t))
+        angle = self.omega * numbers(t, "t")
+        c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * x1 + s * x2, c * x2 - s * x1], axis=-1)
 
 
@@ -110,7 +132,7 @@ class Pendulum(HamiltonianFlow):
         1/k^2) for k > 1, where the pendulum turns over. On the separatrix, k = 1, sn = tanh.
         """
         theta0, rate0 = self._state(X0)
-        times = np.asarray(t, dtype=np.float64)
+        times = numbers(t, "t")
         m = self.energy(X0) / (2.0 * self.omega)
         # Measured from the nearest lowest position.
         turns = np.round(theta0 / (2 * np.pi))
@@ -162,16 +184,16 @@ class ParticleOnSphere(Flow):
 
     def acceleration(self, x: ArrayLike, v: ArrayLike) -> FloatArray:
         """The acceleration on the sphere, shape (3,) (notes eq. 110)."""
-        x, v = np.asarray(x, dtype=np.float64), np.asarray(v, dtype=np.float64)
+        x, v = numbers(x, "x"), numbers(v, "v")
         a = -(v @ v) / self.radius**2 * x
         if self.force is not None:
-            f = np.asarray(self.force(x), dtype=np.float64) / self.mass
+            f = numbers(self.force(lent(x)), "force") / self.mass
             a = a + f - x * (x @ f) / self.radius**2
         return np.asarray(a)
 
     def great_circle(self, t: ArrayLike, x0: ArrayLike, v0: ArrayLike) -> FloatArray:
         """The free motion x(t), shape (3,) or (k, 3); v0 is tangent to the sphere."""
-        x0, v0 = np.asarray(x0, dtype=np.float64), np.asarray(v0, dtype=np.float64)
+        x0, v0 = numbers(x0, "x0"), numbers(v0, "v0")
         speed = float(np.linalg.norm(v0))
-        angle = np.asarray(t, dtype=np.float64)[..., None] * speed / self.radius
+        angle = numbers(t, "t")[..., None] * speed / self.radius
         return np.asarray(np.cos(angle) * x0 + self.radius * np.sin(angle) * (v0 / speed if speed else v0))

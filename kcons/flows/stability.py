@@ -1,7 +1,8 @@
-"""Linear stability: Jordan structure, named classification, and whether a linear flow stays bounded.
+"""Linear stability: named classification, and whether a linear flow stays bounded.
 
 The notes' criterion Re lambda <= 0 (eq. 14) is completed: where Re lambda = 0, the Jordan blocks must be 1 x 1, or the
-solution grows like a power of t.
+solution grows like a power of t. Eigenvalues are judged at their own scale, each with how far it may be off; a real
+part smaller than that is zero only if the matrix as it is written says so exactly. Else stability cannot be told.
 """
 
 from __future__ import annotations
@@ -10,21 +11,16 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from kcons.errors import InputError
 from kcons.flows.flow import FloatArray
-
-#: Eigenvalues closer than this, in parts of the norm of A, count as one: those of a block of size 2 or 3 come out no
-#: better than eps^(1/2), eps^(1/3).
-CLUSTER = 2e-5
-#: A real or imaginary part below this part of the norm counts as zero.
-ZERO = 1e-9
+from kcons.flows.imaginary_axis import on_axis
+from kcons.flows.jordan import clusters, jordan_blocks
+from kcons.flows.spectrum import ComplexArray, spectrum, square_matrix
 
 
 class Kind(Enum):
-    """What the flow looks like around an equilibrium."""
+    """What the flow looks like around an equilibrium; a real part within its error counts as zero."""
 
     NODE = "node"
     FOCUS = "focus"
@@ -39,13 +35,8 @@ class Stability(Enum):
     ASYMPTOTIC = "asymptotically stable"
     STABLE = "stable"
     UNSTABLE = "unstable"
-
-
-class JordanBlocks(NamedTuple):
-    """One eigenvalue and the sizes of its blocks (notes eqs. 11, 12), largest first."""
-
-    eigenvalue: complex
-    sizes: tuple[int, ...]
+    #: No eigenvalue is known to lie to the right of the axis, and not all are known to lie left of it or on it.
+    UNKNOWN = "cannot be told"
 
 
 class Classification(NamedTuple):
@@ -58,122 +49,90 @@ class Classification(NamedTuple):
     detail : str
         'star' or 'improper' for nodes with one eigenvalue only; 'saddle-focus'; otherwise empty.
     eigenvalues : ndarray of complex, shape (n,)
+        Sorted by real part, largest first.
     hyperbolic : bool
-        Whether no eigenvalue has a vanishing real part. Only then does the linear flow decide about the stability of
-        an equilibrium of a flow that is not linear.
+        Whether all real parts are known not to vanish. Only then does the linear flow decide about the stability of an
+        equilibrium of a flow that is not linear.
+    errors : ndarray, shape (n,)
+        How far each eigenvalue may be off.
+    conditions : ndarray, shape (n,)
+        The condition number of each eigenvalue, of the balanced matrix; infinite or nearly so for a defective one.
     """
 
     kind: Kind
     stability: Stability
     detail: str
-    eigenvalues: NDArray[np.complex128]
+    eigenvalues: ComplexArray
     hyperbolic: bool
+    errors: FloatArray
+    conditions: FloatArray
 
     def __str__(self) -> str:
-        return f"{self.stability.value} {self.detail + ' ' if self.detail else ''}{self.kind.value}"
+        named = self.detail.endswith(self.kind.value) or not self.detail
+        name = (self.detail or self.kind.value) if named else f"{self.detail} {self.kind.value}"
+        if self.stability is Stability.UNKNOWN:
+            return f"{name} whose stability cannot be told"
+        return f"{self.stability.value} {name}"
 
 
-def jordan_blocks(matrix: ArrayLike, cluster: float = CLUSTER) -> list[JordanBlocks]:
-    """Eigenvalues and block sizes, sorted by real part, largest first (notes eqs. 10-12).
-
-    The sizes follow from the ranks of the powers of A - lambda on the invariant subspace of each group of eigenvalues.
-    They are not continuous in A; `cluster` says what counts as equal.
-    """
-    A = _square(matrix)
-    scale = max(float(np.linalg.norm(A, 2)), np.finfo(np.float64).tiny)
-    T, _ = scipy.linalg.schur(A, output="complex")
-    groups = _groups(np.diag(T), cluster * scale)
-    blocks = []
-    for group in groups:
-        mean = complex(np.mean(group))
-        near = 1.5 * max((abs(v - mean) for v in group), default=0.0) + 1e-12 * scale
-
-        def inside(v: complex, mean: complex = mean, near: float = near) -> bool:
-            return abs(v - mean) <= near
-
-        T, _, m = scipy.linalg.schur(A, output="complex", sort=inside)
-        N = T[:m, :m] - mean * np.eye(m)
-        blocks.append(JordanBlocks(_clean(mean, scale), _sizes(N, cluster, scale)))
-    return sorted(blocks, key=lambda b: (-round(b.eigenvalue.real / scale, 9), -b.eigenvalue.imag))
-
-
-def _groups(values: NDArray[np.complex128], distance: float) -> list[list[complex]]:
-    """Eigenvalues that lie together, each within `distance` of another of its group."""
-    groups: list[list[complex]] = []
-    for value in values:
-        touching = [g for g in groups if any(abs(value - other) <= distance for other in g)]
-        merged = [complex(value)] + [v for g in touching for v in g]
-        groups = [g for g in groups if g not in touching] + [merged]
-    return groups
-
-
-def _sizes(N: NDArray[np.complex128], cluster: float, scale: float) -> tuple[int, ...]:
-    """Block sizes of a matrix that is nilpotent but for round-off."""
-    m = len(N)
-    # How many blocks there are of size k and more: the drop in rank from N^(k-1) to N^k.
-    ranks, power = [m], np.eye(m, dtype=np.complex128)
-    for k in range(1, m + 1):
-        power = power @ N
-        singular = np.linalg.svd(power, compute_uv=False)
-        ranks.append(int(np.sum(singular > cluster * scale**k)))
-    ranks.append(0)
-    drops = [ranks[k - 1] - ranks[k] for k in range(1, m + 1)]
-    sizes: list[int] = []
-    for k in range(m, 0, -1):
-        exactly = drops[k - 1] - (drops[k] if k < m else 0)
-        sizes += [k] * max(exactly, 0)
-    return tuple(sizes)
-
-
-def _clean(value: complex, scale: float) -> complex:
-    """The eigenvalue without parts that are round-off."""
-    real = value.real if abs(value.real) > ZERO * scale else 0.0
-    imag = value.imag if abs(value.imag) > ZERO * scale else 0.0
-    return complex(real, imag)
-
-
-def classify(matrix: ArrayLike, cluster: float = CLUSTER) -> Classification:
-    """Name the flow dX/dt = A X.
+def classify(matrix: ArrayLike, error: ArrayLike = 0.0) -> Classification:
+    """Name the flow dX/dt = A X (notes eq. 14, completed).
 
     Node: all eigenvalues real and of one sign; focus: real parts of one sign, some eigenvalues complex; saddle: real
     parts of both signs; centre: all purely imaginary; degenerate: an eigenvalue 0, or zero real parts among others.
 
+    Parameters
+    ----------
+    matrix : array_like, shape (n, n)
+    error : array_like, shape (n, n) or a number
+        How far the entries may be off, beyond their rounding: of a Jacobian by differences, for example. Without any,
+        real parts of exactly zero are found, for up to 24 variables.
+
     Raises
     ------
     InputError
-        A matrix that is not square or not finite.
+        A matrix that is not square, real and finite, or errors that do not belong to it.
     """
-    A = _square(matrix)
-    blocks = jordan_blocks(A, cluster)
-    values = [b.eigenvalue for b in blocks]
-    # The sign of a real part: of the group, since the members of a defective one scatter.
-    signs = {int(np.sign(v.real)) for v in values}
-    complex_ = any(v.imag != 0 for v in values)
-    detail = ""
-    if any(v == 0 for v in values) or (0 in signs and len(signs) > 1):
-        kind = Kind.SADDLE if {1, -1} <= signs and all(v != 0 for v in values) else Kind.DEGENERATE
-    elif signs == {0}:
-        kind = Kind.CENTRE
-    elif len(signs) > 1:
-        kind = Kind.SADDLE
-        detail = "saddle-focus" if complex_ else ""
-    elif complex_:
-        kind = Kind.FOCUS
-    else:
-        kind = Kind.NODE
-        if len(values) == 1 and len(A) > 1:
+    A = square_matrix(matrix)
+    found = spectrum(A, error)
+    groups = clusters(found.values, found.errors)
+    means, signs = [], []
+    for group in groups:
+        real, off = found.values[group].real, found.errors[group]
+        means.append(complex(np.mean(found.values[group])))
+        signs.append(1 if np.all(real > off) else -1 if np.all(real < -off) else 0)
+    off_zero = [abs(m) > max(found.errors[g]) for m, g in zip(means, groups, strict=True)]
+    turning = any(abs(m.imag) > max(found.errors[g]) for m, g in zip(means, groups, strict=True))
+    kind, detail = _kind(set(signs), not all(off_zero), turning)
+    if kind is Kind.NODE and len(groups) == 1 and len(A) > 1:
+        blocks = jordan_blocks(A, error)
+        if len(blocks) == 1:
             detail = "star" if blocks[0].sizes[0] == 1 else "improper"
-    if 1 in signs or any(b.eigenvalue.real == 0 and b.sizes[0] > 1 for b in blocks):
-        stability = Stability.UNSTABLE
-    else:
-        stability = Stability.STABLE if 0 in signs else Stability.ASYMPTOTIC
-    return Classification(kind, stability, detail, np.linalg.eigvals(A).astype(np.complex128), 0 not in signs)
+    stability = _stability(signs, groups, A, exact=not np.any(error))
+    order = np.lexsort((-found.values.imag, -found.values.real))
+    return Classification(
+        kind, stability, detail, found.values[order], 0 not in signs, found.errors[order], found.conditions[order]
+    )
 
 
-def _square(matrix: ArrayLike) -> FloatArray:
-    A = np.asarray(matrix, dtype=np.float64)
-    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
-        raise InputError(f"the matrix of a linear flow is square, not of shape {A.shape}", item="matrix")
-    if not np.all(np.isfinite(A)):
-        raise InputError("the matrix is not finite", item="matrix")
-    return A
+def _kind(signs: set[int], zero: bool, turning: bool) -> tuple[Kind, str]:
+    """From the signs of the real parts; whether an eigenvalue is 0, and whether one is complex."""
+    if zero or (0 in signs and len(signs) == 2):
+        return Kind.DEGENERATE, ""
+    if signs == {0}:
+        return Kind.CENTRE, ""
+    if len(signs) > 1:
+        return Kind.SADDLE, "saddle-focus" if turning and 0 not in signs else ""
+    return (Kind.FOCUS if turning else Kind.NODE), ""
+
+
+def _stability(signs: list[int], groups: list[np.ndarray], A: FloatArray, *, exact: bool) -> Stability:
+    if 1 in signs:
+        return Stability.UNSTABLE
+    unknown = sum(len(g) for g, sign in zip(groups, signs, strict=True) if sign == 0)
+    if not unknown:
+        return Stability.ASYMPTOTIC
+    axis = on_axis(A) if exact else None
+    if axis is None or axis.zero + axis.imaginary != unknown:
+        return Stability.UNKNOWN
+    return Stability.STABLE if axis.bounded else Stability.UNSTABLE

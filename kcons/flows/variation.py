@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
+from kcons.arrays import numbers
 from kcons.errors import ConvergenceError
 from kcons.flows.flow import FloatArray, jacobian_by_differences
 
@@ -23,7 +24,7 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
     The velocity of a piece is its difference quotient and L is taken at its middle, so that the path of least S obeys
     Lagrange's equations to second order in the time step.
     """
-    t, q = np.asarray(times, dtype=np.float64), np.asarray(path, dtype=np.float64)
+    t, q = numbers(times, "times"), numbers(path, "path")
     q = q.reshape(len(t), -1)
     steps = np.diff(t)
     middles, velocities = 0.5 * (q[1:] + q[:-1]), np.diff(q, axis=0) / steps[:, None]
@@ -33,7 +34,7 @@ def action(lagrangian: Lagrangian, times: ArrayLike, path: ArrayLike) -> float:
 
 def momentum(lagrangian: Lagrangian, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> FloatArray:
     """p = dL/dv, shape (f,) (notes eq. 45)."""
-    q = np.asarray(q, dtype=np.float64)
+    q = numbers(q, "q")
     return jacobian_by_differences(lambda s, w: [lagrangian(q, w, t)], t, v)[0]
 
 
@@ -41,7 +42,7 @@ def lagrange_residual(
     lagrangian: Lagrangian, q: ArrayLike, v: ArrayLike, a: ArrayLike, t: float = 0.0, step: float = 1e-2
 ) -> FloatArray:
     """d/dt dL/dv - dL/dq along q, v, a, shape (f,); zero on a true motion (notes eq. 44)."""
-    q, v, a = (np.asarray(x, dtype=np.float64) for x in (q, v, a))
+    q, v, a = numbers(q, "q"), numbers(v, "v"), numbers(a, "a")
 
     def along(h: float) -> FloatArray:
         return momentum(lagrangian, q + h * v + 0.5 * h * h * a, v + h * a, t + h)
@@ -61,8 +62,8 @@ def velocity_of_momentum(
     ConvergenceError
         If there is none near the guess.
     """
-    p = np.asarray(p, dtype=np.float64)
-    start = p if guess is None else np.asarray(guess, dtype=np.float64)
+    p = numbers(p, "p")
+    start = p if guess is None else numbers(guess, "guess")
     found = root(lambda v: momentum(lagrangian, q, v, t) - p, start, options={"xtol": 1e-13})
     if not np.all(np.abs(found.fun) <= 1e-9 * np.maximum(1.0, np.abs(p))):
         left = float(np.max(np.abs(found.fun)))
@@ -72,6 +73,6 @@ def velocity_of_momentum(
 
 def hamiltonian(lagrangian: Lagrangian, q: ArrayLike, p: ArrayLike, t: float = 0.0) -> float:
     """H(q, p, t) = v . p - L with v the velocity of this momentum (notes eqs. 47, 48)."""
-    q = np.asarray(q, dtype=np.float64)
+    q = numbers(q, "q")
     v = velocity_of_momentum(lagrangian, q, p, t)
-    return float(v @ np.asarray(p, dtype=np.float64) - lagrangian(q, v, t))
+    return float(v @ numbers(p, "p") - lagrangian(q, v, t))

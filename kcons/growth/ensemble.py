@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import DOP853
 
+from kcons.arrays import numbers
 from kcons.errors import InputError
 from kcons.growth.compensated_sums import two_sum
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
@@ -96,12 +97,16 @@ def solve_ensemble(
     ConstraintError, BudgetError, ContradictionError, SingularGeometryError
         As `solve`, if any start cannot be held.
     """
-    times = np.atleast_1d(np.asarray(t_eval, dtype=np.float64))
+    times = np.atleast_1d(numbers(t_eval, "t_eval"))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
         raise InputError("t_eval holds finite times that increase, none before t0", item="t_eval")
     if (x0 is None) == (log_x0 is None):
         raise InputError("give the starts either as x0 or as log_x0", item="x0")
-    start = np.log(positive_populations(x0)) if x0 is not None else np.array(log_x0, dtype=np.float64)
+    if log_x0 is None:
+        assert x0 is not None
+        start = np.log(positive_populations(x0))
+    else:
+        start = numbers(log_x0, "log_x0").copy()
     if start.ndim != 2 or len(start) != system.n or not np.all(np.isfinite(start)):
         raise InputError(f"the starts have shape ({system.n}, N) and are finite", item="x0")
     if system.model.vectorized is False:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
+from kcons.arrays import numbers
 from kcons.errors import BudgetError, InputError
 from kcons.growth.compensated_sums import compensated_sum
 from kcons.growth.mixture import Mixture
@@ -88,7 +89,7 @@ class Relaxation(EntropyLaw):
     feedback = True
 
     def __init__(self, tau: float | FloatArray, budget: float | None = None, *, partial: bool = False) -> None:
-        self.tau: FloatArray = np.array(tau, dtype=np.float64)
+        self.tau: FloatArray = numbers(tau, "tau").copy()
         if not np.all(np.isfinite(self.tau) & (self.tau > 0)):
             raise InputError(f"tau is a positive time, not {tau}", item="tau")
         if budget is not None and not (np.isfinite(budget) and budget >= 0):
@@ -303,7 +304,7 @@ class EntropyRow(Row):
 
 
 class EntropyBalance(NamedTuple):
-    """Three ways to the entropy, times T, that a solution has produced.
+    """Three ways to the entropy, times T, that a solution has produced, and where it went.
 
     Attributes
     ----------
@@ -313,11 +314,17 @@ class EntropyBalance(NamedTuple):
         The integral of -sum mu dx/dt along the solution.
     prescribed : float
         What the law says.
+    reactions, exchanged : float
+        The parts of `integrated` (notes eq. 145): of what the model does by itself, Psi + G phi, and of what the
+        constraints add to it, G z. In an open system (eq. 150) these are the entropy produced inside and the one
+        exchanged with the outside; in a closed one (eq. 149) nothing is exchanged, and their sum is produced inside.
     """
 
     lost: float
     integrated: float
     prescribed: float
+    reactions: float
+    exchanged: float
 
 
 def entropy_balance(solution: GrowthSolution, nodes: int = 8) -> EntropyBalance:
@@ -343,14 +350,15 @@ def entropy_balance(solution: GrowthSolution, nodes: int = 8) -> EntropyBalance:
             "the integral needs the solution between its times: solve(..., dense_output=True)", item="solution"
         )
     points, weights = np.polynomial.legendre.leggauss(nodes)
-    integrated = 0.0
+    integrated = reactions = 0.0
     for a, b in pairwise(solution.t):
         times = 0.5 * (a + b) + 0.5 * (b - a) * points
         for t, weight, log_x in zip(times, weights, solution.sol.logarithms(times).T, strict=True):
             p = Populations.from_logarithms(float(t), log_x)
-            dx = p.x * solution.system.logarithmic_velocity(p)
-            integrated -= 0.5 * (b - a) * weight * float(np.sum(row.mixture.potentials(p) * dx))
+            fall = -0.5 * (b - a) * weight * row.mixture.potentials(p)
+            integrated += float(np.sum(fall * p.x * solution.system.logarithmic_velocity(p)))
+            reactions += float(np.sum(fall * solution.system.model.drift(p)))
     ends = [Populations.from_logarithms(float(solution.t[k]), solution.log_y[:, k]) for k in (0, -1)]
     lost = float(row.mixture.excess(ends[0], row.total) - row.mixture.excess(ends[1], row.total))
     prescribed = float(row.excess0 - row.law_excess(float(solution.t[-1])))
-    return EntropyBalance(lost, integrated, prescribed)
+    return EntropyBalance(lost, integrated, prescribed, reactions, integrated - reactions)

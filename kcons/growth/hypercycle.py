@@ -24,6 +24,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.errors import InputError
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
@@ -69,12 +70,12 @@ class Hypercycle(GrowthModel):
         if int(n) != n or n < 2:
             raise InputError(f"a hypercycle has at least two species, not {n}", item="n")
         super().__init__(lambda t, x: self.k_h * np.roll(x, -1, axis=0), n=int(n), vectorized=True)
-        self.k_h: FloatArray = np.array(k_h, dtype=np.float64)
+        self.k_h: FloatArray = numbers(k_h, "k_h").copy()
         if not np.all(np.isfinite(self.k_h) & (self.k_h > 0)):
             raise InputError(f"the rate constant k_h is positive and finite, not {self.k_h}", item="k_h")
         if mu0 is None:
             levels = 0.1 + 0.05 * np.arange(1, n + 1)
-            mu0 = np.multiply.outer(levels, np.asarray(kT, dtype=np.float64))
+            mu0 = np.multiply.outer(levels, numbers(kT, "kT"))
         self.mixture = Mixture(mu0, kT)
         if self.mixture.n != n:
             raise InputError(f"{self.mixture.n} standard potentials for {n} species", item="mu0")
@@ -99,7 +100,7 @@ class Hypercycle(GrowthModel):
 
         The budget T(s_eq - s_0) is computed from the start where it is not given, and checked against it where it is.
         """
-        return self.with_law(Relaxation(np.asarray(tau, dtype=np.float64), budget, partial=partial))
+        return self.with_law(Relaxation(numbers(tau, "tau"), budget, partial=partial))
 
     def without_entropy_production(self) -> ConstrainedHypercycle:
         """(c): sum x fixed, no entropy produced in all (notes eq. 150)."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 
+from kcons.arrays import numbers
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.model import FloatArray, Populations, positive_populations
@@ -409,7 +410,7 @@ def _start(system: ConstrainedGrowth, x0: ArrayLike | None, log_x0: ArrayLike | 
         assert x0 is not None
         log_start = np.log(positive_populations(x0))
     else:
-        log_start = np.array(log_x0, dtype=np.float64)
+        log_start = numbers(log_x0, "log_x0").copy()
         if not np.all(np.isfinite(log_start)):
             raise InputError("log_x0 is not finite", item="log_x0")
     if log_start.shape != (system.n,):
@@ -418,7 +419,7 @@ def _start(system: ConstrainedGrowth, x0: ArrayLike | None, log_x0: ArrayLike | 
 
 
 def _times(t_eval: ArrayLike, t0: float, t1: float) -> FloatArray:
-    times = np.asarray(t_eval, dtype=np.float64)
+    times = numbers(t_eval, "t_eval")
     low, high = min(t0, t1), max(t0, t1)
     if times.ndim != 1 or np.any(times < low) or np.any(times > high):
         raise InputError("t_eval is one-dimensional and within t_span", item="t_eval")

@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.errors import InputError
 from kcons.growth.compensated_sums import compensated_sum, two_sum
 from kcons.growth.model import FloatArray, Populations
@@ -40,8 +41,8 @@ class Mixture:
     """
 
     def __init__(self, mu0: ArrayLike, kT: ArrayLike = 1.0) -> None:
-        self.mu0: FloatArray = np.array(mu0, dtype=np.float64)
-        self.kT: FloatArray = np.array(kT, dtype=np.float64)
+        self.mu0: FloatArray = numbers(mu0, "mu0").copy()
+        self.kT: FloatArray = numbers(kT, "kT").copy()
         if self.mu0.ndim not in (1, 2) or not np.all(np.isfinite(self.mu0)):
             raise InputError("mu0 has shape (n,) and is finite", item="mu0")
         if not np.all(np.isfinite(self.kT) & (self.kT > 0)):

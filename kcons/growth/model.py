@@ -15,6 +15,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import lent, numbers
 from kcons.errors import InputError, NonFiniteError
 
 FloatArray = NDArray[np.float64]
@@ -59,10 +60,7 @@ class Populations(NamedTuple):
 
 def positive_populations(x: ArrayLike) -> FloatArray:
     """x as an array, refused if a population is negative, zero or not finite."""
-    try:
-        array = np.array(x, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError("the populations are not an array of numbers", item="x0") from None
+    array = numbers(x, "x0").copy()
     if array.ndim not in (1, 2) or array.size == 0:
         raise InputError(f"populations have shape (n,) or (n, N), not {array.shape}", item="x0")
     if not np.all(np.isfinite(array)):
@@ -140,7 +138,7 @@ class GrowthModel:
 
     def velocity(self, t: float, x: ArrayLike) -> FloatArray:
         """dx/dt without constraints, for any x (negative ones included): the field of a phase portrait."""
-        x = np.asarray(x, dtype=np.float64)
+        x = numbers(x, "x")
         return self.drift(Populations(t, x, np.full_like(x, np.nan)))
 
     def take(self, lanes: NDArray[np.intp]) -> GrowthModel:
@@ -151,11 +149,11 @@ class GrowthModel:
 def evaluate(function: OfState, p: Populations, n: int, vectorized: bool, what: str) -> FloatArray:
     """A user's function at one state or, column by column, at many."""
     if p.x.ndim == 1 or vectorized:
-        value = np.asarray(function(p.time, p.x), dtype=np.float64)  # type: ignore[arg-type]
+        value = numbers(function(p.time, lent(p.x)), what)  # type: ignore[arg-type]
     else:
         times = np.broadcast_to(p.time, p.x.shape[1:])
         value = np.stack(
-            [np.asarray(function(float(t), x), dtype=np.float64) for t, x in zip(times, p.x.T, strict=True)], axis=-1
+            [numbers(function(float(t), lent(x)), what) for t, x in zip(times, p.x.T, strict=True)], axis=-1
         )
     shape = p.x.shape if n else p.x.shape[1:]
     if value.shape != shape:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.errors import InputError
 from kcons.growth.model import FloatArray, GrowthModel
 
@@ -29,14 +30,12 @@ class Logistic(GrowthModel):
 
     def exact(self, t: ArrayLike, x0: float) -> FloatArray:
         """x(t) (notes eq. 66), written with exp(-alpha t), which does not overflow."""
-        decayed = np.exp(-self.alpha * np.asarray(t, dtype=np.float64))
-        return np.asarray(
-            self.alpha * x0 / (self.alpha * decayed - self.beta * x0 * np.expm1(-self.alpha * np.asarray(t)))
-        )
+        exponent = -self.alpha * numbers(t, "t")
+        return np.asarray(self.alpha * x0 / (self.alpha * np.exp(exponent) - self.beta * x0 * np.expm1(exponent)))
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (1, 1)."""
-        return np.asarray([[self.alpha - 2.0 * self.beta * np.asarray(x, dtype=np.float64)[0]]])
+        return np.asarray([[self.alpha - 2.0 * self.beta * numbers(x, "x")[0]]])
 
 
 class LotkaVolterra(GrowthModel):
@@ -67,25 +66,25 @@ class LotkaVolterra(GrowthModel):
 
     def invariant(self, x: ArrayLike) -> FloatArray:
         """G, constant along every solution (notes eq. 73); x of shape (2,) or (2, k)."""
-        x = np.asarray(x, dtype=np.float64)
+        x = numbers(x, "x")
         prey, predators = x[0] / self.equilibrium[0], x[1] / self.equilibrium[1]
         return np.asarray(self.alpha1 * (predators - np.log(predators)) + self.beta2 * (prey - np.log(prey)))
 
     def invariant_gradient(self, x: ArrayLike) -> FloatArray:
         """dG/dx, shape of x."""
-        x = np.asarray(x, dtype=np.float64)
+        x = numbers(x, "x")
         return np.stack([self.alpha2 - self.beta2 / x[0], self.beta1 - self.alpha1 / x[1]])
 
     def jacobian(self, t: float, x: ArrayLike) -> FloatArray:
         """dV/dx, shape (2, 2) (notes eq. 75)."""
-        x1, x2 = np.asarray(x, dtype=np.float64)
+        x1, x2 = numbers(x, "x")
         return np.array(
             [[self.alpha1 - self.beta1 * x2, -self.beta1 * x1], [self.alpha2 * x2, self.alpha2 * x1 - self.beta2]]
         )
 
     def divergence(self, x: ArrayLike) -> FloatArray:
         """div V = (alpha_1 - beta_1 x_2) - (beta_2 - alpha_2 x_1) (notes eq. 72)."""
-        x = np.asarray(x, dtype=np.float64)
+        x = numbers(x, "x")
         return np.asarray((self.alpha1 - self.beta1 * x[1]) - (self.beta2 - self.alpha2 * x[0]))
 
 

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.errors import ConstraintError, InputError
 from kcons.growth.model import FloatArray, OfState, Populations, evaluate
 
@@ -167,7 +168,7 @@ class LinearRow(HolonomicRow):
         *,
         name: str = "linear row",
     ) -> None:
-        c = np.array(coefficients, dtype=np.float64)
+        c = numbers(coefficients, "coefficients").copy()
         if c.ndim != 1 or not np.all(np.isfinite(c)) or not np.any(c):
             raise InputError(f"{name}: give n finite coefficients that are not all zero", item="coefficients")
         self.coefficients: FloatArray = c
@@ -243,7 +244,7 @@ class VelocityRow(Row):
     def gradient(self, p: Populations) -> FloatArray:
         if callable(self._coefficients):
             return evaluate(self._coefficients, p, len(p.x), self.vectorized, f"coefficients of {self.name}")
-        c = np.asarray(self._coefficients, dtype=np.float64)
+        c = numbers(self._coefficients, "coefficients")
         if c.shape != (len(p.x),):
             raise InputError(f"{self.name}: {c.shape} coefficients for {len(p.x)} species", item="coefficients")
         return np.broadcast_to(c.reshape(-1, *(1,) * (p.x.ndim - 1)), p.x.shape)

@@ -48,7 +48,7 @@ class Isokinetic:
     kinetic_energy : Quantity or float, optional
         K itself, in kJ/mol if a float. With neither, K stays what it is at the first step.
     convention : {'exact', 'notes'}
-        2K = (g - 1) kT, or 2K = 3 n kT of the notes (eq. 112) for n particles with a mass.
+        2K = (g - 1) kT, or 2K = 3 n kT of the notes (eq. 111) for n particles with a mass.
     atoms : array_like of int or bool, optional
         Thermostat these only. No constraint may couple them to others.
     momentum : {'auto', 'conserved', 'free'}

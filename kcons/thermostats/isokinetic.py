@@ -85,7 +85,7 @@ class Isokinetic(Splitting):
     order : {2, 4, 6}
         1, 6 and 10 force evaluations a step.
     convention : {'exact', 'notes'}
-        2K = (g - 1) k_B T, or 2K = 3 n k_B T of the notes (eq. 112), n atoms that can move; their configurations are
+        2K = (g - 1) k_B T, or 2K = 3 n k_B T of the notes (eq. 111), n atoms that can move; their configurations are
         hotter than T.
     atoms : array_like of int or bool, optional
         Thermostat these only. No row may couple them to others.

@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.flows import DampedOscillator, Flow, Pendulum, jacobian_by_differences, phase_volume
+from kcons.flows import (
+    DampedOscillator,
+    Flow,
+    ParticleOnSphere,
+    Pendulum,
+    Thermostat,
+    action,
+    hamiltonian,
+    jacobian_by_differences,
+    momentum,
+    phase_volume,
+)
 from kcons.growth import LotkaVolterra
 
 
@@ -26,6 +37,19 @@ def test_jacobian_by_differences():
     assert jacobian_by_differences(own, 0.5, X) == pytest.approx(own_jacobian(0.5, X), abs=1e-11)
     assert Flow(own, 2).jacobian(0.5, X) == pytest.approx(Flow(own, 2, own_jacobian).jacobian(0.5, X), abs=1e-11)
     assert Flow(own, 2).divergence(0.5, X) == pytest.approx(np.sin(-1.2) + 0.05, abs=1e-11)
+
+
+def test_jacobians_by_differences_know_their_error():
+    rng = np.random.default_rng(1)
+    for X in rng.normal(size=(20, 2)):
+        off = abs(Flow(own, 2).jacobian(0.5, X) - own_jacobian(0.5, X))
+        error = Flow(own, 2).jacobian_error(0.5, X)
+        assert np.all(off <= error)
+        assert np.all(error < 1e-9)
+    assert not Flow(own, 2, own_jacobian).jacobian_error(0.5, X).any()
+    # Waves shorter than the steps: nothing is known, and said so.
+    rough = Flow(lambda t, X: [np.sin(1e3 * X[0])], 1)
+    assert abs(rough.jacobian(0.0, [0.1])[0, 0] - 1e3 * np.cos(100.0)) < rough.jacobian_error(0.0, [0.1])[0, 0]
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -82,6 +106,20 @@ def test_time_dependent_trajectory():
         lambda: Flow(lambda t, X: [1.0], 2).velocity(0.0, [1.0, 1.0]),
         lambda: Flow(own, 2, lambda t, X: [1.0]).jacobian(0.0, [1.0, 1.0]),
         lambda: phase_volume(Flow(own, 2), [1.0, 1.0], [0.0, 1.0, 0.5]),
+        # What a conversion to float64 would drop: imaginary parts and masks.
+        lambda: Flow(own, 2).velocity(0.0, [1.0, 1j]),
+        lambda: Flow(own, 2).solve((0.0, 1.0), np.ma.masked_array([1.0, 1.0], mask=[0, 1])),
+        lambda: Flow(lambda t, X: X * 1j, 2).velocity(0.0, [1.0, 1.0]),
+        lambda: Flow(lambda t, X: X * 1j, 2).jacobian(0.0, [1.0, 1.0]),
+        lambda: Flow(own, 2, lambda t, X: 1j * np.eye(2)).jacobian(0.0, [1.0, 1.0]),
+        lambda: Thermostat([1.0, 1.0 + 1j], lambda x: -x),
+        lambda: Thermostat([1.0, 1.0], lambda x: 1j * x).friction([1.0, 0.0, 1.0, 0.0]),
+        lambda: Thermostat([1.0, 1.0], lambda x: -x).state([1.0, 0.0], [1.0, 1j]),
+        lambda: ParticleOnSphere().acceleration([1.0, 0.0, 0.0], [0.0, 1j, 0.0]),
+        lambda: ParticleOnSphere(force=lambda x: 1j * x).acceleration([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        lambda: action(lambda q, v, t: 0.0, [0.0, 1.0], [[0.0], [1j]]),
+        lambda: momentum(lambda q, v, t: 0.0, [1j], [0.0]),
+        lambda: hamiltonian(lambda q, v, t: 0.5 * v[0] ** 2, [0.0], [1j]),
     ],
 )
 def test_bad_input_is_refused(act):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import ConvergenceError, InputError
-from kcons.flows import HamiltonianFlow, Pendulum
+from kcons.flows import DampedOscillator, Flow, HamiltonianFlow, Pendulum, hamiltonian, phase_volume
 
 J = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
@@ -73,6 +73,86 @@ def test_hamiltonian_that_is_not_separable():
     assert np.concatenate([back.q[-1], back.p[-1]]) == pytest.approx([0.5, 0.2, 0.3, -0.4], abs=1e-10)
 
 
+OMEGA, ETA = 1.3, 0.2
+
+
+def damped():
+    """Caldirola's and Kanai's H: in p = e^(eta t) dq/dt it has the motion of an oscillator with friction."""
+    return HamiltonianFlow(
+        lambda q, p, t: np.exp(-ETA * t) * p[0] ** 2 / 2 + np.exp(ETA * t) * OMEGA**2 * q[0] ** 2 / 2,
+        1,
+        lambda q, p, t: np.exp(ETA * t) * OMEGA**2 * q,
+        lambda q, p, t: np.exp(-ETA * t) * p,
+        separable=True,
+        time_dependent=True,
+    )
+
+
+def with_friction(t, q, v):
+    """q and dq/dt after t, by the closed form of the damped oscillator: its variables are Omega q and dq/dt."""
+    x1, x2 = DampedOscillator(OMEGA, ETA).closed_form(t) @ [OMEGA * q, v]
+    return x1 / OMEGA, x2
+
+
+@pytest.mark.parametrize(("method", "order"), [("leapfrog", 2), ("suzuki4", 4), ("gauss6", 6)])
+def test_order_where_the_hamiltonian_depends_on_time(method, order):
+    flow, t0, T = damped(), 0.7, 4.0
+    q, v = with_friction(T, 1.2, 0.4)
+    errors = []
+    steps = np.array([20, 40, 80]) // (2 if method == "gauss6" else 1)
+    for n in steps:
+        found = flow.symplectic(1.2, 0.4 * np.exp(ETA * t0), T / n, n, method, t0=t0)
+        assert found.t == pytest.approx(t0 + np.arange(n + 1) * T / n)
+        errors.append(np.hypot(found.q[-1, 0] - q, found.p[-1, 0] * np.exp(-ETA * (t0 + T)) - v))
+    slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.25)
+    # Taken back, a step ends where it began.
+    back = flow.symplectic(found.q[-1], found.p[-1], -T / n, n, method, t0=t0 + T)
+    assert back.q[-1] == pytest.approx([1.2], abs=1e-11)
+
+
+def test_flow_of_a_hamiltonian_that_depends_on_time():
+    flow = damped()
+    plain = HamiltonianFlow(flow.hamiltonian, 1, time_dependent=True)
+    X = np.array([0.8, -0.5])
+    for t in (0.0, 1.5):
+        assert plain.velocity(t, X) == pytest.approx(flow.velocity(t, X), abs=1e-10)
+        wanted = [np.exp(-ETA * t) * -0.5, -np.exp(ETA * t) * OMEGA**2 * 0.8]
+        assert flow.velocity(t, X) == pytest.approx(wanted, rel=1e-14)
+        assert flow.energy(X, t) == pytest.approx(flow.hamiltonian(X[:1], X[1:], t))
+    # In phase space of (q, p) the volume is kept, though friction takes it from (q, dq/dt).
+    assert phase_volume(flow, X, [0.0, 5.0]).log_volume[-1] == pytest.approx(0.0, abs=1e-9)
+    # (51): along a trajectory H changes by its own change in time, dH/dt = -dL/dt.
+    found = flow.solve((0.0, 2.0), X, t_eval=[0.999, 1.0, 1.001])
+    slope = np.diff([flow.energy(X, t) for X, t in zip(found.y.T, found.t, strict=True)][::2])[0] / 0.002
+    q, p = found.y[:, 1]
+    own = 0.5 * ETA * (-np.exp(-ETA) * p**2 + np.exp(ETA) * OMEGA**2 * q**2)
+    assert slope == pytest.approx(own, rel=1e-5)
+
+    def lagrangian(q, v, t):
+        return np.exp(ETA * t) * (v[0] ** 2 - OMEGA**2 * q[0] ** 2) / 2
+
+    v, h = np.exp(-ETA) * p, 1e-4
+    dL = (lagrangian([q], [v], 1 + h) - lagrangian([q], [v], 1 - h)) / (2 * h)
+    assert slope == pytest.approx(-dL, rel=1e-5)
+    # From the Lagrangian, all by differences.
+    made = HamiltonianFlow(lambda q, p, t: hamiltonian(lagrangian, q, p, t), 1, time_dependent=True)
+    assert made.velocity(1.0, found.y[:, 1]) == pytest.approx(flow.velocity(1.0, found.y[:, 1]), abs=1e-6)
+
+
+def test_user_functions_cannot_change_the_state():
+    def push(t, X):
+        X[0] += 1.0
+        return X
+
+    with pytest.raises(ValueError, match="read-only"):
+        Flow(push, 2).solve((0.0, 1.0), [1.0, 0.0])
+    with pytest.raises(ValueError, match="read-only"):
+        Flow(lambda t, X: X, 2, push).jacobian(0.0, [1.0, 0.0])
+    with pytest.raises(ValueError, match="read-only"):
+        HamiltonianFlow(lambda q, p: 0.0, 1, lambda q, p: push(0.0, q), lambda q, p: p).symplectic(1.0, 0.0, 0.1, 1)
+
+
 def test_bad_input_is_refused():
     with pytest.raises(InputError, match="degree"):
         HamiltonianFlow(coupled, 0)
@@ -83,5 +163,9 @@ def test_bad_input_is_refused():
         flow.symplectic([0.0, 0.0], [0.0, 0.0], 0.1, 1, "euler")
     with pytest.raises(InputError, match="dt"):
         flow.symplectic([0.0, 0.0], [0.0, 0.0], 0.0, 1)
+    with pytest.raises(InputError, match="t0"):
+        flow.symplectic([0.0, 0.0], [0.0, 0.0], 0.1, 1, t0=np.nan)
+    with pytest.raises(InputError, match="complex"):
+        flow.symplectic([0.0, 1j], [0.0, 0.0], 0.1, 1)
     with pytest.raises(ConvergenceError, match="smaller"):
         HamiltonianFlow(lambda q, p: float(p[0] ** 2 + q[0] ** 4), 1).symplectic(30.0, 0.0, 1.0, 1)

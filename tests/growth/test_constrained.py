@@ -134,6 +134,19 @@ def test_time_dependent_rows_are_followed():
     assert held[5:-5] == pytest.approx(0.05 * np.cos(t[5:-5]), abs=2e-5)
 
 
+def test_values_stay_along_the_velocity_of_the_rows():
+    # d sigma/dt = A v - b = 0 (129, 130), by differences in time and along v: b has the sign that goes with A.
+    moving = LinearRow([1.0, 0.0, 2.0, 0.0], lambda t: (1.0 + 0.3 * t**2, 0.6 * t), name="moving target")
+    system = ConstrainedGrowth(make().model, [moving, make().rows[1]])
+    t, h = 0.4, 1e-4
+    v = system.velocity(t, X)
+    bound = [row.bind(Populations.from_values(t, X)) for row in system.rows]
+    for row in bound:
+        ends = [float(row.value(Populations.from_values(t + s * h, X + s * h * v))) for s in (1, -1)]
+        assert abs(row.rate(Populations.from_values(t, X))) > 0.1
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(0.0, abs=1e-8)
+
+
 def test_literal_formulas_are_for_one_system():
     with pytest.raises(InputError, match="one system"):
         make().constrained_inverse(0.0, np.ones((4, 2)))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
 from kcons.growth import Hypercycle, NoProduction, Populations, PrescribedProduction, Relaxation, entropy_balance, solve
@@ -54,6 +55,26 @@ def test_entropy_produced_is_the_integral_of_its_rate(law):
     assert balance.prescribed == pytest.approx(wanted, abs=1e-14)
     assert balance.lost == pytest.approx(wanted, abs=1e-13)
     assert balance.integrated == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize("law", ["relaxation", "none"])
+def test_entropy_produced_inside_and_exchanged(law):
+    # (145): dS = dS_int + dS_ext, along the trajectory, with the rates of (142) and z of (153) written out.
+    model = Hypercycle()
+    system = model.with_entropy_production(3.0) if law == "relaxation" else model.without_entropy_production()
+    found = solve(system, (0.0, 4.0), X0, dense_output=True)
+    balance = entropy_balance(found, nodes=5)
+    t = np.linspace(0.0, 4.0, 4001)
+    x = found.sol(t)
+    mu = (0.1 + 0.05 * np.arange(1, 6))[:, None] + np.log(x / x.sum(axis=0))
+    inside = -np.sum(mu * 3.0 * x * np.roll(x, -1, axis=0), axis=0)
+    outside = -np.sum(mu * x * np.stack([system.constraint_rates(s, v) for s, v in zip(t, x.T, strict=True)]).T, axis=0)
+    assert balance.reactions == pytest.approx(simpson(inside, x=t), abs=1e-7)
+    assert balance.exchanged == pytest.approx(simpson(outside, x=t), abs=1e-7)
+    assert abs(balance.exchanged) > 0.1
+    # What an open system produces it gives away; what a closed one produces is the sum.
+    total = 0.0 if law == "none" else BUDGET * -np.expm1(-4.0 / 3.0)
+    assert balance.reactions + balance.exchanged == pytest.approx(total, abs=1e-9)
 
 
 def test_balance_needs_a_row_and_an_interpolant():

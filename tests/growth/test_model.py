@@ -49,11 +49,29 @@ def test_sources_lift_tiny_populations():
         ([0.5, np.nan], "not finite"),
         ([[[1.0]]], "shape"),
         (["a"], "array of numbers"),
+        ([0.5, 0.5 + 1e-3j], "complex"),
+        (np.ma.masked_array([0.5, 0.5], mask=[0, 1]), "masked"),
     ],
 )
 def test_bad_populations_are_refused(x0, words):
     with pytest.raises(InputError, match=words):
         Populations.from_values(0.0, x0)
+
+
+def test_functions_cannot_change_the_populations_or_return_complex_rates():
+    def feeding(t, x):
+        x[0] += 1.0
+        return x
+
+    for model in (GrowthModel(feeding, n=2), GrowthModel(feeding, n=2, vectorized=True)):
+        x = np.array([1.0, 2.0])
+        with pytest.raises(ValueError, match="read-only"):
+            model.velocity(0.0, x)
+        assert x.tolist() == [1.0, 2.0]
+        with pytest.raises(ValueError, match="read-only"):
+            model.velocity(np.zeros(3), np.ones((2, 3)))
+    with pytest.raises(InputError, match="complex"):
+        GrowthModel(lambda t, x: x * 1j, n=2).velocity(0.0, [1.0, 1.0])
 
 
 def test_bad_models_are_refused():

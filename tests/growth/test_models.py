@@ -68,6 +68,28 @@ def test_lotka_volterra_derivatives():
     assert model.velocity(0.0, model.equilibrium) == pytest.approx([0.0, 0.0], abs=1e-15)
 
 
+def test_lotka_volterra_with_four_different_parameters():
+    # Each parameter at its own place in (69)-(77), none equal to another.
+    model = LotkaVolterra(alpha1=1.1, beta1=0.4, alpha2=0.25, beta2=0.7)
+    assert model.equilibrium == pytest.approx([0.7 / 0.25, 1.1 / 0.4], rel=1e-15)
+    x = np.array([2.0, 3.0])
+    assert model.velocity(0.0, x) == pytest.approx([2.0 * (1.1 - 0.4 * 3.0), -3.0 * (0.7 - 0.25 * 2.0)], rel=1e-14)
+    assert model.velocity(0.0, model.equilibrium) == pytest.approx([0.0, 0.0], abs=1e-15)
+    h = 1e-6
+    columns = [(model.velocity(0.0, x + h * e) - model.velocity(0.0, x - h * e)) / (2 * h) for e in np.eye(2)]
+    assert model.jacobian(0.0, x) == pytest.approx(np.stack(columns, axis=1), abs=1e-9)
+    assert model.divergence(x) == pytest.approx(np.trace(model.jacobian(0.0, x)), rel=1e-14)
+    # (77): the corners of the Jacobian there, and what their product is.
+    centre = model.jacobian(0.0, model.equilibrium)
+    assert centre == pytest.approx(np.array([[0.0, -0.4 * 0.7 / 0.25], [1.1 * 0.25 / 0.4, 0.0]]), abs=1e-15)
+    assert centre[0, 1] * centre[1, 0] == pytest.approx(-1.1 * 0.7, rel=1e-14)
+    # (73): G is stationary there, and constant along the flow.
+    assert model.invariant_gradient(model.equilibrium) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert model.invariant_gradient(x) @ model.velocity(0.0, x) == pytest.approx(0.0, abs=1e-14)
+    slopes = [(model.invariant(x + h * e) - model.invariant(x - h * e)) / (2 * h) for e in np.eye(2)]
+    assert model.invariant_gradient(x) == pytest.approx(slopes, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     "make", [lambda: Logistic(0.0), lambda: Logistic(1.0, -1.0), lambda: LotkaVolterra(beta2=np.nan)]
 )

@@ -98,6 +98,20 @@ def test_great_circles_only_where_every_row_allows_them() -> None:
         assert circles(*rows) is None
 
 
+def test_great_circles_end_on_the_sphere_wherever_they_start() -> None:
+    """What rounding, or a start within the tolerance, left off the sphere is gone after any drift: |x - c| = R."""
+    center = np.array([0.3, -0.2, 0.1])
+    on = center + 2.0 * np.array([[0.6, 0.0, 0.8]])
+    system = system_of([Sphere(0, center, 2.0)], on, [2.0])
+    circles = GreatCircles.of(system.motion)
+    state = system.initial_state(on, [[0.8, 0.5, -0.6]])
+    for off in (1e-7, -1e-10):
+        start = type(state)(on + off * (on - center), state.velocities)
+        for h in (1e-6, 0.4):
+            at, _ = flown(circles, system, start, h)
+            assert abs(np.linalg.norm(at[0] - center) - 2.0) <= 4 * np.spacing(2.0)
+
+
 def test_great_circles_absorb_velocities_along_the_radius() -> None:
     x = np.array([[1.0, 0.0, 0.0]])
     system = system_of([Sphere(0, [0, 0, 0], 1.0)], x, [2.0])
