@@ -2,16 +2,21 @@
 
 A constraint can be told to be kept only to the precision of the file. Formats store a fixed number of decimals
 (XTC, PDB, GRO: a grid) or numbers in single precision (DCD, TRR, NetCDF, H5MD: a part in 2^24 of the coordinate).
+The latter is a matter of every single coordinate: an atom that is far away makes no other one less precise.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
@@ -20,6 +25,8 @@ _NANOMETRES = {"TRR", "H5MD", "TNG"}
 _DECIMALS = {"PDB": 3, "ENT": 3, "PDBQT": 3, "XPDB": 3, "PQR": 3, "TRJ": 3, "MDCRD": 3, "CRDBOX": 3, "CRD": 5}
 #: Magic numbers of XTC; files of the second hold more than 2^31 bytes a frame.
 XTC_MAGIC = (1995, 2023)
+#: Half the distance of neighbouring single precision numbers is at most this part of the power of two below them.
+HALF_UNIT = 2.0**-24
 
 
 @dataclass(frozen=True)
@@ -43,20 +50,53 @@ class FilePrecision:
     unit: float = 1.0
     exact: bool = False
 
-    def half_step(self, largest: float) -> float:
-        """Largest error of a coordinate by rounding, where the largest coordinate is `largest`, in angstrom."""
-        singles = 0.5 * float(np.spacing(np.float32(largest)))
-        if self.step > 0:
-            return 0.5 * self.step + (0.0 if self.exact else 2 * singles)
-        if self.unit != 1.0:
-            return singles + 0.5 * self.unit * float(np.spacing(np.float32(largest / self.unit)))
-        return singles
+    @property
+    def grid(self) -> float:
+        """Steps of coordinates that can be had back exactly, in angstrom; 0 if they cannot."""
+        return self.step if self.exact else 0.0
+
+    @property
+    def reach(self) -> float:
+        """Coordinates from this one on, in angstrom, are not told by the step alone: single precision counts.
+
+        Integers of XTC are turned into nanometres, and these into angstrom, with four roundings; they can be had back
+        where these make less than half a step.
+        """
+        return self.step / (8 * HALF_UNIT) if self.exact else 0.0
+
+    def coefficients(self, farthest: float) -> tuple[float, float]:
+        """Error of a coordinate x by rounding: at most base + factor 2^e, where 2^e <= |x| < 2^(e+1).
+
+        Parameters
+        ----------
+        farthest : float
+            No coordinate of the frame is larger, in angstrom.
+
+        Returns
+        -------
+        base, factor : float
+        """
+        if self.exact:
+            # Where a number of the grid cannot be had back, the one taken for it is off by twice the four roundings.
+            return 0.5 * self.step, 0.0 if farthest < self.reach else 16 * HALF_UNIT
+        # Rounded once, as stored; then, of decimals or nanometres, by the change to angstrom, where 2^e may be twice
+        # that of the number stored.
+        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
+
+    def half_step(self, coordinates: ArrayLike) -> FloatArray:
+        """Largest error by rounding of each coordinate, in angstrom; infinite where there is no number."""
+        size = np.abs(np.asarray(coordinates, dtype=np.float64))
+        base, factor = self.coefficients(float(size.max(initial=0.0)))
+        exponents = np.frexp(size)[1] - 1
+        with np.errstate(all="ignore"):
+            result: FloatArray = base + factor * np.where(size > 0, np.ldexp(1.0, exponents), 0.0)
+        return np.where(np.isfinite(size), result, np.inf)
 
     def describe(self, largest: float) -> str:
-        """One sentence for a person."""
+        """One sentence for a person, for a frame whose largest coordinate is `largest`."""
         if self.step > 0:
             return f"{self.format} stores coordinates in steps of {self.step:.3g} Å ({self.step / 10:.3g} nm)"
-        step = 2 * self.half_step(largest)
+        step = 2 * float(self.half_step(largest))
         return (
             f"{self.format} stores coordinates in single precision: steps of {step:.1e} Å where coordinates reach "
             f"{largest:.0f} Å"
@@ -85,7 +125,8 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
             raise InputError(f"the precision is {step}; give a positive step in angstrom, such as 0.001", item="step")
         return FilePrecision(name, float(step))
     if name == "XTC":
-        per_nanometre = _xtc_precision(path)
+        with open(path, "rb") as file:
+            per_nanometre = _xtc_precision(file)
         return (
             FilePrecision(name, 10.0 / per_nanometre, exact=True) if per_nanometre else FilePrecision(name, unit=10.0)
         )
@@ -98,10 +139,29 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
     return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
 
 
-def _xtc_precision(path: str | Path) -> float:
-    """Steps in a nanometre, from the first frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
+def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
+    """Precision of each frame of an XTC file that was put together from several; None where all have the usual one.
+
+    Parameters
+    ----------
+    path : path
+    offsets : sequence of int
+        Where frames begin.
+    usual : FilePrecision
+        Of the first one.
+    """
     with open(path, "rb") as file:
-        head = file.read(60)
+        found = [_xtc_precision(file, int(offset)) for offset in offsets]
+    if len(set(found)) < 2:
+        return None
+    kinds = {steps: replace(usual, step=10.0 / steps, exact=True) if steps else usual for steps in set(found)}
+    return [kinds[steps] for steps in found]
+
+
+def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
+    """Steps in a nanometre, from a frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
+    file.seek(offset)
+    head = file.read(60)
     if len(head) < 60:
         return 1000.0
     magic, n_atoms = struct.unpack(">2i", head[:8])
