@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
-from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
@@ -21,24 +20,24 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.dcd import PlainDcd, plain_dcd
 from kcons.mdanalysis.deviations import UNITS, Deviations
+from kcons.mdanalysis.endings import intact_frames, last_offset, leftover
 from kcons.mdanalysis.findings import (
-    BOLTZMANN,
     Part,
     by_unit,
     gaps_of,
     joined,
     rms_of,
     row_result,
-    temperature_of,
     verdict_of,
 )
-from kcons.mdanalysis.loading import READ_ERRORS, format_of, intact_frames, last_offset, leftover, quiet
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
 from kcons.mdanalysis.names import AtomNames
-from kcons.mdanalysis.precision import FilePrecision, by_frame, precision_of
+from kcons.mdanalysis.precision import FilePrecision, by_frame, described, precision_of
 from kcons.mdanalysis.rank import rank_of
 from kcons.mdanalysis.result import Break, CheckResult
 from kcons.mdanalysis.rows import SECOND_ORDER, RowTable, cell_matrix, size_of
 from kcons.mdanalysis.targets import TargetFile
+from kcons.mdanalysis.temperature import BOLTZMANN, masses_of, temperature_of
 from kcons.mdanalysis.workers import inherited, short_pickle, with_backend
 from kcons.solvers.frames import coordinate_grid, farthest, kinetic
 
@@ -136,8 +135,11 @@ class ConstraintCheck(AnalysisBase):
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         self._labels = AtomNames(universe)
-        self._remarks: list[str] = []
-        self._masses = self._find_masses(universe, given)
+        self.remarks: list[str] = []
+        self._unit_masses = np.ones(len(universe.atoms))
+        self._masses, reason = masses_of(universe, given, self._labels)
+        if reason:
+            self.remarks.append(f"no temperature: {reason}")
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
             given, self.target_text = tuple(file.apply(given, self._labels)), str(file.path)
@@ -161,40 +163,12 @@ class ConstraintCheck(AnalysisBase):
         if getattr(reader, "transformations", ()):
             # What a transformation did to the coordinates no longer lies on the grid of the file.
             self._precision = FilePrecision(self._format, self._precision.step, self._precision.unit)
-            self._remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+            self.remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
         self._by_frame = None
         if self._precision.exact and precision is None:
             self._by_frame = by_frame(self._path, reader._xdr.offsets, self._precision)
         self._pass_of_means = False
         self._intact = reader.n_frames
-
-    def _find_masses(self, universe: Any, given: Sequence[Constraint]) -> FloatArray | None:
-        """Masses, or None where they cannot be used; says why."""
-        advice = "give a topology with masses, or universe.guess_TopologyAttrs(to_guess=['masses'])"
-        self._unit_masses = np.ones(len(universe.atoms))
-        used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        if len(used) and used[-1] >= len(universe.atoms):
-            raise InputError(
-                f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
-                item="constraints",
-                atoms=[int(used[-1])],
-            )
-        reason = ""
-        masses = np.zeros(0)
-        try:
-            masses = np.asarray(universe.atoms.masses, dtype=np.float64)
-        except (NoDataError, AttributeError):
-            reason = "the topology has no masses"
-        else:
-            bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
-            reason = f"{self._labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}" if len(bad) else ""
-        if not reason:
-            return masses
-        needing = next((item for item in given if item.uses_masses), None)
-        if needing is not None:
-            raise InputError(f"{needing!r} needs masses, but {reason}; {advice}", item="masses")
-        self._remarks.append(f"no temperature: {reason}; {advice}")
-        return None
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
@@ -230,7 +204,9 @@ class ConstraintCheck(AnalysisBase):
         self._bind(self._first(chosen))
         in_blocks = self._blocks_of() is not None
         # The compiled look at a block sees damage by itself.
-        self._intact = n_frames if in_blocks else intact_frames(self._path, self._format, n_frames)
+        self._intact = n_frames
+        if not in_blocks:
+            self._intact = intact_frames(self._path, self._format, n_frames, self._trajectory.n_atoms)
         options = with_backend(options, in_blocks)
         self._pass_of_means = self._mode == "mean"
         with inherited(self, options["backend"]):
@@ -294,7 +270,7 @@ class ConstraintCheck(AnalysisBase):
             try:
                 self._rank = first_use(lambda: rank_of(held, x))
             except KconsError as error:
-                self._remarks.append(f"no rank: {error}")
+                self.remarks.append(f"no rank: {error}")
         first_use(lambda: look_once(table, shot))
 
     def _precision_at(self, frame: int) -> FilePrecision:
@@ -406,7 +382,7 @@ class ConstraintCheck(AnalysisBase):
         for k, frame in enumerate(part.frames.tolist()):
             try:
                 if frame >= self._intact:
-                    raise OSError("its records are damaged")
+                    raise OSError("its records or lines are damaged")
                 ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
                 previous = frame
                 table.precision = self._precision_at(frame)
@@ -489,7 +465,7 @@ class ConstraintCheck(AnalysisBase):
         freedom, temperature = None, None
         if self._rank is not None:
             freedom, temperature, remarks = temperature_of(part, self._rank, masses, self._removed)
-            self._remarks.extend(remarks)
+            self.remarks.extend(remarks)
         series = {
             f"{name} {UNITS[unit]}": values[unit].tolist()
             for unit in range(len(UNITS))
@@ -513,7 +489,7 @@ class ConstraintCheck(AnalysisBase):
             verdict=verdict_of(
                 status, self._tolerance, worst[0], units, (int(violated.sum()), held.n_rows), frames, n_frames, gaps
             ),
-            precision=self._describe(part),
+            precision=described([self._precision_at(frame) for frame in part.frames.tolist()], part.reach),
             tolerance=self._tolerance,
             targets=self.target_text,
             frames=part.frames.tolist(),
@@ -530,16 +506,8 @@ class ConstraintCheck(AnalysisBase):
             broken=part.broken,
             series=series,
             gaps=gaps,
-            remarks=list(self._remarks),
+            remarks=list(self.remarks),
         )
-
-    def _describe(self, part: Part) -> str:
-        """Precision of the file, at the largest coordinate of a usual frame."""
-        steps = {self._precision_at(frame).step for frame in part.frames.tolist()}
-        if len(steps) > 1:
-            return f"{self._format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
-        reach = part.reach[np.isfinite(part.reach)]
-        return self._precision_at(int(part.frames[0])).describe(float(np.median(reach)) if len(reach) else 0.0)
 
 
 def _open_ended(start: int | None, stop: int | None, step: int | None, n_frames: int) -> bool:

@@ -14,11 +14,6 @@ from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.result import Break, RowResult, UnitResult, fitted
 from kcons.mdanalysis.rows import RowTable
 
-#: Boltzmann's constant in amu Å²/(ps² K).
-BOLTZMANN = 0.831446261815324
-#: Part of the kinetic energy that the centre of mass may have where its motion is removed.
-STILL = 1e-2
-
 
 @dataclass
 class Part:
@@ -195,45 +190,3 @@ def gaps_of(part: Part, from_frames: int, untold: int, what: str) -> list[str]:
             "told of these rows there"
         )
     return gaps
-
-
-def temperature_of(
-    part: Part, rank: int, masses: FloatArray, removed: int | None
-) -> tuple[int, dict[str, float] | None, list[str]]:
-    """Degrees of freedom, temperature where there are velocities and masses, and what to say about them.
-
-    Parameters
-    ----------
-    part : Part
-        All frames.
-    rank : int
-        Of the constraints.
-    masses : ndarray, shape (n_atoms,)
-    removed : int, optional
-        Degrees of freedom that the engine took away; found from the total momentum by default.
-    """
-    freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
-    twice = part.twice_kinetic
-    has = np.isfinite(twice)
-    if not has.any():
-        return max(freedom - (removed or 0), 0), None, []
-    remarks = []
-    if removed is None:
-        centre = np.einsum("ij,ij->i", part.momentum[has], part.momentum[has]) / masses.sum()
-        still = float(centre.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
-        removed = 3 if still and freedom > 3 else 0
-        what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
-        remarks.append(f"the centre of mass is {what}")
-    freedom -= removed
-    if freedom <= 0:
-        return 0, None, [*remarks, "no temperature: the constraints leave no degree of freedom"]
-    kelvin = twice / (BOLTZMANN * freedom)
-    line = fitted(part.times, kelvin)
-    temperature = {
-        "mean": float(np.nanmean(kelvin)),
-        "deviation": float(np.nanstd(kelvin)),
-        "frames": float(has.sum()),
-        "slope": line.slope if line else float("nan"),
-        "slope_error": line.error if line else float("nan"),
-    }
-    return freedom, temperature, remarks

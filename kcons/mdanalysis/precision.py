@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from MDAnalysis.lib.util import anyopen
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
@@ -139,6 +140,15 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
     return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
 
 
+def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
+    """Precision of frames, whose largest coordinates are `reach` or NaN, in a sentence; that of a usual frame."""
+    steps = {one.step for one in precisions}
+    if len(steps) > 1:
+        return f"{precisions[0].format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
+    known = reach[np.isfinite(reach)]
+    return precisions[0].describe(float(np.median(known)) if len(known) else 0.0)
+
+
 def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
     """Precision of each frame of an XTC file that was put together from several; None where all have the usual one.
 
@@ -173,16 +183,19 @@ def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
     return float(precision)
 
 
+def _third_line(path: str | Path) -> str:
+    """Of a text file, compressed or not."""
+    with anyopen(str(path), "rb") as file:
+        lines: list[bytes] = [file.readline() for _ in range(3)]
+    return lines[2].decode("ascii", "replace")
+
+
 def _gro_decimals(path: str | Path) -> int:
     """Columns are n + 5 wide for n decimals, so that two points are n + 5 apart."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [file.readline() for _ in range(3)]
-    points = [k for k, c in enumerate(lines[2]) if c == "."]
+    points = [k for k, c in enumerate(_third_line(path)) if c == "."]
     return points[1] - points[0] - 5 if len(points) > 1 else 3
 
 
 def _xyz_decimals(path: str | Path) -> int:
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [file.readline() for _ in range(3)]
-    words = lines[2].split()
+    words = _third_line(path).split()
     return len(words[1].partition(".")[2]) if len(words) > 3 and "e" not in words[1].lower() else 6
