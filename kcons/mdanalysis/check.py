@@ -440,8 +440,13 @@ class ConstraintCheck(AnalysisBase):
         table, held = self._table, self._table.set
         if part.broken is None and self._to_the_end:
             n = self._trajectory.n_frames
-            rest = leftover(self._path, self._format, n, self._trajectory.n_atoms, last_offset(self._trajectory))
-            part.broken = Break(n, rest) if rest else None
+            atoms, last = self._trajectory.n_atoms, last_offset(self._trajectory)
+            part.broken = leftover(self._path, self._format, n, atoms, last)
+            try:
+                with quiet():
+                    self._trajectory[n - 1]
+            except READ_ERRORS as error:
+                part.broken = part.broken or self._break(error, n - 1)
         violated = found.margins > 0
         beyond_file = found.margins + self._tolerance * table.sizes > 0
         # Targets that are nothing but rounding.

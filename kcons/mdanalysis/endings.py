@@ -15,10 +15,11 @@ import numpy as np
 from MDAnalysis.lib.util import anyopen
 
 from kcons.mdanalysis.precision import XTC_MAGIC
+from kcons.mdanalysis.result import Break
 
 
-def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> str:
-    """What lies behind the last whole frame: a frame that was cut off, or that cannot be read. '' if nothing does.
+def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> Break | None:
+    """What lies behind the last whole frame: a frame that was cut off, or that cannot be read; None if nothing does.
 
     Parameters
     ----------
@@ -36,19 +37,21 @@ def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, la
             end = _dcd_end(path, n_frames)
             announced = _dcd_announced(path)
             if end >= size and announced > n_frames:
-                return f"its header announces {announced} frames, and it has {n_frames}"
+                return Break(n_frames, f"its header announces {announced} frames, and it has {n_frames}")
         elif file_format == "XTC" and last_offset is not None:
             end = last_offset + _xtc_frame_size(path, last_offset)
         elif file_format == "TRR" and last_offset is not None:
             end = last_offset + _trr_frame_size(path, last_offset)
         else:
-            more = _lines(path, file_format, n_atoms)[1]
-            return f"{more} lines follow the last whole frame" if more > 0 else ""
+            whole, more = _lines(path, file_format, n_atoms)
+            return None if more <= 0 or whole is None else Break(whole, f"{more} lines follow the last whole frame")
     except (OSError, EOFError, struct.error) as error:
-        return f"its frames cannot be followed ({error})"
+        return Break(n_frames, f"its frames cannot be followed ({error})")
     if end < size:
-        return f"{size - end} bytes follow the last whole frame"
-    return ""
+        return Break(n_frames, f"{size - end} bytes follow the last whole frame")
+    if end > size:
+        return Break(n_frames - 1, f"its last frame lacks {end - size} bytes")
+    return None
 
 
 def intact_frames(path: str | Path, file_format: str, n_frames: int, n_atoms: int) -> int:

@@ -185,8 +185,8 @@ def gaps_of(part: Part, from_frames: int, untold: int, what: str) -> list[str]:
     frames = np.flatnonzero(unseen > 0)
     if len(frames):
         gaps.append(
-            f"coordinates are so large that their rounding exceeds the lengths of up to {unseen.max():.0f} of {n_rows} "
-            f"rows in {len(frames)} of {len(part.frames)} frames, from frame {part.frames[frames[0]]}: nothing can be "
-            "told of these rows there"
+            f"nothing can be told of up to {unseen.max():.0f} of {n_rows} rows in {len(frames)} of {len(part.frames)} "
+            f"frames, from frame {part.frames[frames[0]]}: coordinates are so large that their rounding exceeds the "
+            "lengths, or atoms coincide"
         )
     return gaps

@@ -364,12 +364,13 @@ class RowTable:
         here = coordinate_grid(x.reshape(-1, 3)[self._other_atoms], self.precision.grid)
         with np.errstate(all="ignore"):
             off = others.value(here, time)
-            if not np.isfinite(off).all():
+            if not np.isfinite(here).all():
                 self.refuse(x)
             slopes = others.jacobian(here, time)
-        rounding = self._rounding_of_others(slopes, self.precision.half_step(here))
-        clear = ~(rounding > np.maximum(self.sizes[rows], self._slack[rows]))
-        off = np.where(clear, off, 0.0)
+            rounding = self._rounding_of_others(slopes, self.precision.half_step(here))
+        # Where atoms coincide, an angle is no number, nor is its rounding.
+        clear = np.isfinite(off) & (rounding <= np.maximum(self.sizes[rows], self._slack[rows]))
+        off, rounding = np.where(clear, off, 0.0), np.where(np.isfinite(rounding), rounding, np.inf)
         size, known = np.abs(off), np.where(clear, rounding, 0.0)
         margin = size - rounding - self._slack[rows]
         new = margin > into.margins[rows]
@@ -388,7 +389,9 @@ class RowTable:
         if v is None:
             return
         speeds = v.reshape(-1, 3)[self._other_atoms].astype(np.float64)
-        rates = np.abs(slopes @ speeds.ravel() - others.velocity_target(here, time))
+        with np.errstate(all="ignore"):
+            rates = np.abs(slopes @ speeds.ravel() - others.velocity_target(here, time))
+        rates = np.where(clear, rates, 0.0)
         for unit in range(len(UNITS)):
             mine = self._other_units == unit
             if mine.any():
@@ -412,7 +415,7 @@ class RowTable:
         bad = self.set.touched[~np.isfinite(points[self.set.touched]).all(axis=1)]
         if len(bad):
             raise NonFiniteError(f"position of atom {bad[0]} is {points[bad[0]]}", item="position", atom=int(bad[0]))
-        raise NonFiniteError("a row is undefined: atoms coincide or are collinear", item="position")
+        raise NonFiniteError("a length is no number", item="position")
 
 
 def size_of(bits: Any) -> Any:

@@ -410,7 +410,8 @@ def length_rates(x, v, places, n_rows, limit, lattice, step):  # type: ignore[no
         along = dx * (np.float64(v[i]) - np.float64(v[j]))
         along += dy * (np.float64(v[i + 1]) - np.float64(v[j + 1]))
         along += dz * (np.float64(v[i + 2]) - np.float64(v[j + 2]))
-        rate = abs(along) / np.sqrt(dx * dx + dy * dy + dz * dz)
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        rate = abs(along) / length if length > 0.0 else 0.0
         squares += rate * rate
         if rate > worst:
             worst, row = rate, k
