@@ -23,6 +23,8 @@ COLOURS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete
 FILES = ("check.json", "check.png", "check.txt")
 #: Ticks on the axis of frames are numbers of frames where times say nothing.
 _NO_TIMES = "frame"
+#: Deviations that are this part of the largest, or less, are not drawn.
+_NOTHING = 1e-6
 
 
 def summary(result: CheckResult) -> str:
@@ -114,8 +116,10 @@ def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
     for axes, unit in zip(grid, result.units, strict=False):
         largest, rms, rounding = (result.series[f"{name} {unit.unit}"] for name in ("largest", "rms", "rounding"))
         if any(value > 0 for value in largest):
-            # A logarithm of 0 is no point of a line: of the frame that gives targets, for one.
-            axes.set_yscale("log", nonpositive="mask")
+            axes.set_yscale("log")
+        # The frame that gives targets is off by 0, or by the rounding of this program: no point of such a line.
+        least = _NOTHING * max(largest)
+        largest, rms = ([value if value > least else math.nan for value in values] for values in (largest, rms))
         axes.plot(x, largest, color="#D55E00", linewidth=1.0, marker="." if len(x) < 60 else "", label="largest")
         axes.plot(x, rms, color="#0072B2", linewidth=1.0, marker="." if len(x) < 60 else "", label="rms")
         # Rounding of the targets comes to that of each frame.
