@@ -71,8 +71,9 @@ class ConstraintCheck(AnalysisBase):
         1 rad for angles).
     precision : float, optional
         Step of the coordinates in the file, in angstrom, for formats where it cannot be known.
-    target_error : float
-        Rounding of the targets, in angstrom a coordinate; for 'given' targets that were measured in another file.
+    target_error : float or ndarray, shape (n_atoms,)
+        Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
+        measured in another file.
     removed : int, optional
         Degrees of freedom that the engine took away besides: 3 where it stops the centre of mass. Found from the
         total momentum by default.
@@ -90,11 +91,10 @@ class ConstraintCheck(AnalysisBase):
 
     Notes
     -----
-    Coordinates that were rounded by at most h_x each move a distance by at most the norm of the sum of both atoms' h,
-    which is 2 √3 h where all are alike, and any other row by Σ h_x |∂q/∂x| to first order. Each h is that of the
-    coordinate itself, in its frame. Targets that were read from a frame are rounded themselves, which about doubles the
-    bound. Velocities of leapfrog integrators belong to the middle of a step and are not tangent at the positions they
-    are stored with.
+    An atom whose coordinates were rounded by at most h each moves a distance by at most √3 h, both atoms by the sum,
+    and any other row by Σ h |∂q/∂x| to first order. h is that of the largest coordinate of the atom, in its frame.
+    Targets that were read from a frame are rounded themselves, which about doubles the bound. Velocities of leapfrog
+    integrators belong to the middle of a step and are not tangent at the positions they are stored with.
 
     Backends: serial, multiprocessing, dask, and threads for DCD files and rows that are all lengths
     (`run(backend=..., n_workers=...)`); of several workers, threads where they can be had, processes otherwise.
@@ -110,7 +110,7 @@ class ConstraintCheck(AnalysisBase):
         targets: Literal["given", "first", "mean"] | str | Path | TargetFile = "given",
         tolerance: float = 1e-4,
         precision: float | None = None,
-        target_error: float = 0.0,
+        target_error: float | FloatArray = 0.0,
         removed: int | None = None,
         rank: bool = True,
         worst: int = 10,
@@ -130,8 +130,11 @@ class ConstraintCheck(AnalysisBase):
             )
         if not (np.isfinite(tolerance) and tolerance >= 0):
             raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
-        if not (np.isfinite(target_error) and target_error >= 0):
-            raise InputError(f"target_error is {target_error}; give a length in angstrom", item="target_error")
+        errors = np.asarray(target_error, dtype=np.float64)
+        if errors.shape not in ((), (len(universe.atoms),)) or not (errors >= 0).all() or not np.isfinite(errors).all():
+            raise InputError(
+                f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
+            )
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         self._labels = AtomNames(universe)
@@ -150,7 +153,7 @@ class ConstraintCheck(AnalysisBase):
                 self._mode, "as given"
             )
         self._given = given
-        self._tolerance, self._target_error = float(tolerance), float(target_error)
+        self._tolerance, self._target_error = float(tolerance), np.broadcast_to(errors, len(universe.atoms))
         self._removed, self._wants_rank, self._n_worst = removed, rank, int(worst)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
@@ -262,7 +265,10 @@ class ConstraintCheck(AnalysisBase):
         # An error of 1 of each coordinate: the error of a row, at most and in the mean square.
         self._reach = np.where(is_length, 2 * np.sqrt(3.0), SECOND_ORDER * reach)
         self._spread = np.sqrt(squares / 3.0)
-        self._allow(np.where(self._measured, table.roundings(x, ts.dimensions, time), self._reach * self._target_error))
+        measured, told = (
+            table.errors_of(errors, x, ts.dimensions, time) for errors in (precision.half_step(x), self._target_error)
+        )
+        self._allow(np.where(self._measured, measured, told))
         shot = frame_of(ts, time, plain_dcd(self._trajectory) is not None)
         first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, precision, self._wants_rank))
         self._rank: int | None = None

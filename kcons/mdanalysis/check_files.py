@@ -82,8 +82,8 @@ def check_trajectory(
             )
         with quiet():
             reader = universe.trajectory
-            largest = float(np.abs(universe.atoms.positions).max(initial=0.0))
-            options["target_error"] = precision_of(topology, format_of(reader)).half_step(largest)
+            precision = precision_of(topology, format_of(reader))
+            options["target_error"] = precision.half_step(universe.atoms.positions)
         constraints, guessed = _rows(universe, constrain, held)
         load_trajectory(universe, trajectory, topology)
         given, text = "given", f"coordinates of {topology}"

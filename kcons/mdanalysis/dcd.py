@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.frames import farthest, lengths, triangles
+from kcons.solvers.frames import farthest, lengths, powers_below, triangles
 
 #: Bytes of a block: what stays in the cache of a core.
 BLOCK = 1 << 20
@@ -180,13 +180,14 @@ def plain_dcd(reader: Any) -> PlainDcd | None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _gather(words, begin, points):  # type: ignore[no-untyped-def]
-    """Coordinates of a frame, atom by atom."""
+def _gather(words, begin, points, powers):  # type: ignore[no-untyped-def]
+    """Coordinates of a frame, atom by atom; see `powers_below`."""
     n = len(points)
     values = words.view(np.float32)
     x, y, z = values[begin + 1 :], values[begin + n + 3 :], values[begin + 2 * n + 5 :]
     for a in range(n):
         points[a, 0], points[a, 1], points[a, 2] = x[a], y[a], z[a]
+    powers_below(points.reshape(-1), powers)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -194,6 +195,7 @@ def look_at(  # type: ignore[no-untyped-def]
     words,
     begin,
     points,
+    powers,
     first,
     summed_every,
     reach_every,
@@ -226,6 +228,8 @@ def look_at(  # type: ignore[no-untyped-def]
         See `Block`.
     points : ndarray of float32, shape (n_atoms, 3)
         Room; on return the last frame that was looked at.
+    powers : ndarray of float32, shape (n_atoms,)
+        Room.
     first, summed_every, reach_every, n_all : int
         Place of the first frame among n_all; one frame in how many counts in the sums by row, and in the reach.
     limits, lattices : ndarray, shape (n_frames,), (n_frames, 2, 3, 3)
@@ -249,7 +253,7 @@ def look_at(  # type: ignore[no-untyped-def]
     has_triangles, has_singles = corner_targets.shape[1] > 0, len(targets) > 0
     for f in range(len(words)):
         k = first + f
-        _gather(words[f], begin, points)
+        _gather(words[f], begin, points, powers)
         summed = k % summed_every == 0
         if np.isnan(limits[f]):
             return f
@@ -266,6 +270,7 @@ def look_at(  # type: ignore[no-untyped-def]
                 step,
                 base,
                 factor,
+                powers,
                 corner_margins,
                 corner_largest,
                 corner_sums,
@@ -282,6 +287,7 @@ def look_at(  # type: ignore[no-untyped-def]
                 step,
                 base,
                 factor,
+                powers,
                 margins,
                 largest,
                 sums_by_row,

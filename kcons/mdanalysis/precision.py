@@ -66,7 +66,7 @@ class FilePrecision:
         return self.step / (8 * HALF_UNIT) if self.exact else 0.0
 
     def coefficients(self, farthest: float) -> tuple[float, float]:
-        """Error of a coordinate x by rounding: at most base + factor 2^e, where 2^e <= |x| < 2^(e+1).
+        """Error by rounding: at most base + factor 2^e, with 2^e <= |x| < 2^(e+1) for an atom's largest coordinate.
 
         Parameters
         ----------
@@ -85,19 +85,29 @@ class FilePrecision:
         return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
 
     def half_step(self, coordinates: ArrayLike) -> FloatArray:
-        """Largest error by rounding of each coordinate, in angstrom; infinite where there is no number."""
-        size = np.abs(np.asarray(coordinates, dtype=np.float64))
+        """Largest error by rounding of the coordinates of atoms; infinite where there are no numbers.
+
+        Parameters
+        ----------
+        coordinates : array_like, shape (..., 3)
+            In angstrom.
+
+        Returns
+        -------
+        ndarray, shape (...)
+        """
+        size = np.abs(np.asarray(coordinates, dtype=np.float64)).max(axis=-1)
         base, factor = self.coefficients(float(size.max(initial=0.0)))
-        exponents = np.frexp(size)[1] - 1
         with np.errstate(all="ignore"):
-            result: FloatArray = base + factor * np.where(size > 0, np.ldexp(1.0, exponents), 0.0)
-        return np.where(np.isfinite(size), result, np.inf)
+            below = np.where(size > 0, np.ldexp(1.0, np.frexp(size)[1] - 1), 0.0)
+        result: FloatArray = np.where(np.isfinite(size), base + factor * below, np.inf)
+        return result
 
     def describe(self, largest: float) -> str:
         """One sentence for a person, for a frame whose largest coordinate is `largest`."""
         if self.step > 0:
             return f"{self.format} stores coordinates in steps of {self.step:.3g} Å ({self.step / 10:.3g} nm)"
-        step = 2 * float(self.half_step(largest))
+        step = 2 * float(self.half_step([largest]))
         return (
             f"{self.format} stores coordinates in single precision: steps of {step:.1e} Å where coordinates reach "
             f"{largest:.0f} Å"

@@ -18,12 +18,14 @@ from kcons.mdanalysis.deviations import UNITS, Deviations
 from kcons.mdanalysis.precision import FilePrecision
 from kcons.solvers.frames import (
     LANES,
+    UNIFORM,
     coordinate_grid,
     farthest,
     filled,
     length_rates,
     lengths,
     padded,
+    powers_below,
     triangles,
 )
 from kcons.solvers.lattice import NO_LATTICE
@@ -81,7 +83,7 @@ class RowTable:
         single[sides.ravel()] = False
         self._triangle_rows = self.length_rows[sides]
         corners = np.stack([self._pairs[sides[0], 0], self._pairs[sides[0], 1], self._pairs[sides[1], 1]])
-        self._corners = np.ascontiguousarray(3 * corners, dtype=np.uint32)
+        self._corners = np.ascontiguousarray(corners, dtype=np.uint32)
         self._triangle_targets = np.ascontiguousarray(wanted[sides])
         self._single_rows = self.length_rows[single]
         self._places, self._targets = padded(self._pairs[single], wanted[single])
@@ -90,7 +92,6 @@ class RowTable:
             self._others, self._other_atoms = constraint_set.subset(self.other_rows)
             self._other_units = self.units[self.other_rows]
         self.allow(np.zeros(constraint_set.n_rows))
-        self._forget()
 
     def allow(self, slack: FloatArray) -> None:
         """Say what each row may be off by, besides the rounding of its coordinates; shape (n_rows,)."""
@@ -99,7 +100,8 @@ class RowTable:
         self._single_slack = filled(slack[self._single_rows])
 
     def _forget(self) -> None:
-        """Begin anew."""
+        """Begin anew, with room of one's own."""
+        self._powers = np.zeros(self.set.n_atoms, dtype=np.float32)
         triangles, singles = self._triangle_targets.shape, self._targets.shape
         self._triangle_margins, self._margins = (np.full(n, -np.inf, np.float32) for n in (triangles, singles))
         self._triangle_largest, self._largest = (np.zeros(n, np.float32) for n in (triangles, singles))
@@ -111,27 +113,30 @@ class RowTable:
         return self._others is None
 
     def fresh(self) -> RowTable:
-        """One that shares all but what is changed while frames are looked at; each worker needs its own."""
+        """One that shares all but what is changed while frames are looked at; each worker needs its own to look."""
         other = copy.copy(self)
         other._box, other._dimensions = np.zeros((2, 3, 3)), ()
         other._forget()
         return other
 
-    def roundings(self, positions: FloatArray, dimensions: NDArray[np.float32] | None, time: float) -> FloatArray:
-        """What rounding of the coordinates of one frame makes of each row, at most, shape (n_rows,).
+    def errors_of(
+        self, errors: FloatArray, positions: FloatArray, dimensions: NDArray[np.float32] | None, time: float
+    ) -> FloatArray:
+        """What errors of the coordinates of one frame make of each row, at most, shape (n_rows,).
 
         Parameters
         ----------
+        errors : ndarray, shape (n_atoms,)
+            Of each coordinate of an atom, at most, in angstrom; see `FilePrecision.half_step`.
         positions : ndarray, shape (n_atoms, 3)
             In angstrom.
         dimensions : ndarray or None
             Lengths and angles of the cell.
         time : float
         """
-        errors = self.precision.half_step(positions)
         result = np.zeros(self.set.n_rows)
         i, j = self._pairs.T
-        result[self.length_rows] = np.linalg.norm(errors[i] + errors[j], axis=1)
+        result[self.length_rows] = np.sqrt(3.0) * (errors[i] + errors[j])
         if self._others is not None:
             lattice, limit = self.cell_of(dimensions)
             self._others.lattice = lattice if limit < np.inf else None
@@ -144,7 +149,7 @@ class RowTable:
     def _rounding_of_others(self, slopes: Any, errors: FloatArray) -> FloatArray:
         """First order, and some more; rows that hold velocities only have no position to be off."""
         others = cast(ConstraintSet, self._others)
-        result: FloatArray = np.where(others.holonomic, SECOND_ORDER * (abs(slopes) @ errors.ravel()), 0.0)
+        result: FloatArray = np.where(others.holonomic, SECOND_ORDER * (abs(slopes) @ np.repeat(errors, 3)), 0.0)
         return result
 
     # -- cell -----------------------------------------------------------------------------------
@@ -212,10 +217,13 @@ class RowTable:
             atom = int(np.argmin(np.isfinite(v.reshape(-1, 3)).all(axis=1)))
             raise NonFiniteError(f"velocity of atom {atom} is {v.reshape(-1, 3)[atom]}", item="velocity", atom=atom)
         if len(self.length_rows):
-            far = 0.0
-            if self.precision.exact:
-                far = size_of(farthest(x))
-            rounding = (self.precision.grid, *self.precision.coefficients(far))
+            far = size_of(farthest(x)) if self.precision.exact else 0.0
+            base, factor = self.precision.coefficients(far)
+            powers = UNIFORM
+            if factor > 0:
+                powers = self._powers
+                powers_below(x, powers)
+            rounding = (self.precision.grid, base, factor, powers)
             here, row = into.by_frame[0, :, k], -1
             if self._triangle_rows.size:
                 *found, side, triangle, coarsest, seen = triangles(
@@ -299,6 +307,7 @@ class RowTable:
             block.words,
             block.x,
             points,
+            self._powers,
             k,
             *every,
             into.n_frames,
@@ -340,14 +349,13 @@ class RowTable:
         return result
 
     def collect(self, into: Deviations) -> None:
-        """Put what was found by row where it belongs, and begin anew."""
+        """Put what was found by row where it belongs."""
         n = len(self._single_rows)
         for rows, margins, largest, sums in (
             (self._single_rows, self._margins[:n], self._largest[:n], self._sums[:, :n]),
             (self._triangle_rows, self._triangle_margins, self._triangle_largest, self._triangle_sums),
         ):
             into.margins[rows], into.largest[rows], into.by_row[:, rows] = margins, largest, sums
-        self._forget()
 
     def _look_at_others(
         self,

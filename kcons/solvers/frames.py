@@ -4,8 +4,9 @@ A frame is read once and looked at once, so that what counts is memory traffic a
 row: four rows at a time, whole points loaded at once, sums kept in registers, minimum images only where a vector
 is long enough to need one.
 
-What rounding of the coordinates makes of a length is told for each row by its own two atoms: a coordinate x is off by
-at most ``base + factor 2^e`` with 2^e <= |x| < 2^(e+1), both vectors together by the Euclidean norm of the sum.
+What rounding of the coordinates makes of a length is told for each row by its own two atoms: the coordinates of an atom
+are off by at most ``base + factor 2^e``, where 2^e is the power of two below the largest of them, and the length by
+sqrt(3) times the sum of both.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ _INT64 = ir.IntType(64)
 _SINGLES = ir.VectorType(ir.FloatType(), 4)
 _DOUBLES = ir.VectorType(ir.DoubleType(), 4)
 _POINT = ir.Constant(ir.VectorType(ir.IntType(1), 4), [1, 1, 1, 0])
-_INTEGERS = ir.VectorType(_INT32, 4)
-#: Bits of a single that hold its exponent: alone, they are the power of two below it.
-_EXPONENT = ir.Constant(_INTEGERS, [0x7F800000] * 4)
-#: All bits of a single but its sign.
-_UNSIGNED = np.int32(0x7FFFFFFF)
+#: All bits of a single but its sign; those of its exponent alone, which are the power of two below it.
+_UNSIGNED, _EXPONENT = np.int32(0x7FFFFFFF), np.int32(0x7F800000)
+#: No powers of two, where all coordinates have the same rounding.
+UNIFORM = np.zeros(0, dtype=np.float32)
+_ROOT_THREE = np.sqrt(3.0)
 
 
 def padded(pairs: Any, targets: Any) -> tuple[Any, Any]:
-    """Tables for `lengths`: offsets of both atoms, shape (2, rows rounded up), and targets of that many rows.
+    """Tables for `lengths`: both atoms, shape (2, rows rounded up), and targets of that many rows.
 
     Rows that fill up measure from an atom of the first row to itself and hold 0; `filled` gives them infinite slack.
     """
     n = len(pairs)
-    places = np.full((2, -(-n // LANES) * LANES), 3 * pairs[0, 0] if n else 0, dtype=np.uint32)
-    places[:, :n] = 3 * np.asarray(pairs, dtype=np.int64).reshape(n, 2).T
+    places = np.full((2, -(-n // LANES) * LANES), pairs[0, 0] if n else 0, dtype=np.uint32)
+    places[:, :n] = np.asarray(pairs, dtype=np.int64).reshape(n, 2).T
     held = np.zeros(places.shape[1])
     held[:n] = targets
     return places, held
@@ -64,6 +65,10 @@ def _shuffled(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
     return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(_INT32, len(mask)), mask))
 
 
+def _entry(builder: Any, table: Any, k: Any, n: int) -> Any:
+    return builder.load(builder.gep(table, [builder.add(k, ir.Constant(_INT64, n))]))
+
+
 def _point(builder: Any, x: Any, table: Any, k: Any, n: int) -> Any:
     """The point that the (k + n)-th entry of a table leads to, as four singles of which the last is 0."""
     load = cgutils.get_or_insert_function(
@@ -72,8 +77,8 @@ def _point(builder: Any, x: Any, table: Any, k: Any, n: int) -> Any:
         "llvm.masked.load.v4f32.p0v4f32",
     )
     # The fourth number of a vector is not read: it lies beyond the array for the last atom.
-    place = builder.load(builder.gep(table, [builder.add(k, ir.Constant(_INT64, n))]))
-    pointer = builder.gep(x, [builder.zext(place, _INT64)], inbounds=True)
+    atom = builder.zext(_entry(builder, table, k, n), _INT64)
+    pointer = builder.gep(x, [builder.mul(atom, ir.Constant(_INT64, 3))], inbounds=True)
     wide = builder.bitcast(pointer, ir.PointerType(_SINGLES))
     return builder.call(load, [wide, _INT32(4), _POINT, ir.Constant(_SINGLES, [0.0] * 4)])
 
@@ -129,28 +134,23 @@ def _everywhere(builder: Any, value: Any) -> Any:
 
 
 @intrinsic
-def _square_roundings(typingctx, x, first, second, k, base, factor):  # type: ignore[no-untyped-def]
-    """Squares of what rounding makes of the lengths of the four pairs from the k-th on, at most."""
+def _sums_of_powers(typingctx, powers, first, second, k):  # type: ignore[no-untyped-def]
+    """Of the four pairs from the k-th on, the numbers of both atoms together."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         data, *tables = (
             context.make_array(kind)(context, builder, a).data for kind, a in zip(sig.args[:3], args[:3], strict=True)
         )
-        k, base, factor = args[3:]
-        zero = ir.Constant(_DOUBLES, [0.0] * 4)
-        twice = _shuffled(builder, _everywhere(builder, builder.fadd(base, base)), zero, [0, 1, 2, 4])
-        factors = _everywhere(builder, factor)
+        result = ir.Constant(_SINGLES, ir.Undefined)
+        for n in range(4):
+            one, other = (
+                builder.load(builder.gep(data, [builder.zext(_entry(builder, table, args[3], n), _INT64)]))
+                for table in tables
+            )
+            result = builder.insert_element(result, builder.fadd(one, other), _INT32(n))
+        return builder.fpext(result, _DOUBLES)
 
-        def power(table: Any, n: int) -> Any:
-            bits = builder.bitcast(_point(builder, data, table, k, n), _INTEGERS)
-            return builder.fpext(builder.bitcast(builder.and_(bits, _EXPONENT), _SINGLES), _DOUBLES)
-
-        sums = [builder.fadd(power(tables[0], n), power(tables[1], n), flags=_FLAGS) for n in range(4)]
-        return _norms(
-            builder, [builder.fadd(builder.fmul(s, factors, flags=_FLAGS), twice, flags=_FLAGS) for s in sums]
-        )
-
-    return quad_type(x, first, second, types.int64, types.float64, types.float64), codegen
+    return quad_type(powers, first, second, types.int64), codegen
 
 
 @intrinsic
@@ -264,6 +264,7 @@ def difference(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _square(x, i, j, limit, lattice, step):  # type: ignore[no-untyped-def]
+    i, j = 3 * np.int64(i), 3 * np.int64(j)
     dx, dy, dz = difference(x, i, j, limit, lattice, step)
     return dx * dx + dy * dy + dz * dz
 
@@ -314,6 +315,22 @@ def _place(q, most, k):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def powers_below(x, powers):  # type: ignore[no-untyped-def]
+    """The power of two below the largest coordinate of each atom; infinity where that is no number.
+
+    Parameters
+    ----------
+    x : ndarray of float32, shape (3 n_atoms,)
+    powers : ndarray of float32, shape (n_atoms,)
+        Filled.
+    """
+    bits, result = x.view(np.int32), powers.view(np.int32)
+    for a in range(len(result)):
+        one, two, three = bits[3 * a] & _UNSIGNED, bits[3 * a + 1] & _UNSIGNED, bits[3 * a + 2] & _UNSIGNED
+        result[a] = max(max(one, two), three) & _EXPONENT
+
+
+@nb.njit(cache=True, nogil=True)
 def farthest(x):  # type: ignore[no-untyped-def]
     """Bits of the largest |x| of an array of float32; those of NaN exceed those of numbers."""
     bits = x.view(np.int32)
@@ -325,7 +342,7 @@ def farthest(x):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def lengths(  # type: ignore[no-untyped-def]
-    x, places, targets, slack, limit, lattice, step, base, factor, margins, largest, sums_by_row, summed
+    x, places, targets, slack, limit, lattice, step, base, factor, powers, margins, largest, sums_by_row, summed
 ):
     """Deviations of all lengths in one frame.
 
@@ -347,6 +364,8 @@ def lengths(  # type: ignore[no-untyped-def]
         Grid of the coordinates in the file, such as 0.01 A of XTC; 0 if there is none.
     base, factor : float
         Rounding of coordinates, see the module.
+    powers : ndarray of float32, shape (n_atoms,)
+        See `powers_below`; `UNIFORM` where the factor does not matter.
     margins, largest : ndarray of float32, shape (rows,)
         Changed in place: the largest excess over rounding and slack (negative where there is none), by row, and the
         absolute deviation in the same frame.
@@ -363,8 +382,9 @@ def lengths(  # type: ignore[no-untyped-def]
     first, second = places[0], places[1]
     zero = quad(0.0, 0.0, 0.0, 0.0)
     low = quad(-np.inf, -np.inf, -np.inf, -np.inf)
-    fixed = 12.0 * base * base
-    rounding = _root(quad(fixed, fixed, fixed, fixed))
+    fixed, slope, uniform = 2 * _ROOT_THREE * base, _ROOT_THREE * factor, len(powers) == 0
+    same = quad(fixed, fixed, fixed, fixed)
+    rounding = same
     n = len(targets)
     sums, squares, seen, most, coarsest, worst = zero, zero, zero, zero, zero, -np.inf
     begin_of_worst = 0
@@ -372,8 +392,8 @@ def lengths(  # type: ignore[no-untyped-def]
         excess = low
         for k in range(begin, min(n, begin + BLOCK), 4):
             square = _four(x, first, second, k, step)
-            if factor > 0.0:
-                rounding = _root(_square_roundings(x, first, second, k, base, factor))
+            if not uniform:
+                rounding = _sums_of_powers(powers, first, second, k) * slope + same
             if not _all_below(square, limit):
                 square = _images(square, x, first, second, k, limit, lattice, step)
             off, margin, clear = _judged(square, rounding, targets, slack, k)
@@ -390,8 +410,8 @@ def lengths(  # type: ignore[no-untyped-def]
     row = -1
     for k in range(begin_of_worst, min(n, begin_of_worst + BLOCK), 4):
         square = _images(_four(x, first, second, k, step), x, first, second, k, limit, lattice, step)
-        if factor > 0.0:
-            rounding = _root(_square_roundings(x, first, second, k, base, factor))
+        if not uniform:
+            rounding = _sums_of_powers(powers, first, second, k) * slope + same
         _, margin, _ = _judged(square, rounding, targets, slack, k)
         row = _place(margin, worst, k)
         if row >= 0:
@@ -405,7 +425,7 @@ def length_rates(x, v, places, n_rows, limit, lattice, step):  # type: ignore[no
     first, second = places[0], places[1]
     squares, worst, row = 0.0, -1.0, 0
     for k in range(n_rows):
-        i, j = first[k], second[k]
+        i, j = 3 * np.int64(first[k]), 3 * np.int64(second[k])
         dx, dy, dz = difference(x, i, j, limit, lattice, step)
         along = dx * (np.float64(v[i]) - np.float64(v[j]))
         along += dy * (np.float64(v[i + 1]) - np.float64(v[j + 1]))
@@ -438,14 +458,14 @@ def coordinate_grid(x: Any, step: float) -> Any:
 
 @nb.njit(cache=True, nogil=True)
 def triangles(  # type: ignore[no-untyped-def]
-    x, corners, targets, slack, limit, lattice, step, base, factor, margins, largest, sums_by_row, summed
+    x, corners, targets, slack, limit, lattice, step, base, factor, powers, margins, largest, sums_by_row, summed
 ):
     """`lengths` of triangles, such as rigid water: each corner is loaded once.
 
     Parameters
     ----------
     corners : ndarray of uint32, shape (3, n)
-        Offsets of the corners a, b, c; n is a multiple of four.
+        The corners a, b, c; n is a multiple of four.
     targets, slack, margins, largest : ndarray, shape (3, n)
         Of the sides ab, ac, bc.
     sums_by_row : ndarray, shape (3, 3, n)
@@ -457,9 +477,9 @@ def triangles(  # type: ignore[no-untyped-def]
     a, b, c = corners[0], corners[1], corners[2]
     zero = quad(0.0, 0.0, 0.0, 0.0)
     low = quad(-np.inf, -np.inf, -np.inf, -np.inf)
-    fixed = 12.0 * base * base
-    of_ab = _root(quad(fixed, fixed, fixed, fixed))
-    of_ac, of_bc = of_ab, of_ab
+    fixed, slope, uniform = 2 * _ROOT_THREE * base, _ROOT_THREE * factor, len(powers) == 0
+    same = quad(fixed, fixed, fixed, fixed)
+    of_ab, of_ac, of_bc = same, same, same
     n = targets.shape[1]
     sums, squares, seen, most, coarsest, worst = zero, zero, zero, zero, zero, -np.inf
     begin_of_worst = 0
@@ -472,10 +492,10 @@ def triangles(  # type: ignore[no-untyped-def]
                 bc = _squares_on_grid(x, b, c, k, step)
             else:
                 ab, ac, bc = _squares(x, a, b, k, step), _squares(x, a, c, k, step), _squares(x, b, c, k, step)
-            if factor > 0.0:
-                of_ab = _root(_square_roundings(x, a, b, k, base, factor))
-                of_ac = _root(_square_roundings(x, a, c, k, base, factor))
-                of_bc = _root(_square_roundings(x, b, c, k, base, factor))
+            if not uniform:
+                of_ab = _sums_of_powers(powers, a, b, k) * slope + same
+                of_ac = _sums_of_powers(powers, a, c, k) * slope + same
+                of_bc = _sums_of_powers(powers, b, c, k) * slope + same
             if not _all_below(_larger(_larger(ab, ac), bc), limit):
                 ab = _images(ab, x, a, b, k, limit, lattice, step)
                 ac = _images(ac, x, a, c, k, limit, lattice, step)
@@ -508,8 +528,8 @@ def triangles(  # type: ignore[no-untyped-def]
         for s in range(3):
             first, second = corners[1 if s == 2 else 0], corners[1 if s == 0 else 2]
             if triangle < 0:
-                if factor > 0.0:
-                    of_ab = _root(_square_roundings(x, first, second, k, base, factor))
+                if not uniform:
+                    of_ab = _sums_of_powers(powers, first, second, k) * slope + same
                 square = _images(_four(x, first, second, k, step), x, first, second, k, limit, lattice, step)
                 _, margin, _ = _judged(square, of_ab, targets[s], slack[s], k)
                 side, triangle = s, _place(margin, worst, k)

@@ -301,9 +301,9 @@ def test_precision_is_read_from_the_file(tmp_path, x):
     assert precision_of(files.write(tmp_path / "b.xtc", x[:, :9]), "XTC").step == 0.0
     assert precision_of(files.topology(tmp_path / "c.gro", N, x[0]), "GRO").step == pytest.approx(0.01)
     single = precision_of("none.dcd", "DCD")
-    assert single.half_step(100.0) == pytest.approx(2.0**-18)
-    assert precision_of("none.trr", "TRR").half_step(100.0) > single.half_step(100.0)
-    assert precision_of("none.dcd", "DCD", 0.02).half_step(1.0) == pytest.approx(0.01, rel=1e-4)
+    assert single.half_step([100.0]) == pytest.approx(2.0**-18)
+    assert precision_of("none.trr", "TRR").half_step([100.0]) > single.half_step([100.0])
+    assert precision_of("none.dcd", "DCD", 0.02).half_step([1.0]) == pytest.approx(0.01, rel=1e-4)
 
 
 def test_big_endian_dcd_and_fixed_layout(tmp_path, x):
