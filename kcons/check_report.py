@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from kcons.errors import OccupiedError
+
 if TYPE_CHECKING:
     from kcons.mdanalysis.result import CheckResult
 
-COLOURS = {"kept": "green", "tolerated": "green", "violated": "red"}
+COLOURS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
+#: What `write` writes.
+FILES = ("check.json", "check.png", "check.txt")
 #: Ticks on the axis of frames are numbers of frames where times say nothing.
 _NO_TIMES = "frame"
+#: Deviations that are this part of the largest, or less, are not drawn.
+_NOTHING = 1e-6
 
 
 def summary(result: CheckResult) -> str:
@@ -34,9 +41,7 @@ def summary(result: CheckResult) -> str:
         lines[-1] += f", {t['mean']:.2f} ± {t['deviation']:.2f} K (mean and standard deviation of frames)"
         if t["slope"] == t["slope"]:
             lines[-1] += f", drift {1000 * t['slope']:.2g} ± {1000 * t['slope_error']:.1g} K/ns"
-    lines += result.remarks
-    if result.broken is not None:
-        lines.append(f"the file ends too early, at frame {result.broken.frame}: {result.broken.reason}")
+    lines += result.remarks + result.gaps
     return "\n".join(lines)
 
 
@@ -94,8 +99,11 @@ def row_table(result: CheckResult) -> Table:
     return shown
 
 
-def plot(result: CheckResult, path: Path) -> None:
-    """Largest and root mean square deviation along the trajectory, and the temperature, as a PNG file."""
+def plot(result: CheckResult, path: Path | IO[bytes]) -> None:
+    """Largest and root mean square deviation along the trajectory, and the temperature, as a PNG file.
+
+    Lines show what rounding of the file makes of a row at most, and what the tolerance allows the shortest row besides.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -106,12 +114,25 @@ def plot(result: CheckResult, path: Path) -> None:
     timed = len(set(result.times)) == len(result.times)
     x = result.times if timed else [float(frame) for frame in result.frames]
     for axes, unit in zip(grid, result.units, strict=False):
-        largest, rms = (result.series[f"{name} {unit.unit}"] for name in ("largest", "rms"))
+        largest, rms, rounding = (result.series[f"{name} {unit.unit}"] for name in ("largest", "rms", "rounding"))
+        if any(value > 0 for value in largest):
+            axes.set_yscale("log")
+        # The frame that gives targets is off by 0, or by the rounding of this program: no point of such a line.
+        least = _NOTHING * max(largest)
+        largest, rms = ([value if value > least else math.nan for value in values] for values in (largest, rms))
         axes.plot(x, largest, color="#D55E00", linewidth=1.0, marker="." if len(x) < 60 else "", label="largest")
         axes.plot(x, rms, color="#0072B2", linewidth=1.0, marker="." if len(x) < 60 else "", label="rms")
-        axes.axhline(unit.bound, color="black", linestyle=":", linewidth=1.0, label="rounding of the file, at most")
-        if min((value for value in (*largest, *rms) if value > 0), default=1.0) > 0:
-            axes.set_yscale("log" if any(value > 0 for value in largest) else "linear")
+        # Rounding of the targets comes to that of each frame.
+        of_targets = unit.bound - max(rounding)
+        lines = [("black", ":", 0.0, "rounding of the file, at most")]
+        if unit.tolerance > 0:
+            lines.append(("#555555", "--", unit.tolerance, f"rounding and tolerance of {result.tolerance:g}"))
+        for colour, style, more, label in lines:
+            level = [value + of_targets + more for value in rounding]
+            if len(x) < 2:
+                axes.axhline(level[0], color=colour, linestyle=style, linewidth=1.0, label=label)
+            else:
+                axes.plot(x, level, color=colour, linestyle=style, linewidth=1.0, label=label)
         axes.set_ylabel(f"deviation / {unit.unit}")
         axes.legend(fontsize=8, loc="best")
     if result.temperature is not None:
@@ -122,21 +143,92 @@ def plot(result: CheckResult, path: Path) -> None:
             axes.axvline(x[-1], color="#999999", linestyle="--", linewidth=1.0)
     grid[-1].set_xlabel("time / ps" if timed else _NO_TIMES)
     figure.suptitle(f"{Path(result.trajectory).name}: {result.n_rows} rows, {result.status}", fontsize=11)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, format="png")
 
 
 def write(result: CheckResult, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:
-    """Put check.json, check.png and, if given, the tables as text into `folder`; the paths written."""
-    folder.mkdir(parents=True, exist_ok=True)
-    data, picture, text = folder / "check.json", folder / "check.png", folder / "check.txt"
-    data.write_text(
-        json.dumps(_finite(result.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    """Put check.json, check.png and, if given, the tables as text into `folder`; the paths written.
+
+    Raises
+    ------
+    OccupiedError
+        The folder holds the check of another trajectory, or other files of these names; nothing was written.
+    """
+    picture = io.BytesIO()
     plot(result, picture)
-    written = [data, picture]
-    if tables:
-        text.write_text("\n".join(tables) + "\n", encoding="utf-8")
-        written.append(text)
+    return _put(folder, result.trajectory, result.to_dict(), picture.getvalue(), "\n".join(tables))
+
+
+def write_failure(trajectory: str | Path, reason: str, folder: Path) -> list[Path]:
+    """Put check.json into `folder` for a trajectory of which nothing could be read; the paths written.
+
+    Raises
+    ------
+    OccupiedError
+        As `write`.
+    """
+    return _put(folder, trajectory, {"trajectory": str(trajectory), "status": "incomplete", "verdict": reason})
+
+
+def refuse_others(folder: Path, trajectory: str | Path) -> None:
+    """Refuse a folder that holds anything but a check of this trajectory under the names that `write` uses.
+
+    Raises
+    ------
+    OccupiedError
+    """
+    remedy = "give another folder (--out)"
+    if folder.exists() and not folder.is_dir():
+        raise OccupiedError(f"{folder} is no folder; {remedy}", item="out")
+    paths = [folder / name for name in FILES]
+    for path in paths:
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise OccupiedError(f"{path} is a link, or no file; {remedy}", item="out")
+    if not any(path.exists() for path in paths):
+        return
+    try:
+        data = json.loads(paths[0].read_text(encoding="utf-8"))
+        owner = Path(data.get("file") or data["trajectory"]).resolve()
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        raise OccupiedError(f"{folder} has other files called {', '.join(FILES)}; {remedy}", item="out") from None
+    if owner != Path(trajectory).resolve():
+        raise OccupiedError(f"{folder} holds the check of {owner}; {remedy}", item="out")
+
+
+def _put(
+    folder: Path, trajectory: str | Path, data: dict[str, Any], picture: bytes = b"", text: str = ""
+) -> list[Path]:
+    """Write what there is, and take away what an earlier check of the same trajectory left."""
+    refuse_others(folder, trajectory)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / name for name in FILES]
+    if not paths[0].exists():
+        try:
+            paths[0].open("x").close()
+        except FileExistsError:
+            raise OccupiedError(
+                f"another check writes into {folder}; give another folder (--out)", item="out"
+            ) from None
+    whole = json.dumps(
+        _finite({"file": str(Path(trajectory).resolve()), **data}), indent=1, ensure_ascii=False, allow_nan=False
+    )
+    # Names of files need not be text; in JSON the replacement is what stands for such a character.
+    contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, text and f"{text}\n".encode(errors="replace")]
+    written = []
+    for path, content in zip(paths, contents, strict=True):
+        if not content:
+            path.unlink(missing_ok=True)
+            continue
+        unfinished = path.with_name(path.name + ".unfinished")
+        unfinished.unlink(missing_ok=True)
+        try:
+            # Neither the one nor the other follows a link.
+            with unfinished.open("xb") as file:
+                file.write(content)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+        written.append(path)
     return written
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcons import __version__, cli_check, cli_studies
 from kcons.errors import InputError, KconsError
-from kcons.terminal import console, names, numbers, rendered, say_written, show
+from kcons.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 
 if TYPE_CHECKING:
     from kcons.runs import Method
@@ -24,8 +24,18 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    The exit status: 0; 1 where `check` finds a violation; 2 for an error that the user can mend; 130 when interrupted.
+    The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; 2 for an error that the user
+    can mend; 130 when interrupted.
     """
+    try:
+        with patient_streams():
+            return _main(arguments)
+    except OSError as error:
+        print(f"kcons: the output cannot be written: {error}", file=sys.stderr)
+        return 2
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.version:

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from kcons.errors import InputError
+from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.terminal import console, rendered, say_written
+
+if TYPE_CHECKING:
+    from kcons.mdanalysis.result import CheckResult
+
+#: The exit status of each result; 2 is wrong use.
+EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
 
 
 def add(commands: Any) -> None:
@@ -16,7 +26,8 @@ def add(commands: Any) -> None:
         "check",
         help="how well a trajectory of any engine kept its constraints",
         description="Deviations of all rows along a trajectory, worst rows by name, rank, temperature, drift; told by "
-        "the precision of the file. Exit status 0: kept; 1: violated; 2: an error.",
+        "the precision of the file. Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete, such as a file that "
+        "ends too early, or has a NaN.",
     )
     check.add_argument("trajectory", type=Path, help="any trajectory that MDAnalysis reads")
     check.add_argument("--topology", type=Path, required=True, help="any topology that MDAnalysis reads")
@@ -47,8 +58,40 @@ def _check(chosen: argparse.Namespace) -> int:
         raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
     from kcons import check_report
 
-    folder: Path = chosen.out or Path(f"check-{chosen.trajectory.stem}")
-    result = check_trajectory(
+    if chosen.out is not None:
+        check_report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
+    try:
+        result = _result(chosen, check_trajectory)
+    except UnreadableError as error:
+        reason = str(error)
+        print(f"kcons: {reason}", file=sys.stderr)
+        say_written(_put(chosen, lambda folder: check_report.write_failure(chosen.trajectory, reason, folder)))
+        return EXIT["incomplete"]
+    terminal = console()
+    tables = (check_report.unit_table(result), check_report.row_table(result))
+    terminal.print(check_report.summary(result), highlight=False, markup=False)
+    for table in tables:
+        terminal.print(table)
+    terminal.print(check_report.verdict(result), soft_wrap=True)
+    text = [check_report.summary(result), *map(rendered, tables), result.verdict]
+    say_written(_put(chosen, lambda folder: check_report.write(result, folder, tables=text)))
+    return EXIT[result.status]
+
+
+def _put(chosen: argparse.Namespace, write: Callable[[Path], list[Path]]) -> list[Path]:
+    """Write into the folder asked for, or into the first of the usual names that no other trajectory has."""
+    if chosen.out is not None:
+        return write(chosen.out)
+    for number in count(1):
+        folder = Path(f"check-{chosen.trajectory.stem}" + (f"-{number}" if number > 1 else ""))
+        if not folder.is_symlink():
+            with suppress(OccupiedError):
+                return write(folder)
+    raise AssertionError
+
+
+def _result(chosen: argparse.Namespace, check_trajectory: Callable[..., CheckResult]) -> CheckResult:
+    return check_trajectory(
         chosen.trajectory,
         chosen.topology,
         chosen.constrain,
@@ -64,12 +107,3 @@ def _check(chosen: argparse.Namespace) -> int:
         worst=chosen.worst,
         rank=not chosen.no_rank,
     )
-    terminal = console()
-    tables = (check_report.unit_table(result), check_report.row_table(result))
-    terminal.print(check_report.summary(result), highlight=False, markup=False)
-    for table in tables:
-        terminal.print(table)
-    terminal.print(check_report.verdict(result), soft_wrap=True)
-    text = [check_report.summary(result), *map(rendered, tables), result.verdict]
-    say_written(check_report.write(result, folder, tables=text))
-    return int(result.violated)

@@ -30,6 +30,14 @@ class InputError(KconsError, ValueError):
         self.atoms = tuple(int(a) for a in atoms)
 
 
+class UnreadableError(InputError):
+    """A file ends too early, or has no numbers, before anything could be told of it."""
+
+
+class OccupiedError(InputError):
+    """A place to write to has something else in it."""
+
+
 class ConstraintError(KconsError, ValueError):
     """A constraint cannot be held as it is written.
 

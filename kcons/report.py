@@ -352,7 +352,9 @@ def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -
     """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
-    data.write_text(json.dumps(plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    data.write_text(
+        json.dumps(plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+    )
     plot(comparison, picture)
     written = [data, picture]
     if tables:

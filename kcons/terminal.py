@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import codecs
+import io
+import os
+import sys
+import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -12,6 +19,13 @@ if TYPE_CHECKING:
 
 #: Columns of a page that is no terminal.
 WIDE = 150
+#: What stands for characters that an encoding lacks and that no decomposition leads to.
+_PLAIN = {
+    "–": "-", "—": "-", "\N{MINUS SIGN}": "-",
+    "±": "+/-", "×": "x", "·": "*", "√": "sqrt", "→": "->", "≤": "<=", "≥": ">=",
+    "≈": "~", "°": " deg", "━": "-", "─": "-", "│": "|", "█": "#", "σ": "sigma", "Σ": "sum", "∂": "d",
+}  # fmt: skip
+_PLAIN_ERRORS = "kcons.plain"
 
 
 def numbers(text: str) -> list[float]:
@@ -33,6 +47,82 @@ def show(table: Table, explained: str, console: Console) -> None:
 def say_written(paths: list[Path]) -> None:
     for path in paths:
         print(f"wrote {path}")
+
+
+# -- streams ----------------------------------------------------------------------------------------
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """Something like the characters that cannot be encoded, in ASCII."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    shown = []
+    for character in error.object[error.start : error.end]:
+        simple = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+        shown.append(_PLAIN.get(character) or simple or "?")
+    return "".join(shown), error.end
+
+
+class _Forgiving(io.FileIO):
+    """A pipe that may be closed at its other end: what is written from then on is dropped."""
+
+    gone = False
+
+    def write(self, data: Any, /) -> int:
+        if self.gone:
+            return len(data)
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            self.gone = True
+            return len(data)
+
+
+def _patient(stream: Any) -> Any:
+    if stream is None:  # closed by whoever started the command
+        return open(os.devnull, "w", encoding="utf-8")
+    buffer = getattr(stream, "buffer", None)
+    if not isinstance(getattr(buffer, "raw", buffer), io.FileIO):
+        return stream  # of a program that calls the command
+    stream.flush()
+    raw = _Forgiving(stream.fileno(), "w", closefd=False)
+    return io.TextIOWrapper(
+        # python -u has no buffer.
+        raw if isinstance(buffer, io.FileIO) else io.BufferedWriter(raw),  # type: ignore[arg-type]
+        encoding=stream.encoding,
+        errors=_PLAIN_ERRORS,
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
+@contextmanager
+def patient_streams() -> Iterator[None]:
+    """Standard output and errors that take any character, and a reader that goes away, such as `head`.
+
+    Raises
+    ------
+    OSError
+        What was written cannot be brought to its file, at the end.
+    """
+    codecs.register_error(_PLAIN_ERRORS, _plain)
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = map(_patient, before)
+    streams = [new for new, old in zip((sys.stdout, sys.stderr), before, strict=True) if new is not old]
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+        for stream in streams:
+            try:
+                stream.flush()
+            except OSError:
+                # Closing would try again.
+                getattr(stream.buffer, "raw", stream.buffer).gone = True
+                raise
+
+
+# -- tables -----------------------------------------------------------------------------------------
 
 
 def rendered(table: Table) -> str:

@@ -10,32 +10,40 @@ from typing import Any, Literal
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
-from MDAnalysis.exceptions import NoDataError
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.dcd import PlainDcd, plain_dcd
-from kcons.mdanalysis.findings import BOLTZMANN, Part, by_unit, joined, rms_of, row_result, temperature_of, verdict_of
-from kcons.mdanalysis.loading import READ_ERRORS, format_of, intact_frames, last_offset, leftover, quiet
+from kcons.mdanalysis.deviations import UNITS, Deviations
+from kcons.mdanalysis.endings import intact_frames, last_offset, leftover
+from kcons.mdanalysis.findings import (
+    Part,
+    by_unit,
+    gaps_of,
+    joined,
+    rms_of,
+    row_result,
+    verdict_of,
+)
+from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
 from kcons.mdanalysis.names import AtomNames
-from kcons.mdanalysis.precision import FilePrecision, precision_of
+from kcons.mdanalysis.precision import FilePrecision, by_frame, described, precision_of
 from kcons.mdanalysis.rank import rank_of
 from kcons.mdanalysis.result import Break, CheckResult
-from kcons.mdanalysis.rows import UNITS, Deviations, RowTable, cell_matrix
+from kcons.mdanalysis.rows import SECOND_ORDER, RowTable, cell_matrix, size_of
 from kcons.mdanalysis.targets import TargetFile
+from kcons.mdanalysis.temperature import BOLTZMANN, masses_of, temperature_of
 from kcons.mdanalysis.workers import inherited, short_pickle, with_backend
-from kcons.solvers.frames import coordinate_grid, kinetic
+from kcons.solvers.frames import coordinate_grid, farthest, kinetic
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
 #: in how many frames at least.
 SAMPLES, SUMMED, MOST_SKIPPED = 32, 100, 8
-#: What second order adds to the error of rows other than distances, at most.
-SECOND_ORDER = 1.1
 
 
 class _Remote:
@@ -63,8 +71,9 @@ class ConstraintCheck(AnalysisBase):
         1 rad for angles).
     precision : float, optional
         Step of the coordinates in the file, in angstrom, for formats where it cannot be known.
-    target_error : float
-        Rounding of the targets, in angstrom a coordinate; for 'given' targets that were measured in another file.
+    target_error : float or ndarray, shape (n_atoms,)
+        Rounding of the targets, in angstrom a coordinate, of each atom or of all; for 'given' targets that were
+        measured in another file.
     removed : int, optional
         Degrees of freedom that the engine took away besides: 3 where it stops the centre of mass. Found from the
         total momentum by default.
@@ -82,8 +91,9 @@ class ConstraintCheck(AnalysisBase):
 
     Notes
     -----
-    A coordinate that was rounded by at most h moves a distance by at most 2 √3 h, any other row by h Σ |∂q/∂x| to first
-    order; targets that were read from a file are rounded themselves, which doubles the bound. Velocities of leapfrog
+    An atom whose coordinates were rounded by at most h each moves a distance by at most √3 h, both atoms by the sum,
+    and any other row by Σ h |∂q/∂x| to first order. h is that of the largest coordinate of the atom, in its frame.
+    Targets that were read from a frame are rounded themselves, which about doubles the bound. Velocities of leapfrog
     integrators belong to the middle of a step and are not tangent at the positions they are stored with.
 
     Backends: serial, multiprocessing, dask, and threads for DCD files and rows that are all lengths
@@ -100,7 +110,7 @@ class ConstraintCheck(AnalysisBase):
         targets: Literal["given", "first", "mean"] | str | Path | TargetFile = "given",
         tolerance: float = 1e-4,
         precision: float | None = None,
-        target_error: float = 0.0,
+        target_error: float | FloatArray = 0.0,
         removed: int | None = None,
         rank: bool = True,
         worst: int = 10,
@@ -120,11 +130,19 @@ class ConstraintCheck(AnalysisBase):
             )
         if not (np.isfinite(tolerance) and tolerance >= 0):
             raise InputError(f"the tolerance is {tolerance}; give a number such as 1e-4, or 0", item="tolerance")
-        if not (np.isfinite(target_error) and target_error >= 0):
-            raise InputError(f"target_error is {target_error}; give a length in angstrom", item="target_error")
+        errors = np.asarray(target_error, dtype=np.float64)
+        if errors.shape not in ((), (len(universe.atoms),)) or not (errors >= 0).all() or not np.isfinite(errors).all():
+            raise InputError(
+                f"target_error is {target_error}; give a length in angstrom, or one for each atom", item="target_error"
+            )
+        if worst < 0:
+            raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
         self._labels = AtomNames(universe)
-        self._remarks: list[str] = []
-        self._masses = self._find_masses(universe, given)
+        self.remarks: list[str] = []
+        self._unit_masses = np.ones(len(universe.atoms))
+        self._masses, reason = masses_of(universe, given, self._labels)
+        if reason:
+            self.remarks.append(f"no temperature: {reason}")
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
             given, self.target_text = tuple(file.apply(given, self._labels)), str(file.path)
@@ -135,7 +153,7 @@ class ConstraintCheck(AnalysisBase):
                 self._mode, "as given"
             )
         self._given = given
-        self._tolerance, self._target_error = float(tolerance), float(target_error)
+        self._tolerance, self._target_error = float(tolerance), np.broadcast_to(errors, len(universe.atoms))
         self._removed, self._wants_rank, self._n_worst = removed, rank, int(worst)
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
@@ -148,38 +166,12 @@ class ConstraintCheck(AnalysisBase):
         if getattr(reader, "transformations", ()):
             # What a transformation did to the coordinates no longer lies on the grid of the file.
             self._precision = FilePrecision(self._format, self._precision.step, self._precision.unit)
-            self._remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
-        self._grid = self._precision.step if self._precision.exact else 0.0
+            self.remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+        self._by_frame = None
+        if self._precision.exact and precision is None:
+            self._by_frame = by_frame(self._path, reader._xdr.offsets, self._precision)
         self._pass_of_means = False
         self._intact = reader.n_frames
-
-    def _find_masses(self, universe: Any, given: Sequence[Constraint]) -> FloatArray | None:
-        """Masses, or None where they cannot be used; says why."""
-        advice = "give a topology with masses, or universe.guess_TopologyAttrs(to_guess=['masses'])"
-        self._unit_masses = np.ones(len(universe.atoms))
-        used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
-        if len(used) and used[-1] >= len(universe.atoms):
-            raise InputError(
-                f"there is no atom {used[-1]}; the topology has atoms 0 to {len(universe.atoms) - 1}",
-                item="constraints",
-                atoms=[int(used[-1])],
-            )
-        reason = ""
-        masses = np.zeros(0)
-        try:
-            masses = np.asarray(universe.atoms.masses, dtype=np.float64)
-        except (NoDataError, AttributeError):
-            reason = "the topology has no masses"
-        else:
-            bad = used[~(np.isfinite(masses[used]) & (masses[used] > 0))]
-            reason = f"{self._labels.atom(int(bad[0]))} has mass {masses[bad[0]]:g}" if len(bad) else ""
-        if not reason:
-            return masses
-        needing = next((item for item in given if item.uses_masses), None)
-        if needing is not None:
-            raise InputError(f"{needing!r} needs masses, but {reason}; {advice}", item="masses")
-        self._remarks.append(f"no temperature: {reason}; {advice}")
-        return None
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
@@ -200,16 +192,24 @@ class ConstraintCheck(AnalysisBase):
         Raises
         ------
         InputError
-            There are no frames; the first frame cannot be read; threads where the file cannot be read by them.
+            There are no frames; threads where the file cannot be read by them.
+        UnreadableError
+            The first frame cannot be read.
         KconsError
             Constraints that cannot be, at the first frame.
         """
         chosen = {"start": start, "stop": stop, "step": step, "frames": frames}
+        # Whether frames that were cut off would have been looked at.
+        n_frames = self._trajectory.n_frames
+        self._to_the_end = (
+            Path(self._path).is_file() and chosen["frames"] is None and _open_ended(start, stop, step, n_frames)
+        )
         self._bind(self._first(chosen))
         in_blocks = self._blocks_of() is not None
         # The compiled look at a block sees damage by itself.
-        n_frames = self._trajectory.n_frames
-        self._intact = n_frames if in_blocks else intact_frames(self._path, self._format, n_frames)
+        self._intact = n_frames
+        if not in_blocks:
+            self._intact = intact_frames(self._path, self._format, n_frames, self._trajectory.n_atoms)
         options = with_backend(options, in_blocks)
         self._pass_of_means = self._mode == "mean"
         with inherited(self, options["backend"]):
@@ -245,54 +245,79 @@ class ConstraintCheck(AnalysisBase):
                 ts = self._trajectory[frame]
                 time = float(ts.time)
         except READ_ERRORS as error:
-            raise InputError(
-                f"{self._names[0]}: frame {frame}, the first to be checked, cannot be read ({error}); "
-                "start at another frame, or write the file again",
-                item="trajectory",
-            ) from None
-        x = coordinate_grid(ts.positions, self._grid)
+            raise self._nothing(frame, str(error)) from None
+        precision = self._precision_at(frame)
+        x = coordinate_grid(ts.positions, precision.grid)
         given = self._given
         if self._mode != "given":
             given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
         masses = self._unit_masses if self._masses is None else self._masses
-        self._from_file = np.concatenate([np.full(item.n_rows, item.target is None) for item in given])
+        # Rows whose targets are those of this frame, or of the mean of all.
+        self._measured = np.concatenate([np.full(item.n_rows, item.target is None) for item in given])
+        self._refuse_numbers(ts, frame, given)
         cell = cell_matrix(ts.dimensions)
         held = ConstraintSet(given, x, masses, cell=cell, time=time)
+        table = self._table = RowTable(held, precision)
         with np.errstate(all="ignore"):
-            reach = np.asarray(abs(held.jacobian(x, time)).sum(axis=1)).ravel()
-            squares = np.asarray(held.jacobian(x, time).power(2).sum(axis=1)).ravel()
+            slopes = abs(held.jacobian(x, time))
+            reach, squares = (np.asarray(part.sum(axis=1)).ravel() for part in (slopes, slopes.power(2)))
         is_length = np.concatenate([np.full(c.n_rows, c.family == "Distance") for c in held.constraints])
-        # A step h of each coordinate: the error of a row, at most and in the mean square.
+        # An error of 1 of each coordinate: the error of a row, at most and in the mean square.
         self._reach = np.where(is_length, 2 * np.sqrt(3.0), SECOND_ORDER * reach)
         self._spread = np.sqrt(squares / 3.0)
-        self._scale = np.where(is_length, held.scale, 1.0)
-        lengths = ~is_length & (np.concatenate([np.full(c.n_rows, c.period is None) for c in held.constraints]))
-        angles = np.concatenate([np.full(c.n_rows, c.family == "Angle") for c in held.constraints])
-        self._scale = np.where(lengths & ~angles, held.scale, self._scale)
+        measured, told = (
+            table.errors_of(errors, x, ts.dimensions, time) for errors in (precision.half_step(x), self._target_error)
+        )
+        self._allow(np.where(self._measured, measured, told))
         shot = frame_of(ts, time, plain_dcd(self._trajectory) is not None)
-        first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, self._grid, self._wants_rank))
+        first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, precision, self._wants_rank))
         self._rank: int | None = None
         if self._wants_rank:
             try:
                 self._rank = first_use(lambda: rank_of(held, x))
             except KconsError as error:
-                self._remarks.append(f"no rank: {error}")
-        table = self._table = RowTable(held, self._grid)
+                self.remarks.append(f"no rank: {error}")
         first_use(lambda: look_once(table, shot))
+
+    def _precision_at(self, frame: int) -> FilePrecision:
+        return self._precision if self._by_frame is None else self._by_frame[frame]
+
+    def _allow(self, of_targets: FloatArray) -> None:
+        """Say what rounding makes of the targets, at most; the tolerance and the rounding of frames come besides."""
+        self._of_targets = of_targets
+        self._table.allow(of_targets + self._tolerance * self._table.sizes)
+
+    def _nothing(self, frame: int, reason: str) -> UnreadableError:
+        """Of a trajectory of which nothing can be told."""
+        return UnreadableError(
+            f"{self._names[0]}: frame {frame}, the first to be checked, cannot be read ({reason}); start at another "
+            "frame, or write the file again",
+            item="trajectory",
+        )
+
+    def _refuse_numbers(self, ts: Any, frame: int, given: Sequence[Constraint]) -> None:
+        """A frame that gives targets, or scales, must be finite."""
+        used = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
+        bad = used[~np.isfinite(ts.positions[used]).all(axis=1)]
+        if len(bad):
+            raise self._nothing(frame, f"position of atom {bad[0]} is {ts.positions[bad[0]]}")
+        if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
+            raise self._nothing(frame, f"the cell is {ts.dimensions}")
 
     def _hold_means(self) -> None:
         """Take the means that the first pass found as targets."""
         part: Part = self.results.part
-        held = self._table.set
-        means = part.found.total / max(part.found.n_summed, 1)
+        held, found = self._table.set, part.found
+        means = found.mean(found.total)
         moved = [
             item if item.moving or not item.holonomic else item.with_target(item.target_at(0.0) + means[a:b])
             for item, a, b in zip(held.constraints, held.starts[:-1], held.starts[1:], strict=True)
         ]
-        first = self._trajectory.ts
-        self._table = RowTable(
-            held.replaced(moved, coordinate_grid(first.positions, self._grid), float(first.time)), self._grid
-        )
+        first, precision = self._trajectory.ts, self._table.precision
+        positions = coordinate_grid(first.positions, precision.grid)
+        self._table = RowTable(held.replaced(moved, positions, float(first.time)), precision)
+        seen = self._measured & (found.counted > 0)
+        self._allow(np.where(seen, found.mean(found.rounded), self._of_targets))
 
     def _prepare_sliced_trajectory(self, slicer: Any) -> None:
         with quiet():
@@ -311,7 +336,7 @@ class ConstraintCheck(AnalysisBase):
             found,
             np.full(n, np.nan),
             np.zeros((n, 3)),
-            0.0,
+            np.full(n, np.nan),
         )
         # Means need all frames; what is only told about rows does not.
         every = (1 if self._pass_of_means else min(max(n // SUMMED, 1), MOST_SKIPPED), max(n // SAMPLES, 1))
@@ -327,7 +352,9 @@ class ConstraintCheck(AnalysisBase):
         table.collect(found)
         found.cut(done)
         part.frames, part.times = part.frames[:done], part.times[:done]
-        part.twice_kinetic, part.momentum = part.twice_kinetic[:done], part.momentum[:done]
+        part.twice_kinetic, part.momentum, part.reach = (
+            array[:done] for array in (part.twice_kinetic, part.momentum, part.reach)
+        )
         return _Remote(part)
 
     def _blocks_of(self) -> PlainDcd | None:
@@ -342,15 +369,15 @@ class ConstraintCheck(AnalysisBase):
         done = 0
         try:
             for block in file.blocks(numbers):
-                looked, reach = table.look_at_block(part.found, done, block, points, every)
+                looked, part.reach[done : done + len(block.words)] = table.look_at_block(
+                    part.found, done, block, points, every
+                )
                 done += looked
-                part.reach = max(part.reach, reach)
                 bar.update(looked)
                 if looked < len(block.words):
-                    table.refuse(points)
+                    table.refuse(points, block.dimensions[looked])
         except (OSError, KconsError) as error:
-            frame = int(part.frames[done])
-            part.broken = Break(frame, self._reason(error, frame))
+            part.broken = self._break(error, int(part.frames[done]))
         return done
 
     def _read_frames(self, table: RowTable, part: Part, every: tuple[int, int], bar: Any) -> int:
@@ -361,17 +388,18 @@ class ConstraintCheck(AnalysisBase):
         for k, frame in enumerate(part.frames.tolist()):
             try:
                 if frame >= self._intact:
-                    raise OSError("its records are damaged")
+                    raise OSError("its records or lines are damaged")
                 ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
                 previous = frame
+                table.precision = self._precision_at(frame)
                 self._look(table, part, k, ts, k % every[1] == 0 or k == n - 1, k % every[0] == 0)
             except (*READ_ERRORS, KconsError, FloatingPointError) as error:
-                part.broken = Break(frame, self._reason(error, frame))
+                part.broken = self._break(error, frame)
                 return k
             bar.update()
         return n
 
-    def _reason(self, error: BaseException, frame: int) -> str:
+    def _break(self, error: BaseException, frame: int) -> Break:
         """What the reader says; iteration hides it."""
         if isinstance(error, StopIteration):
             try:
@@ -379,7 +407,7 @@ class ConstraintCheck(AnalysisBase):
             except READ_ERRORS as hidden:
                 error = hidden
         lines = str(error).strip().splitlines()
-        return lines[0].strip() if lines else "the file ends"
+        return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
 
     def _look(self, table: RowTable, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
         x = _flat(ts.positions)
@@ -388,7 +416,7 @@ class ConstraintCheck(AnalysisBase):
         part.times[k] = time
         table.look(part.found, k, x, v, ts.dimensions, time, summed)
         if sample:
-            part.reach = max(part.reach, float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
+            part.reach[k] = size_of(farthest(x))
         if v is not None and self._masses is not None:
             part.twice_kinetic[k], *part.momentum[k] = kinetic(v, self._masses)
 
@@ -404,11 +432,7 @@ class ConstraintCheck(AnalysisBase):
             return
         if not len(part.frames):
             assert part.broken is not None
-            raise InputError(
-                f"{self._names[0]}: frame {part.broken.frame}, the first to be checked, cannot be read "
-                f"({part.broken.reason})",
-                item="trajectory",
-            )
+            raise self._nothing(part.broken.frame, part.broken.reason)
         self.results.check = self._concluded(part)
 
     @property
@@ -419,49 +443,49 @@ class ConstraintCheck(AnalysisBase):
 
     def _concluded(self, part: Part) -> CheckResult:
         found, n_frames = part.found, len(part.frames)
-        held = self._table.set
-        half = self._precision.half_step(part.reach)
-        targets_half = half if self._mode != "given" else self._target_error
-        bound = self._reach * (half + np.where(self._from_file, half, targets_half))
-        allowed = bound + self._tolerance * self._scale
-        excess = found.largest - allowed
-        beyond_file = found.largest > bound
-        violated = excess > 0
-        broken = part.broken
-        if broken is None and self._path and int(part.frames[-1]) == self._trajectory.n_frames - 1:
-            rest = leftover(
-                self._path,
-                self._format,
-                self._trajectory.n_frames,
-                self._trajectory.n_atoms,
-                last_offset(self._trajectory),
-            )
-            broken = Break(self._trajectory.n_frames, rest) if rest else None
-        # Rounding of the file and of the targets; that of a mean averages out.
-        of_target = np.where(self._from_file & (self._mode != "mean"), half, self._target_error)
-        rounding = self._spread * np.sqrt(half**2 + of_target**2)
-        units = by_unit(self._table, part, bound, rounding)
-        order = np.lexsort((-found.largest, ~violated))
-        worst = [row_result(self._table, self._labels, int(row), part, allowed) for row in order[: self._n_worst]]
-        in_frame = np.zeros(n_frames, dtype=bool)
-        for unit in range(len(UNITS)):
-            rows = found.worst_row[unit]
-            # The worst row of a frame need not be the one that is least allowed, so take the smallest allowance.
-            mine = self._table.units == unit
-            if mine.any():
-                in_frame |= (rows >= 0) & (found.worst[unit] > np.where(rows >= 0, allowed[rows], np.inf))
+        table, held = self._table, self._table.set
+        if part.broken is None and self._to_the_end:
+            n = self._trajectory.n_frames
+            atoms, last = self._trajectory.n_atoms, last_offset(self._trajectory)
+            part.broken = leftover(self._path, self._format, n, atoms, last)
+            try:
+                with quiet():
+                    self._trajectory[n - 1]
+            except READ_ERRORS as error:
+                part.broken = part.broken or self._break(error, n - 1)
+        violated = found.margins > 0
+        beyond_file = found.margins + self._tolerance * table.sizes > 0
+        # Targets that are nothing but rounding.
+        untold = self._measured & (self._of_targets > table.sizes)
+        gaps = gaps_of(part, int(self._measured.sum()), int(untold.sum()), self.target_text)
+        # The rounding of a mean averages out.
+        of_targets = self._of_targets if self._mode != "mean" else np.where(self._measured, 0.0, self._of_targets)
+        rounding = (
+            self._spread
+            / np.maximum(self._reach, np.finfo(float).tiny)
+            * np.hypot(found.mean(found.rounded), of_targets)
+        )
+        units = by_unit(table, part, np.where(untold, 0.0, self._of_targets), rounding, self._tolerance)
+        order = np.lexsort((-np.where(violated, found.margins, found.largest), ~violated))
+        worst = [row_result(table, self._labels, int(row), part) for row in order[: max(self._n_worst, 1)]]
+        in_frame = (found.excess > 0).any(axis=0)
         frames = part.frames[in_frame]
-        status = "violated" if violated.any() else "tolerated" if beyond_file.any() else "kept"
+        status = "tolerated" if beyond_file.any() else "kept"
+        status = "violated" if violated.any() else "incomplete" if gaps else status
         masses = self._unit_masses if self._masses is None else self._masses
         freedom, temperature = None, None
         if self._rank is not None:
             freedom, temperature, remarks = temperature_of(part, self._rank, masses, self._removed)
-            self._remarks.extend(remarks)
+            self.remarks.extend(remarks)
         series = {
             f"{name} {UNITS[unit]}": values[unit].tolist()
             for unit in range(len(UNITS))
             if (self._table.units == unit).any()
-            for name, values in (("largest", found.worst), ("rms", rms_of(self._table, found)))
+            for name, values in (
+                ("largest", found.worst),
+                ("rms", rms_of(found)),
+                ("rounding", found.rounding),
+            )
         }
         if temperature is not None:
             assert freedom is not None
@@ -474,26 +498,34 @@ class ConstraintCheck(AnalysisBase):
             n_constrained=len(held.touched),
             status=status,
             verdict=verdict_of(
-                status, self._tolerance, worst[0], units, (int(violated.sum()), held.n_rows), frames, n_frames
+                status, self._tolerance, worst[0], units, (int(violated.sum()), held.n_rows), frames, n_frames, gaps
             ),
-            precision=self._precision.describe(part.reach),
+            precision=described([self._precision_at(frame) for frame in part.frames.tolist()], part.reach),
             tolerance=self._tolerance,
             targets=self.target_text,
             frames=part.frames.tolist(),
             times=part.times.tolist(),
             n_frames_in_file=int(self._trajectory.n_frames),
             units=units,
-            worst=worst,
+            worst=worst[: self._n_worst],
             violated_rows=int(violated.sum()),
             violated_frames=int(in_frame.sum()),
             first_violated_frame=int(frames[0]) if len(frames) else None,
             rank=self._rank,
             degrees_of_freedom=freedom,
             temperature=temperature,
-            broken=broken,
+            broken=part.broken,
             series=series,
-            remarks=list(self._remarks),
+            gaps=gaps,
+            remarks=list(self.remarks),
         )
+
+
+def _open_ended(start: int | None, stop: int | None, step: int | None, n_frames: int) -> bool:
+    """Whether a slice means the end of a trajectory, wherever it is."""
+    if step is not None and step < 0:
+        start, stop = stop, start
+    return stop is None or stop < 0 or stop > n_frames or (start or 0) < 0
 
 
 def _flat(values: Any) -> NDArray[np.float32]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kcons.errors import InputError
+from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis.check import ConstraintCheck
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.memory import give_back
@@ -56,6 +57,8 @@ def check_trajectory(
     ------
     InputError
         Files that cannot be read, selections that match nothing, unknown names, atom counts that differ.
+    UnreadableError
+        A trajectory of which nothing can be told: cut off, or not finite, in its first frame.
     """
     chosen: dict[str, Any] = _slice(frames)
     if workers < 1:
@@ -79,18 +82,23 @@ def check_trajectory(
             )
         with quiet():
             reader = universe.trajectory
-            largest = float(np.abs(universe.atoms.positions).max(initial=0.0))
-            options["target_error"] = precision_of(topology, format_of(reader)).half_step(largest)
-        constraints = constraints_of(universe, constrain, **held)
+            precision = precision_of(topology, format_of(reader))
+            options["target_error"] = precision.half_step(universe.atoms.positions)
+        constraints, guessed = _rows(universe, constrain, held)
         load_trajectory(universe, trajectory, topology)
         given, text = "given", f"coordinates of {topology}"
     else:
         universe = open_universe(topology, trajectory)
-        constraints = constraints_of(universe, constrain, **held)
+        constraints, guessed = _rows(universe, constrain, held)
         given = str(targets)
     check = ConstraintCheck(universe, constraints, targets=file or given, names=names, **options)
     if text is not None:
         check.target_text = text
+    if guessed:
+        check.remarks.append(
+            f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
+            "topology with bonds, such as PSF, PRMTOP or TPR"
+        )
     # Sets are made anew at the first frame; this one need not stay in memory.
     del constraints
     give_back()
@@ -102,6 +110,19 @@ def check_trajectory(
     del check, universe
     give_back()
     return result
+
+
+def _rows(universe: Any, constrain: str | None, held: dict[str, Any]) -> tuple[Any, int]:
+    """Constraints, and how many bonds were guessed for them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*bonds were guessed", category=UserWarning)
+        try:
+            found = constraints_of(universe, constrain, **held)
+        except InputError as error:
+            if error.item == "positions" and not np.isfinite(universe.atoms.positions).all():
+                raise UnreadableError(f"{universe.trajectory.filename}: {error}", item="trajectory") from None
+            raise
+    return found, found.bonds_guessed
 
 
 def _slice(frames: str | None) -> dict[str, int | None]:

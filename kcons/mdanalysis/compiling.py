@@ -27,8 +27,10 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.errors import KconsError
 from kcons.mdanalysis.dcd import Block
+from kcons.mdanalysis.deviations import Deviations
+from kcons.mdanalysis.precision import FilePrecision
 from kcons.mdanalysis.rank import PIECE, rank_of
-from kcons.mdanalysis.rows import Deviations, RowTable
+from kcons.mdanalysis.rows import RowTable
 from kcons.solvers.frames import coordinate_grid, kinetic
 
 #: Clusters of each kind in a sample: compiled code takes four at once, solvers up to eight.
@@ -112,28 +114,28 @@ class Sample:
         Some of its rows.
     frame : Frame
         Their atoms.
-    grid : float
-        See `RowTable`.
+    precision : FilePrecision
+        Of the file.
     rank : bool
         Whether the rank is asked for.
     """
 
     constraint_set: ConstraintSet
     frame: Frame
-    grid: float
+    precision: FilePrecision
     rank: bool
 
     def use(self) -> None:
         """Compile, or load, all kernels."""
-        x = coordinate_grid(self.frame.x.reshape(-1, 3), self.grid)
-        look_once(RowTable(self.constraint_set, self.grid), self.frame)
+        x = coordinate_grid(self.frame.x.reshape(-1, 3), self.precision.grid)
+        look_once(RowTable(self.constraint_set, self.precision), self.frame)
         if self.rank:
             # The check says so of its own rows.
             with suppress(KconsError):
                 rank_of(self.constraint_set, x)
 
 
-def sample_of(constraint_set: ConstraintSet, frame: Frame, grid: float, rank: bool) -> Sample:
+def sample_of(constraint_set: ConstraintSet, frame: Frame, precision: FilePrecision, rank: bool) -> Sample:
     """A few clusters of each kind: equal numbers of rows, of atoms, and of rows of each sort.
 
     Parameters
@@ -141,8 +143,8 @@ def sample_of(constraint_set: ConstraintSet, frame: Frame, grid: float, rank: bo
     constraint_set : ConstraintSet
     frame : Frame
         Of all atoms of the set.
-    grid : float
-        See `RowTable`.
+    precision : FilePrecision
+        Of the file.
     rank : bool
         Whether the rank is asked for.
     """
@@ -163,7 +165,7 @@ def sample_of(constraint_set: ConstraintSet, frame: Frame, grid: float, rank: bo
     chosen = clusters[order[np.arange(len(order)) - begins < OF_A_KIND]]
     rows = np.flatnonzero(np.isin(of_rows, chosen))[:PIECE]
     part, atoms = constraint_set.subset(rows)
-    return Sample(part, frame.of(atoms), grid, rank)
+    return Sample(part, frame.of(atoms), precision, rank)
 
 
 class _Cold(BaseException):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.frames import lengths, triangles
+from kcons.solvers.frames import farthest, lengths, powers_below, triangles
 
 #: Bytes of a block: what stays in the cache of a core.
 BLOCK = 1 << 20
@@ -180,13 +180,14 @@ def plain_dcd(reader: Any) -> PlainDcd | None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _gather(words, begin, points):  # type: ignore[no-untyped-def]
-    """Coordinates of a frame, atom by atom."""
+def _gather(words, begin, points, powers):  # type: ignore[no-untyped-def]
+    """Coordinates of a frame, atom by atom; see `powers_below`."""
     n = len(points)
     values = words.view(np.float32)
     x, y, z = values[begin + 1 :], values[begin + n + 3 :], values[begin + 2 * n + 5 :]
     for a in range(n):
         points[a, 0], points[a, 1], points[a, 2] = x[a], y[a], z[a]
+    powers_below(points.reshape(-1), powers)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -194,26 +195,30 @@ def look_at(  # type: ignore[no-untyped-def]
     words,
     begin,
     points,
+    powers,
     first,
     summed_every,
     reach_every,
     n_all,
     limits,
     lattices,
-    step,
+    rounding,
     corners,
     corner_targets,
+    corner_slack,
+    corner_margins,
     corner_largest,
-    corner_total,
+    corner_sums,
     places,
     targets,
+    slack,
+    margins,
     largest,
-    total,
-    sums,
-    squares,
-    worst,
+    sums_by_row,
+    found,
     side,
     place,
+    far,
 ):
     """`triangles` and `lengths` of all frames of a block.
 
@@ -223,43 +228,79 @@ def look_at(  # type: ignore[no-untyped-def]
         See `Block`.
     points : ndarray of float32, shape (n_atoms, 3)
         Room; on return the last frame that was looked at.
+    powers : ndarray of float32, shape (n_atoms,)
+        Room.
     first, summed_every, reach_every, n_all : int
         Place of the first frame among n_all; one frame in how many counts in the sums by row, and in the reach.
     limits, lattices : ndarray, shape (n_frames,), (n_frames, 2, 3, 3)
-        See `lengths`.
-    sums, squares, worst, side, place : ndarray, shape (n_frames,)
+        See `lengths`; limits are NaN where the cell is.
+    rounding : (float, float, float)
+        step, base and factor, see `lengths`.
+    found : ndarray, shape (6, n_frames)
+        Filled with what `lengths` returns, but the row.
+    side, place : ndarray, shape (n_frames,)
         Filled. `side` is -1 where the worst row is a single one, and `place` its number.
+    far : ndarray of int32, shape (n_frames,)
+        Filled where `reach_every` says so: see `farthest`.
 
     Returns
     -------
-    done, reach, n_summed
-        Frames until the first that is not finite, the largest coordinate of those that were asked for that, and the
-        number of those that count in the sums.
+    int
+        Frames until the first that is not finite.
     """
     x = points.reshape(-1)
-    reach, n_summed = 0.0, 0
+    step, base, factor = rounding
     has_triangles, has_singles = corner_targets.shape[1] > 0, len(targets) > 0
     for f in range(len(words)):
         k = first + f
-        _gather(words[f], begin, points)
+        _gather(words[f], begin, points, powers)
         summed = k % summed_every == 0
-        sums[f], squares[f], worst[f], side[f], place[f] = 0.0, 0.0, -1.0, -1, 0
+        if np.isnan(limits[f]):
+            return f
+        sums, squares, worst, excess, coarsest, seen = 0.0, 0.0, 0.0, -np.inf, 0.0, 0.0
+        side[f], place[f] = -1, 0
         if has_triangles:
-            sums[f], squares[f], worst[f], side[f], place[f] = triangles(
-                x, corners, corner_targets, limits[f], lattices[f], step, corner_largest, corner_total, summed
+            sums, squares, worst, excess, side[f], place[f], coarsest, seen = triangles(
+                x,
+                corners,
+                corner_targets,
+                corner_slack,
+                limits[f],
+                lattices[f],
+                step,
+                base,
+                factor,
+                powers,
+                corner_margins,
+                corner_largest,
+                corner_sums,
+                summed,
             )
         if has_singles:
-            more, more_squares, most, row = lengths(
-                x, places, targets, limits[f], lattices[f], step, largest, total, summed
+            more, more_squares, most, more_excess, row, coarse, more_seen = lengths(
+                x,
+                places,
+                targets,
+                slack,
+                limits[f],
+                lattices[f],
+                step,
+                base,
+                factor,
+                powers,
+                margins,
+                largest,
+                sums_by_row,
+                summed,
             )
-            sums[f] += more
-            squares[f] += more_squares
-            if most > worst[f]:
-                worst[f], side[f], place[f] = most, -1, row
-        if not squares[f] < np.inf:
-            return f, reach, n_summed
-        n_summed += summed
+            sums, squares, seen = sums + more, squares + more_squares, seen + more_seen
+            worst, coarsest = max(worst, most), max(coarsest, coarse)
+            if more_excess > excess:
+                excess, side[f], place[f] = more_excess, -1, row
+        if not squares < np.inf:
+            return f
+        found[0, f], found[1, f], found[2, f] = sums, squares, worst
+        found[3, f], found[4, f], found[5, f] = excess, coarsest, seen
         if k % reach_every == 0 or k == n_all - 1:
-            for a in range(len(x)):
-                reach = max(reach, np.float64(abs(x[a])))
-    return len(words), reach, n_summed
+            far[f] = farthest(x)
+    return len(words)

@@ -9,26 +9,22 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.mdanalysis.deviations import UNITS, Deviations
 from kcons.mdanalysis.names import AtomNames
 from kcons.mdanalysis.result import Break, RowResult, UnitResult, fitted
-from kcons.mdanalysis.rows import UNITS, Deviations, RowTable
-
-#: Boltzmann's constant in amu Å²/(ps² K).
-BOLTZMANN = 0.831446261815324
-#: Part of the kinetic energy that the centre of mass may have where its motion is removed.
-STILL = 1e-2
+from kcons.mdanalysis.rows import RowTable
 
 
 @dataclass
 class Part:
-    """What one worker found in its frames."""
+    """What one worker found in its frames; `reach` is the largest coordinate, NaN where it was not looked up."""
 
     frames: IntArray
     times: FloatArray
     found: Deviations
     twice_kinetic: FloatArray
     momentum: FloatArray
-    reach: float
+    reach: FloatArray
     broken: Break | None = None
 
     def with_next(self, other: Part) -> Part:
@@ -38,7 +34,7 @@ class Part:
             self.found.with_next(other.found),
             np.concatenate([self.twice_kinetic, other.twice_kinetic]),
             np.concatenate([self.momentum, other.momentum]),
-            max(self.reach, other.reach),
+            np.concatenate([self.reach, other.reach]),
             other.broken,
         )
 
@@ -53,23 +49,37 @@ def joined(parts: Sequence[Part]) -> Part:
     return whole
 
 
-def rms_of(table: RowTable, found: Deviations) -> FloatArray:
+def rms_of(found: Deviations) -> FloatArray:
     """Root mean square over the rows of each unit and frame, shape (units, frames)."""
-    counts = np.array([[np.count_nonzero(table.units == unit)] for unit in range(len(UNITS))])
-    result: FloatArray = np.sqrt(found.squares / np.maximum(counts, 1))
+    result: FloatArray = np.sqrt(found.squares / np.maximum(found.seen, 1))
     return result
 
 
-def by_unit(table: RowTable, part: Part, bound: FloatArray, rounding: FloatArray) -> list[UnitResult]:
-    """All rows of a unit together; `bound` is what rounding may do at most, `rounding` its standard deviation."""
-    found, n_frames = part.found, len(part.frames)
+def by_unit(
+    table: RowTable, part: Part, of_targets: FloatArray, rounding: FloatArray, tolerance: float
+) -> list[UnitResult]:
+    """All rows of a unit together.
+
+    Parameters
+    ----------
+    table : RowTable
+    part : Part
+        All frames.
+    of_targets : ndarray, shape (n_rows,)
+        What rounding makes of the targets, at most.
+    rounding : ndarray, shape (n_rows,)
+        Standard deviation of what rounding makes of the rows.
+    tolerance : float
+    """
+    found = part.found
     result = []
-    rms = rms_of(table, found)
+    rms = rms_of(found)
     for unit, name in enumerate(UNITS):
         mine = table.units == unit
         n = int(mine.sum())
         if not n:
             continue
+        seen = max(float(found.seen[unit].sum()), 1.0)
         rates = np.isfinite(found.rate_squares[unit])
         rate_rms = float(np.sqrt(found.rate_squares[unit][rates].mean() / n)) if rates.any() else None
         result.append(
@@ -77,11 +87,12 @@ def by_unit(table: RowTable, part: Part, bound: FloatArray, rounding: FloatArray
                 unit=name,
                 n_rows=n,
                 largest=float(found.worst[unit].max()),
-                rms=float(np.sqrt(found.squares[unit].sum() / (n * n_frames))),
-                mean=float(found.sums[unit].sum() / (n * n_frames)),
-                bound=float(bound[mine].max()),
+                rms=float(np.sqrt(found.squares[unit].sum() / seen)),
+                mean=float(found.sums[unit].sum() / seen),
+                bound=float(found.rounding[unit].max() + of_targets[mine].max()),
+                tolerance=float(tolerance * table.sizes[mine].min()),
                 rounding_rms=float(np.sqrt(np.mean(rounding[mine] ** 2))),
-                largest_mean=float(np.abs(found.total[mine]).max() / found.n_summed),
+                largest_mean=float(np.abs(found.mean(found.total)[mine]).max()),
                 drift=fitted(part.times, rms[unit]),
                 rate_largest=float(np.nanmax(found.rate_worst[unit])) if rates.any() else None,
                 rate_rms=rate_rms,
@@ -90,15 +101,19 @@ def by_unit(table: RowTable, part: Part, bound: FloatArray, rounding: FloatArray
     return result
 
 
-def row_result(table: RowTable, labels: AtomNames, row: int, part: Part, allowed: FloatArray) -> RowResult:
+def row_result(table: RowTable, labels: AtomNames, row: int, part: Part) -> RowResult:
     """One row, by name."""
     found, held = part.found, table.set
     unit = int(table.units[row])
     item, k = held.locate(row)
     # By row, single precision is kept; by frame, double.
     mine = np.flatnonzero(found.worst_row[unit] == row)
-    at = mine[np.float32(found.worst[unit][mine]) >= np.float32(found.largest[row])]
-    largest = found.worst[unit][at[0]] if len(at) else found.largest[row]
+    at = mine[np.float32(found.excess[unit][mine]) >= np.float32(found.margins[row])]
+    largest, margin = found.largest[row], found.margins[row]
+    if len(at):
+        margin = found.excess[unit][at[0]]
+        if np.float32(found.worst[unit][at[0]]) == np.float32(largest):
+            largest = found.worst[unit][at[0]]
     atoms = item.atoms[k]
     return RowResult(
         row=row,
@@ -107,8 +122,8 @@ def row_result(table: RowTable, labels: AtomNames, row: int, part: Part, allowed
         unit=UNITS[unit],
         target=float(item.target_at(float(part.times[0]))[k]),
         largest=float(largest),
-        mean=float(found.total[row] / found.n_summed),
-        allowed=float(allowed[row]),
+        mean=float(found.mean(found.total)[row]),
+        allowed=float(largest - margin),
         frame=int(part.frames[at[0]]) if len(at) else None,
     )
 
@@ -121,9 +136,12 @@ def verdict_of(
     rows: tuple[int, int],
     frames: IntArray,
     n_frames: int,
+    gaps: Sequence[str],
 ) -> str:
-    """The result in a sentence; `rows`: how many are violated, and of how many."""
+    """The result in a sentence; `rows`: how many are violated, and of how many; `gaps`: what could not be told."""
     most = ", ".join(f"{unit.largest:.2g} {unit.unit} (rounding: up to {unit.bound:.2g})" for unit in units)
+    if status == "incomplete":
+        return f"incomplete: {'; '.join(gaps)}; no violation otherwise in {n_frames} frames: largest deviation {most}"
     if status == "kept":
         return f"kept to the precision of the file: largest deviation {most}"
     if status == "tolerated":
@@ -136,43 +154,39 @@ def verdict_of(
     )
 
 
-def temperature_of(
-    part: Part, rank: int, masses: FloatArray, removed: int | None
-) -> tuple[int, dict[str, float] | None, list[str]]:
-    """Degrees of freedom, temperature where there are velocities and masses, and what to say about them.
+def gaps_of(part: Part, from_frames: int, untold: int, what: str) -> list[str]:
+    """Why a check is no verdict on all that was asked; empty where it is.
 
     Parameters
     ----------
     part : Part
         All frames.
-    rank : int
-        Of the constraints.
-    masses : ndarray, shape (n_atoms,)
-    removed : int, optional
-        Degrees of freedom that the engine took away; found from the total momentum by default.
+    from_frames : int
+        Rows whose targets come from the frames themselves.
+    untold : int
+        Rows whose targets are as imprecise as they are long.
+    what : str
+        Where targets come from.
     """
-    freedom = 3 * int(np.count_nonzero(masses > 0)) - rank
-    twice = part.twice_kinetic
-    has = np.isfinite(twice)
-    if not has.any():
-        return max(freedom - (removed or 0), 0), None, []
-    remarks = []
-    if removed is None:
-        centre = np.einsum("ij,ij->i", part.momentum[has], part.momentum[has]) / masses.sum()
-        still = float(centre.mean()) < STILL * 3 / max(freedom, 1) * float(twice[has].mean())
-        removed = 3 if still and freedom > 3 else 0
-        what = "at rest: 3 degrees of freedom less" if removed else "not at rest: it counts"
-        remarks.append(f"the centre of mass is {what}")
-    freedom -= removed
-    if freedom <= 0:
-        return 0, None, [*remarks, "no temperature: the constraints leave no degree of freedom"]
-    kelvin = twice / (BOLTZMANN * freedom)
-    line = fitted(part.times, kelvin)
-    temperature = {
-        "mean": float(np.nanmean(kelvin)),
-        "deviation": float(np.nanstd(kelvin)),
-        "frames": float(has.sum()),
-        "slope": line.slope if line else float("nan"),
-        "slope_error": line.error if line else float("nan"),
-    }
-    return freedom, temperature, remarks
+    gaps = [] if part.broken is None else [part.broken.text]
+    n_rows = part.found.n_rows
+    if len(part.frames) == 1 and from_frames:
+        which = "targets" if from_frames == n_rows else f"targets of {from_frames} of {n_rows} rows"
+        gaps.append(
+            f"{which} come from the only frame that was looked at, so that it cannot be off; look at more frames, or "
+            "take targets from the topology or a parameter file"
+        )
+    if untold:
+        gaps.append(
+            f"coordinates in {what} are so large that their rounding exceeds the lengths of {untold} of {n_rows} rows: "
+            "these have no targets; begin at another frame, or take targets from the topology or a parameter file"
+        )
+    unseen = n_rows - part.found.seen.sum(axis=0)
+    frames = np.flatnonzero(unseen > 0)
+    if len(frames):
+        gaps.append(
+            f"nothing can be told of up to {unseen.max():.0f} of {n_rows} rows in {len(frames)} of {len(part.frames)} "
+            f"frames, from frame {part.frames[frames[0]]}: coordinates are so large that their rounding exceeds the "
+            "lengths, or atoms coincide"
+        )
+    return gaps

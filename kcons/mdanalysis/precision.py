@@ -2,16 +2,22 @@
 
 A constraint can be told to be kept only to the precision of the file. Formats store a fixed number of decimals
 (XTC, PDB, GRO: a grid) or numbers in single precision (DCD, TRR, NetCDF, H5MD: a part in 2^24 of the coordinate).
+The latter is a matter of every single coordinate: an atom that is far away makes no other one less precise.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from MDAnalysis.lib.util import anyopen
+from numpy.typing import ArrayLike
 
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 #: Formats whose numbers are floats in nanometres, which MDAnalysis turns into angstrom, in single precision again.
@@ -20,6 +26,8 @@ _NANOMETRES = {"TRR", "H5MD", "TNG"}
 _DECIMALS = {"PDB": 3, "ENT": 3, "PDBQT": 3, "XPDB": 3, "PQR": 3, "TRJ": 3, "MDCRD": 3, "CRDBOX": 3, "CRD": 5}
 #: Magic numbers of XTC; files of the second hold more than 2^31 bytes a frame.
 XTC_MAGIC = (1995, 2023)
+#: Half the distance of neighbouring single precision numbers is at most this part of the power of two below them.
+HALF_UNIT = 2.0**-24
 
 
 @dataclass(frozen=True)
@@ -43,20 +51,63 @@ class FilePrecision:
     unit: float = 1.0
     exact: bool = False
 
-    def half_step(self, largest: float) -> float:
-        """Largest error of a coordinate by rounding, where the largest coordinate is `largest`, in angstrom."""
-        singles = 0.5 * float(np.spacing(np.float32(largest)))
-        if self.step > 0:
-            return 0.5 * self.step + (0.0 if self.exact else 2 * singles)
-        if self.unit != 1.0:
-            return singles + 0.5 * self.unit * float(np.spacing(np.float32(largest / self.unit)))
-        return singles
+    @property
+    def grid(self) -> float:
+        """Steps of coordinates that can be had back exactly, in angstrom; 0 if they cannot."""
+        return self.step if self.exact else 0.0
+
+    @property
+    def reach(self) -> float:
+        """Coordinates from this one on, in angstrom, are not told by the step alone: single precision counts.
+
+        Integers of XTC are turned into nanometres, and these into angstrom, with four roundings; they can be had back
+        where these make less than half a step.
+        """
+        return self.step / (8 * HALF_UNIT) if self.exact else 0.0
+
+    def coefficients(self, farthest: float) -> tuple[float, float]:
+        """Error by rounding: at most base + factor 2^e, with 2^e <= |x| < 2^(e+1) for an atom's largest coordinate.
+
+        Parameters
+        ----------
+        farthest : float
+            No coordinate of the frame is larger, in angstrom.
+
+        Returns
+        -------
+        base, factor : float
+        """
+        if self.exact:
+            # Where a number of the grid cannot be had back, the one taken for it is off by twice the four roundings.
+            return 0.5 * self.step, 0.0 if farthest < self.reach else 16 * HALF_UNIT
+        # Rounded once, as stored; then, of decimals or nanometres, by the change to angstrom, where 2^e may be twice
+        # that of the number stored.
+        return 0.5 * self.step, (1 if self.unit == 1.0 and not self.step else 3) * HALF_UNIT
+
+    def half_step(self, coordinates: ArrayLike) -> FloatArray:
+        """Largest error by rounding of the coordinates of atoms; infinite where there are no numbers.
+
+        Parameters
+        ----------
+        coordinates : array_like, shape (..., 3)
+            In angstrom.
+
+        Returns
+        -------
+        ndarray, shape (...)
+        """
+        size = np.abs(np.asarray(coordinates, dtype=np.float64)).max(axis=-1)
+        base, factor = self.coefficients(float(size.max(initial=0.0)))
+        with np.errstate(all="ignore"):
+            below = np.where(size > 0, np.ldexp(1.0, np.frexp(size)[1] - 1), 0.0)
+        result: FloatArray = np.where(np.isfinite(size), base + factor * below, np.inf)
+        return result
 
     def describe(self, largest: float) -> str:
-        """One sentence for a person."""
+        """One sentence for a person, for a frame whose largest coordinate is `largest`."""
         if self.step > 0:
             return f"{self.format} stores coordinates in steps of {self.step:.3g} Å ({self.step / 10:.3g} nm)"
-        step = 2 * self.half_step(largest)
+        step = 2 * float(self.half_step([largest]))
         return (
             f"{self.format} stores coordinates in single precision: steps of {step:.1e} Å where coordinates reach "
             f"{largest:.0f} Å"
@@ -85,7 +136,8 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
             raise InputError(f"the precision is {step}; give a positive step in angstrom, such as 0.001", item="step")
         return FilePrecision(name, float(step))
     if name == "XTC":
-        per_nanometre = _xtc_precision(path)
+        with open(path, "rb") as file:
+            per_nanometre = _xtc_precision(file)
         return (
             FilePrecision(name, 10.0 / per_nanometre, exact=True) if per_nanometre else FilePrecision(name, unit=10.0)
         )
@@ -98,10 +150,38 @@ def precision_of(path: str | Path, file_format: str, step: float | None = None) 
     return FilePrecision(name, unit=10.0 if name in _NANOMETRES else 1.0)
 
 
-def _xtc_precision(path: str | Path) -> float:
-    """Steps in a nanometre, from the first frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
+def described(precisions: Sequence[FilePrecision], reach: FloatArray) -> str:
+    """Precision of frames, whose largest coordinates are `reach` or NaN, in a sentence; that of a usual frame."""
+    steps = {one.step for one in precisions}
+    if len(steps) > 1:
+        return f"{precisions[0].format} stores coordinates in steps of {min(steps):.3g} to {max(steps):.3g} Å, by frame"
+    known = reach[np.isfinite(reach)]
+    return precisions[0].describe(float(np.median(known)) if len(known) else 0.0)
+
+
+def by_frame(path: str | Path, offsets: Sequence[int], usual: FilePrecision) -> list[FilePrecision] | None:
+    """Precision of each frame of an XTC file that was put together from several; None where all have the usual one.
+
+    Parameters
+    ----------
+    path : path
+    offsets : sequence of int
+        Where frames begin.
+    usual : FilePrecision
+        Of the first one.
+    """
     with open(path, "rb") as file:
-        head = file.read(60)
+        found = [_xtc_precision(file, int(offset)) for offset in offsets]
+    if len(set(found)) < 2:
+        return None
+    kinds = {steps: replace(usual, step=10.0 / steps, exact=True) if steps else usual for steps in set(found)}
+    return [kinds[steps] for steps in found]
+
+
+def _xtc_precision(file: BinaryIO, offset: int = 0) -> float:
+    """Steps in a nanometre, from a frame; 1000 is usual. 0 for floats, as which up to 9 atoms are stored."""
+    file.seek(offset)
+    head = file.read(60)
     if len(head) < 60:
         return 1000.0
     magic, n_atoms = struct.unpack(">2i", head[:8])
@@ -113,16 +193,19 @@ def _xtc_precision(path: str | Path) -> float:
     return float(precision)
 
 
+def _third_line(path: str | Path) -> str:
+    """Of a text file, compressed or not."""
+    with anyopen(str(path), "rb") as file:
+        lines: list[bytes] = [file.readline() for _ in range(3)]
+    return lines[2].decode("ascii", "replace")
+
+
 def _gro_decimals(path: str | Path) -> int:
     """Columns are n + 5 wide for n decimals, so that two points are n + 5 apart."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [file.readline() for _ in range(3)]
-    points = [k for k, c in enumerate(lines[2]) if c == "."]
+    points = [k for k, c in enumerate(_third_line(path)) if c == "."]
     return points[1] - points[0] - 5 if len(points) > 1 else 3
 
 
 def _xyz_decimals(path: str | Path) -> int:
-    with open(path, encoding="utf-8", errors="replace") as file:
-        lines = [file.readline() for _ in range(3)]
-    words = lines[2].split()
+    words = _third_line(path).split()
     return len(words[1].partition(".")[2]) if len(words) > 3 and "e" not in words[1].lower() else 6

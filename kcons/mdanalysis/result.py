@@ -49,7 +49,9 @@ class UnitResult:
     largest, rms, mean : float
         Over all rows and frames: largest absolute deviation, root mean square, mean.
     bound : float
-        What rounding in the file makes of a row that is kept, at most.
+        What rounding in the file makes of a row that is kept, at most, in the frame and row where it makes most.
+    tolerance : float
+        What the tolerance allows the shortest row, besides rounding.
     rounding_rms : float
         The root mean square of rounding alone.
     largest_mean : float
@@ -66,6 +68,7 @@ class UnitResult:
     rms: float
     mean: float
     bound: float
+    tolerance: float
     rounding_rms: float
     largest_mean: float
     drift: Drift | None
@@ -75,7 +78,22 @@ class UnitResult:
 
 @dataclass(frozen=True)
 class RowResult:
-    """One of the worst rows."""
+    """One of the worst rows.
+
+    Attributes
+    ----------
+    row : int
+    name : str
+    atoms : list of int
+    unit : str
+    target : float
+    largest, allowed : float
+        Absolute deviation and what was allowed, in the frame where the first exceeds the second most.
+    mean : float
+        Over the frames.
+    frame : int or None
+        That frame, where this row exceeded more than the others; None where another did.
+    """
 
     row: int
     name: str
@@ -90,10 +108,27 @@ class RowResult:
 
 @dataclass(frozen=True)
 class Break:
-    """Where a trajectory cannot be read any further."""
+    """Where a trajectory cannot be read any further.
+
+    Attributes
+    ----------
+    frame : int
+        The first frame that cannot be used.
+    reason : str
+    ends : bool
+        Whether the file ends or is damaged there; else it can be read but its numbers are none.
+    """
 
     frame: int
     reason: str
+    ends: bool = True
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        if self.ends:
+            return f"the file ends too early, at frame {self.frame}: {self.reason}"
+        return f"frame {self.frame} cannot be used, nor what follows: {self.reason}"
 
 
 @dataclass
@@ -102,8 +137,9 @@ class CheckResult:
 
     Attributes
     ----------
-    status : {'kept', 'tolerated', 'violated'}
-        Kept to the precision of the file; kept to the tolerance given; neither.
+    status : {'kept', 'tolerated', 'violated', 'incomplete'}
+        Kept to the precision of the file; kept to the tolerance given; neither; no violation, but not all that was
+        asked could be told, see `gaps`.
     verdict : str
         The same in a sentence.
     frames, times : list
@@ -112,13 +148,16 @@ class CheckResult:
     worst : list of RowResult
         Violated rows first, then by their largest deviation.
     series : dict
-        Numbers by frame: largest and root mean square deviation for each unit, temperature.
+        Numbers by frame: largest and root mean square deviation, and the largest that rounding makes, for each unit;
+        temperature.
     rank, degrees_of_freedom : int or None
         None where the rank could not be found; see `remarks`.
     temperature : dict or None
         Mean, standard deviation and drift in K; None without velocities or masses.
     broken : Break or None
-        Where the file ends too early.
+        Where the file ends too early, or is no longer numbers.
+    gaps : list of str
+        Why the check is no verdict on all that was asked.
     """
 
     trajectory: str
@@ -144,6 +183,7 @@ class CheckResult:
     temperature: dict[str, float] | None
     broken: Break | None
     series: dict[str, list[float]]
+    gaps: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -15,70 +14,29 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.dcd import Block, look_at
-from kcons.solvers.frames import LANES, coordinate_grid, length_rates, lengths, padded, triangles
+from kcons.mdanalysis.deviations import UNITS, Deviations
+from kcons.mdanalysis.precision import FilePrecision
+from kcons.solvers.frames import (
+    LANES,
+    UNIFORM,
+    coordinate_grid,
+    farthest,
+    filled,
+    length_rates,
+    lengths,
+    padded,
+    powers_below,
+    triangles,
+)
 from kcons.solvers.lattice import NO_LATTICE
 
-#: Natural units of rows, in this order.
-UNITS = ("Å", "rad")
+#: What second order adds to the error of rows other than distances, at most.
+SECOND_ORDER = 1.1
 
 
 def unit_of(item: Constraint) -> int:
     """Which of `UNITS` the coordinate of a constraint has; coordinates of one's own count as lengths."""
     return int(item.family in ("Angle", "Dihedral") or item.period is not None)
-
-
-@dataclass
-class Deviations:
-    """What was found in some frames: by row, and by unit (see `UNITS`) in each frame.
-
-    Attributes
-    ----------
-    largest, total : ndarray, shape (n_rows,)
-        Largest absolute deviation; sum of the deviations over the frames that were summed.
-    n_summed : int
-        How many these are.
-    worst, worst_row, sums, squares : ndarray, shape (n_units, n_frames)
-        In each frame: the largest absolute deviation and its row, sum and sum of squares.
-    rate_worst, rate_row, rate_squares : ndarray, shape (n_units, n_frames)
-        The same of A v, NaN without velocities.
-    """
-
-    n_rows: int
-    n_frames: int
-    n_summed: int = 0
-    largest: FloatArray = field(init=False)
-    total: FloatArray = field(init=False)
-    worst: FloatArray = field(init=False)
-    worst_row: IntArray = field(init=False)
-    sums: FloatArray = field(init=False)
-    squares: FloatArray = field(init=False)
-    rate_worst: FloatArray = field(init=False)
-    rate_row: IntArray = field(init=False)
-    rate_squares: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.largest, self.total = np.zeros(self.n_rows), np.zeros(self.n_rows)
-        shape = (len(UNITS), self.n_frames)
-        self.worst, self.sums, self.squares = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self.rate_worst, self.rate_squares = np.full(shape, np.nan), np.full(shape, np.nan)
-        self.worst_row, self.rate_row = np.full(shape, -1, np.int64), np.full(shape, -1, np.int64)
-
-    def cut(self, n_frames: int) -> None:
-        """Leave out what was not reached."""
-        self.n_frames = n_frames
-        for name in ("worst", "sums", "squares", "rate_worst", "rate_squares", "worst_row", "rate_row"):
-            setattr(self, name, getattr(self, name)[:, :n_frames])
-
-    def with_next(self, other: Deviations) -> Deviations:
-        """Both, one after the other."""
-        both = Deviations(self.n_rows, 0)
-        both.n_frames = self.n_frames + other.n_frames
-        both.largest = np.maximum(self.largest, other.largest)
-        both.total = self.total + other.total
-        both.n_summed = self.n_summed + other.n_summed
-        for name in ("worst", "sums", "squares", "rate_worst", "rate_squares", "worst_row", "rate_row"):
-            setattr(both, name, np.concatenate([getattr(self, name), getattr(other, name)], axis=1))
-        return both
 
 
 class RowTable:
@@ -88,19 +46,22 @@ class RowTable:
     ----------
     constraint_set : ConstraintSet
         In angstrom, with all targets.
-    grid : float
-        Steps of the coordinates in the file, in angstrom, where these can be had back exactly; 0 otherwise.
+    precision : FilePrecision
+        Of the coordinates in the file; may be changed from frame to frame.
     """
 
-    def __init__(self, constraint_set: ConstraintSet, grid: float) -> None:
+    def __init__(self, constraint_set: ConstraintSet, precision: FilePrecision) -> None:
         self.set = constraint_set
-        self.grid = grid
+        self.precision = precision
         self._dimensions: tuple[float, ...] = ()
         self._box = np.zeros((2, 3, 3))
         self._cell: tuple[FloatArray, float] = NO_LATTICE, np.inf
         self.units: IntArray = np.concatenate(
             [np.full(c.n_rows, unit_of(c), dtype=np.int64) for c in constraint_set.constraints] or [np.zeros(0, int)]
         )
+        periodic = np.concatenate([np.full(c.n_rows, c.period is not None) for c in constraint_set.constraints])
+        #: What a tolerance is a part of: the length held; 1 rad.
+        self.sizes: FloatArray = np.where(periodic, 1.0, constraint_set.scale)
         none = np.zeros(0, dtype=np.int64)
         pairs, held, length_rows, other_rows = [np.zeros((0, 2), np.int64)], [np.zeros(0)], [none], [none]
         for item, first, end in zip(
@@ -122,17 +83,29 @@ class RowTable:
         single[sides.ravel()] = False
         self._triangle_rows = self.length_rows[sides]
         corners = np.stack([self._pairs[sides[0], 0], self._pairs[sides[0], 1], self._pairs[sides[1], 1]])
-        self._corners = np.ascontiguousarray(3 * corners, dtype=np.uint32)
+        self._corners = np.ascontiguousarray(corners, dtype=np.uint32)
         self._triangle_targets = np.ascontiguousarray(wanted[sides])
-        self._triangle_largest, self._triangle_total = np.zeros(sides.shape, np.float32), np.zeros(sides.shape)
         self._single_rows = self.length_rows[single]
         self._places, self._targets = padded(self._pairs[single], wanted[single])
-        self._largest, self._total = np.zeros(len(self._targets), np.float32), np.zeros(len(self._targets))
         self._others: ConstraintSet | None = None
         if len(self.other_rows):
             self._others, self._other_atoms = constraint_set.subset(self.other_rows)
             self._other_units = self.units[self.other_rows]
-            self._holonomic = self._others.holonomic
+        self.allow(np.zeros(constraint_set.n_rows))
+
+    def allow(self, slack: FloatArray) -> None:
+        """Say what each row may be off by, besides the rounding of its coordinates; shape (n_rows,)."""
+        self._slack = slack
+        self._triangle_slack = np.ascontiguousarray(slack[self._triangle_rows])
+        self._single_slack = filled(slack[self._single_rows])
+
+    def _forget(self) -> None:
+        """Begin anew, with room of one's own."""
+        self._powers = np.zeros(self.set.n_atoms, dtype=np.float32)
+        triangles, singles = self._triangle_targets.shape, self._targets.shape
+        self._triangle_margins, self._margins = (np.full(n, -np.inf, np.float32) for n in (triangles, singles))
+        self._triangle_largest, self._largest = (np.zeros(n, np.float32) for n in (triangles, singles))
+        self._triangle_sums, self._sums = np.zeros((3, *triangles)), np.zeros((3, *singles))
 
     @property
     def only_lengths(self) -> bool:
@@ -140,20 +113,54 @@ class RowTable:
         return self._others is None
 
     def fresh(self) -> RowTable:
-        """One that shares all but what is changed while frames are looked at; each worker needs its own."""
+        """One that shares all but what is changed while frames are looked at; each worker needs its own to look."""
         other = copy.copy(self)
         other._box, other._dimensions = np.zeros((2, 3, 3)), ()
-        for name in ("_largest", "_total", "_triangle_largest", "_triangle_total"):
-            setattr(other, name, np.zeros_like(getattr(self, name)))
+        other._forget()
         return other
+
+    def errors_of(
+        self, errors: FloatArray, positions: FloatArray, dimensions: NDArray[np.float32] | None, time: float
+    ) -> FloatArray:
+        """What errors of the coordinates of one frame make of each row, at most, shape (n_rows,).
+
+        Parameters
+        ----------
+        errors : ndarray, shape (n_atoms,)
+            Of each coordinate of an atom, at most, in angstrom; see `FilePrecision.half_step`.
+        positions : ndarray, shape (n_atoms, 3)
+            In angstrom.
+        dimensions : ndarray or None
+            Lengths and angles of the cell.
+        time : float
+        """
+        result = np.zeros(self.set.n_rows)
+        i, j = self._pairs.T
+        result[self.length_rows] = np.sqrt(3.0) * (errors[i] + errors[j])
+        if self._others is not None:
+            lattice, limit = self.cell_of(dimensions)
+            self._others.lattice = lattice if limit < np.inf else None
+            atoms = self._other_atoms
+            with np.errstate(all="ignore"):
+                slopes = self._others.jacobian(positions[atoms], time)
+            result[self.other_rows] = self._rounding_of_others(slopes, errors[atoms])
+        return result
+
+    def _rounding_of_others(self, slopes: Any, errors: FloatArray) -> FloatArray:
+        """First order, and some more; rows that hold velocities only have no position to be off."""
+        others = cast(ConstraintSet, self._others)
+        result: FloatArray = np.where(others.holonomic, SECOND_ORDER * (abs(slopes) @ np.repeat(errors, 3)), 0.0)
+        return result
 
     # -- cell -----------------------------------------------------------------------------------
 
     def cell_of(self, dimensions: NDArray[np.float32] | None) -> tuple[FloatArray, float]:
-        """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width."""
+        """Cell with its inverse, shape (2, 3, 3), and the square of half its smallest width; NaN where the cell is."""
         if dimensions is None:
             return NO_LATTICE, np.inf
         values = tuple(dimensions.tolist())
+        if not np.isfinite(dimensions).all():
+            return NO_LATTICE, np.nan
         if values != self._dimensions:
             self._dimensions, self._cell = values, self._new_cell(values)
         return self._cell
@@ -201,41 +208,65 @@ class RowTable:
         Raises
         ------
         NonFiniteError
-            A coordinate of a held atom is NaN or infinite.
+            A coordinate of a held atom, a velocity or the cell is NaN or infinite.
         """
         lattice, limit = self.cell_of(dimensions)
-        into.n_summed += summed
+        if np.isnan(limit):
+            self.refuse(x, dimensions)
+        if v is not None and not np.isfinite(size_of(farthest(v))):
+            atom = int(np.argmin(np.isfinite(v.reshape(-1, 3)).all(axis=1)))
+            raise NonFiniteError(f"velocity of atom {atom} is {v.reshape(-1, 3)[atom]}", item="velocity", atom=atom)
         if len(self.length_rows):
-            sums, squares, worst, row = 0.0, 0.0, -1.0, -1
+            far = size_of(farthest(x)) if self.precision.exact else 0.0
+            base, factor = self.precision.coefficients(far)
+            powers = UNIFORM
+            if factor > 0:
+                powers = self._powers
+                powers_below(x, powers)
+            rounding = (self.precision.grid, base, factor, powers)
+            here, row = into.by_frame[0, :, k], -1
             if self._triangle_rows.size:
-                sums, squares, worst, side, triangle = triangles(
+                *found, side, triangle, coarsest, seen = triangles(
                     x,
                     self._corners,
                     self._triangle_targets,
+                    self._triangle_slack,
                     limit,
                     lattice,
-                    self.grid,
+                    *rounding,
+                    self._triangle_margins,
                     self._triangle_largest,
-                    self._triangle_total,
+                    self._triangle_sums,
                     summed,
                 )
+                here[:] = (*found, coarsest, seen)
                 row = self._triangle_rows[side, triangle]
             if len(self._single_rows):
-                more, more_squares, largest, k_worst = lengths(
-                    x, self._places, self._targets, limit, lattice, self.grid, self._largest, self._total, summed
+                sums, squares, worst, excess, place, coarsest, seen = lengths(
+                    x,
+                    self._places,
+                    self._targets,
+                    self._single_slack,
+                    limit,
+                    lattice,
+                    *rounding,
+                    self._margins,
+                    self._largest,
+                    self._sums,
+                    summed,
                 )
-                sums, squares = sums + more, squares + more_squares
-                if largest > worst:
-                    worst, row = largest, self._single_rows[min(k_worst, len(self._single_rows) - 1)]
-            if not squares < np.inf:
+                if excess > here[3]:
+                    row = self._single_rows[min(place, len(self._single_rows) - 1)]
+                here[[0, 1, 5]] += sums, squares, seen + len(self._single_rows) - len(self._targets)
+                here[2:5] = np.maximum(here[2:5], (worst, excess, coarsest))
+            if not here[1] < np.inf:
                 self.refuse(x)
-            into.sums[0, k], into.squares[0, k] = sums, squares
-            into.worst[0, k], into.worst_row[0, k] = worst, row
+            into.worst_row[0, k] = row
             if v is not None:
                 if self._all_places is None:
                     self._all_places, _ = padded(self._pairs, 0.0)
                 n = len(self.length_rows)
-                squares, worst, row = length_rates(x, v, self._all_places, n, limit, lattice, self.grid)
+                squares, worst, row = length_rates(x, v, self._all_places, n, limit, lattice, self.precision.grid)
                 into.rate_squares[0, k] = squares
                 into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
         if self._others is not None:
@@ -248,7 +279,7 @@ class RowTable:
         block: Block,
         points: NDArray[np.float32],
         every: tuple[int, int],
-    ) -> tuple[int, float]:
+    ) -> tuple[int, FloatArray]:
         """Put what is found in the frames of a block into the k-th place and those that follow; lengths only.
 
         Parameters
@@ -256,11 +287,11 @@ class RowTable:
         points : ndarray of float32, shape (n_atoms, 3)
             Room for a frame; on return the last one that was looked at.
         every : (int, int)
-            One frame in how many counts in the sums by row, and in the largest coordinate.
+            One frame in how many counts in the sums by row, and has its largest coordinate looked up.
 
         Returns
         -------
-        Frames until the first that is not finite, and the largest coordinate.
+        Frames until the first that is not finite, and the largest coordinates of frames, NaN where not looked up.
         """
         n = len(block.words)
         lattices, limits = np.empty((n, 2, 3, 3)), np.empty(n)
@@ -271,36 +302,41 @@ class RowTable:
             lattices[1:], limits[1:] = lattices[0], limits[0]
         here = slice(k, k + n)
         side, place = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        done, reach, n_summed = look_at(
+        far = np.full(n, np.float32(np.nan).view(np.int32))
+        done = look_at(
             block.words,
             block.x,
             points,
+            self._powers,
             k,
             *every,
             into.n_frames,
             limits,
             lattices,
-            self.grid,
+            (0.0, *self.precision.coefficients(0.0)),
             self._corners,
             self._triangle_targets,
+            self._triangle_slack,
+            self._triangle_margins,
             self._triangle_largest,
-            self._triangle_total,
+            self._triangle_sums,
             self._places,
             self._targets,
+            self._single_slack,
+            self._margins,
             self._largest,
-            self._total,
-            into.sums[0, here],
-            into.squares[0, here],
-            into.worst[0, here],
+            self._sums,
+            into.by_frame[0, :, here],
             side,
             place,
+            far,
         )
-        into.n_summed += n_summed
+        into.seen[0, k : k + done] -= len(self._targets) - len(self._single_rows)
         rows = np.where(
             side < 0, self._row_of(self._single_rows, place), self._row_of(self._triangle_rows, place, side)
         )
         into.worst_row[0, here] = rows
-        return done, reach
+        return done, size_of(far)
 
     @staticmethod
     def _row_of(rows: IntArray, place: IntArray, side: IntArray | None = None) -> IntArray:
@@ -313,15 +349,13 @@ class RowTable:
         return result
 
     def collect(self, into: Deviations) -> None:
-        """Put what was found by row where it belongs, and begin anew."""
+        """Put what was found by row where it belongs."""
         n = len(self._single_rows)
-        into.largest[self._single_rows], into.total[self._single_rows] = self._largest[:n], self._total[:n]
-        into.largest[self._triangle_rows], into.total[self._triangle_rows] = (
-            self._triangle_largest,
-            self._triangle_total,
-        )
-        for array in (self._largest, self._total, self._triangle_largest, self._triangle_total):
-            array[...] = 0.0
+        for rows, margins, largest, sums in (
+            (self._single_rows, self._margins[:n], self._largest[:n], self._sums[:, :n]),
+            (self._triangle_rows, self._triangle_margins, self._triangle_largest, self._triangle_sums),
+        ):
+            into.margins[rows], into.largest[rows], into.by_row[:, rows] = margins, largest, sums
 
     def _look_at_others(
         self,
@@ -333,29 +367,39 @@ class RowTable:
         time: float,
         summed: bool,
     ) -> None:
-        others = cast(ConstraintSet, self._others)
+        others, rows = cast(ConstraintSet, self._others), self.other_rows
         others.lattice = lattice
-        here = coordinate_grid(x.reshape(-1, 3)[self._other_atoms], self.grid)
+        here = coordinate_grid(x.reshape(-1, 3)[self._other_atoms], self.precision.grid)
         with np.errstate(all="ignore"):
             off = others.value(here, time)
-        if not np.isfinite(off).all():
-            self.refuse(x)
-        size = np.abs(off)
-        into.largest[self.other_rows] = np.maximum(into.largest[self.other_rows], size)
+            if not np.isfinite(here).all():
+                self.refuse(x)
+            slopes = others.jacobian(here, time)
+            rounding = self._rounding_of_others(slopes, self.precision.half_step(here))
+        # Where atoms coincide, an angle is no number, nor is its rounding.
+        clear = np.isfinite(off) & (rounding <= np.maximum(self.sizes[rows], self._slack[rows]))
+        off, rounding = np.where(clear, off, 0.0), np.where(np.isfinite(rounding), rounding, np.inf)
+        size, known = np.abs(off), np.where(clear, rounding, 0.0)
+        margin = size - rounding - self._slack[rows]
+        new = margin > into.margins[rows]
+        into.margins[rows[new]], into.largest[rows[new]] = margin[new], size[new]
         if summed:
-            into.total[self.other_rows] += off
+            into.by_row[:, rows] += off, known, clear
         for unit in range(len(UNITS)):
             mine = self._other_units == unit
             if mine.any():
-                into.sums[unit, k] += off[mine].sum()
-                into.squares[unit, k] += off[mine] @ off[mine]
-                best = int(np.argmax(np.where(mine, size, -1.0)))
-                if into.worst_row[unit, k] < 0 or size[best] > into.worst[unit, k]:
-                    into.worst[unit, k], into.worst_row[unit, k] = size[best], self.other_rows[best]
+                now = into.by_frame[unit, :, k]
+                best = int(np.argmax(np.where(mine, margin, -np.inf)))
+                if margin[best] > now[3]:
+                    into.worst_row[unit, k] = rows[best]
+                now[[0, 1, 5]] += off[mine].sum(), off[mine] @ off[mine], np.count_nonzero(clear & mine)
+                now[2:5] = np.maximum(now[2:5], (size[mine].max(), margin[best], known[mine].max()))
         if v is None:
             return
         speeds = v.reshape(-1, 3)[self._other_atoms].astype(np.float64)
-        rates = np.abs(others.jacobian(here, time) @ speeds.ravel() - others.velocity_target(here, time))
+        with np.errstate(all="ignore"):
+            rates = np.abs(slopes @ speeds.ravel() - others.velocity_target(here, time))
+        rates = np.where(clear, rates, 0.0)
         for unit in range(len(UNITS)):
             mine = self._other_units == unit
             if mine.any():
@@ -363,15 +407,29 @@ class RowTable:
                 before = into.rate_squares[unit, k]
                 into.rate_squares[unit, k] = (0.0 if np.isnan(before) else before) + rates[mine] @ rates[mine]
                 if not into.rate_worst[unit, k] >= rates[best]:
-                    into.rate_worst[unit, k], into.rate_row[unit, k] = rates[best], self.other_rows[best]
+                    into.rate_worst[unit, k], into.rate_row[unit, k] = rates[best], rows[best]
 
-    def refuse(self, x: NDArray[np.float32]) -> None:
-        """Say which atom of a frame makes it undefined."""
+    def refuse(self, x: NDArray[np.float32], dimensions: NDArray[np.float32] | None = None) -> None:
+        """Say what makes a frame undefined: its cell, or which atom.
+
+        Raises
+        ------
+        NonFiniteError
+        """
+        if dimensions is not None and not np.isfinite(dimensions).all():
+            shown = ", ".join(f"{value:g}" for value in dimensions)
+            raise NonFiniteError(f"the cell is ({shown})", item="cell")
         points = x.reshape(-1, 3)
         bad = self.set.touched[~np.isfinite(points[self.set.touched]).all(axis=1)]
         if len(bad):
             raise NonFiniteError(f"position of atom {bad[0]} is {points[bad[0]]}", item="position", atom=int(bad[0]))
-        raise NonFiniteError("a row is undefined: atoms coincide or are collinear", item="position")
+        raise NonFiniteError("a length is no number", item="position")
+
+
+def size_of(bits: Any) -> Any:
+    """What `farthest` found, as a number."""
+    found = np.asarray(bits, dtype=np.int32).view(np.float32)
+    return found.astype(np.float64) if found.ndim else float(found)
 
 
 def _triangles(pairs: IntArray) -> IntArray:

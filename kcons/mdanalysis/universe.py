@@ -133,7 +133,7 @@ def _hint(group: Any, words: str) -> str:
                 return f": no {keyword} {given}{near_misses(given, present)}; there are {listed(present)}"
     if "resid" in tokens and hasattr(group, "resids"):
         return f"; residues are numbered {group.resids.min()} to {group.resids.max()}"
-    return "; look at universe.atoms for what there is"
+    return "; names are those of the topology, case counts"
 
 
 def snapshot_of(universe: Any) -> Snapshot:

@@ -95,7 +95,8 @@ class TrajectoryWriter:
     Raises
     ------
     InputError
-        MDAnalysis does not write this format, or not several frames.
+        MDAnalysis does not write this format, or not several frames; beside it lies a file of another trajectory where
+        that of the constraints would go.
     UnsupportedError
         Velocities or forces are asked of a format without them; H5MD without h5py.
 
@@ -133,6 +134,8 @@ class TrajectoryWriter:
         for asked, what in ((velocities, "velocities"), (forces, "forces")):
             if asked and not able:
                 raise UnsupportedError(f"{self._format} has no {what}; write TRR or H5MD")
+        if motion is not None and self._format != "H5MD":
+            self._refuse_others()
         self._with_velocities = able if velocities is None else velocities
         self._with_forces = forces
         self._universe = MDAnalysis.Universe.empty(
@@ -156,6 +159,27 @@ class TrajectoryWriter:
             ) from None
         except RuntimeError as error:
             raise UnsupportedError(f"{self.path.name}: {error}") from None
+
+    @property
+    def _side_title(self) -> str:
+        return f"# constraints of {self.path.name}, in "
+
+    def _refuse_others(self) -> None:
+        """The file beside the trajectory takes the place of its own older self only."""
+        side = self.path.with_suffix(".xvg")
+        if side.is_symlink():
+            mine = False
+        elif side.is_file():
+            with side.open(encoding="utf-8", errors="replace") as file:
+                mine = file.readline().startswith(self._side_title)
+        else:
+            mine = not side.exists()
+        if not mine:
+            raise InputError(
+                f"{side} is not of {self.path.name}: residuals are not written over it; move it away, or give the "
+                "trajectory another name",
+                item="path",
+            )
 
     # -- writing --------------------------------------------------------------------------------
 
@@ -269,7 +293,7 @@ class TrajectoryWriter:
             if multipliers is not None and held is not None:
                 columns += [f"multiplier {held.row_name(k)}" for k in range(len(multipliers))]
             self._width = len(columns)
-            print(f"# constraints of {self.path.name}, in {self.units.name}; time in ps", file=self._side)
+            print(f"{self._side_title}{self.units.name}; time in ps", file=self._side)
             for k, column in enumerate(columns):
                 print(f'@ s{k} legend "{column}"', file=self._side)
         sigma, rates = extras["residuals"], extras.get("velocity_residuals")

@@ -148,7 +148,7 @@ def from_file(
         raise InputError(f"there is no file {path}", item="file")
     try:
         kind = app.PDBFile if path.suffix.lower() in (".pdb", ".ent") else app.PDBxFile
-        molecule = kind(StringIO(path.read_text()))
+        molecule = kind(StringIO(path.read_text(encoding="utf-8", errors="replace")))
         topology, x = molecule.topology, _nanometers(molecule)
     except Exception as error:  # OpenMM's readers raise whatever went wrong inside of them
         raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}", item="file") from error

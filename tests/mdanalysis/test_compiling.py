@@ -16,6 +16,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
 from kcons.mdanalysis import compiling
 from kcons.mdanalysis.compiling import Frame, compiled_elsewhere, sample_of
+from kcons.mdanalysis.precision import FilePrecision
 
 N = 40
 #: A check in a process of its own: kernels of kcons that it compiled itself, and other processes that it started.
@@ -84,7 +85,7 @@ def test_a_sample_has_a_few_clusters_of_each_kind():
     bonds = end + np.arange(2 * n).reshape(-1, 2)
     bends = 5 * n + np.arange(3 * n).reshape(-1, 3)
     held = ConstraintSet([Distance(pairs), Distance(bonds), Angle(bends)], x, np.ones(len(x)))
-    sample = sample_of(held, frame(x), 0.01, True)
+    sample = sample_of(held, frame(x), FilePrecision("XTC", 0.01, exact=True), True)
     few = compiling.OF_A_KIND
     part = sample.constraint_set
     assert [(item.family, item.n_rows) for item in part.constraints] == [
@@ -94,7 +95,7 @@ def test_a_sample_has_a_few_clusters_of_each_kind():
     ]
     assert part.n_atoms == 8 * few == len(sample.frame.x) / 3
     np.testing.assert_allclose(part.value(sample.frame.x.reshape(-1, 3).astype(float)), 0.0, atol=1e-4)
-    assert (sample.grid, sample.rank) == (0.01, True)
+    assert (sample.precision.grid, sample.rank) == (0.01, True)
     sample.use()
 
 

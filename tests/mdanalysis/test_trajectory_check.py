@@ -315,8 +315,8 @@ def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
     path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
     result = checked(path, Distance(files.pairs(N), files.targets(N)), masses=False)
     assert result.rank == 3 * N and result.temperature is None
-    assert any("no masses" in remark and "guess_TopologyAttrs" in remark for remark in result.remarks)
-    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*guess_TopologyAttrs"):
+    assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
+    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
         checked(path, CenterOfMass([0, 1, 2]), masses=False)
 
 

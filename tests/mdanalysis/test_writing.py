@@ -34,6 +34,30 @@ def system():
     return made, made.initial_state(x, motion.project_velocities(x, v)), motion
 
 
+@pytest.mark.parametrize("what", ["another trajectory's", "an engine's", "a link"])
+def test_residuals_of_another_trajectory_are_not_overwritten(tmp_path, what):
+    """run.trr and run.xtc would both have run.xvg; so would what GROMACS writes."""
+    _, _, motion = system()
+    side = tmp_path / "run.xvg"
+    x = files.whole(files.water(N, 1))[0]
+    if what == "another trajectory's":
+        with TrajectoryWriter(tmp_path / "run.trr", 3 * N, motion=motion) as writer:
+            writer.write(x)
+        # Its own older self it may replace.
+        with TrajectoryWriter(tmp_path / "run.trr", 3 * N, motion=motion) as writer:
+            writer.write(x)
+    elif what == "an engine's":
+        side.write_text("# This file was created by an engine\n")
+    else:
+        side.symlink_to(tmp_path / "elsewhere")
+    before = side.read_bytes() if side.exists() else None
+    with pytest.raises(InputError, match=r"run\.xvg is not of run\.xtc.*another name") as error:
+        TrajectoryWriter(tmp_path / "run.xtc", 3 * N, motion=motion)
+    assert error.value.item == "path" and not (tmp_path / "run.xtc").exists()
+    assert (side.read_bytes() if side.exists() else None) == before and not (tmp_path / "elsewhere").exists()
+    TrajectoryWriter(tmp_path / "run.xtc", 3 * N).close()
+
+
 def read(path):
     made = files.universe(N)
     load_trajectory(made, path)

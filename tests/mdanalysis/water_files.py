@@ -82,6 +82,27 @@ def write(
     return path
 
 
+def write_text(path: Path, x: np.ndarray) -> Path:
+    """A dump of LAMMPS, coordinates of AMBER, or an archive of Tinker, as their programs write them."""
+    lines = ["title"] if path.suffix == ".mdcrd" else []
+    for k, positions in enumerate(x):
+        n = len(positions)
+        if path.suffix == ".mdcrd":
+            words = [f"{value:8.3f}" for value in positions.ravel()]
+            lines += ["".join(words[i : i + 10]) for i in range(0, len(words), 10)]
+        elif path.suffix == ".arc":
+            lines.append(f"{n} water")
+            lines += [
+                f"{a + 1:6d}  {'OHH'[a % 3]}  {r[0]:.6f} {r[1]:.6f} {r[2]:.6f}  1 " for a, r in enumerate(positions)
+            ]
+        else:
+            lines += ["ITEM: TIMESTEP", str(k), "ITEM: NUMBER OF ATOMS", str(n), "ITEM: BOX BOUNDS pp pp pp"]
+            lines += ["0 12"] * 3 + ["ITEM: ATOMS id type x y z"]
+            lines += [f"{a + 1} 1 {r[0]:.6f} {r[1]:.6f} {r[2]:.6f}" for a, r in enumerate(positions)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def topology(path: Path, n: int, positions: np.ndarray, side: float = 12.0) -> Path:
     """A PDB or GRO file of the same atoms."""
     made = universe(n)
