@@ -264,7 +264,7 @@ class ConstrainedDynamics(MolecularDynamics):
         x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
         require_on_surface(system.motion.constraint_set, x, state.time)
         away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
-        if away > START_TOLERANCE * np.abs(v).max(initial=0.0):
+        if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
             raise InputError(
                 f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?", item="state"
             )

@@ -408,21 +408,24 @@ class _Step:
         half_kick = (fraction * self.dt) * system.inverse_masses
         point.land()
         drifted = point.v
+        start = float(np.abs(drifted).max(initial=0.0))
         v, change = drifted, math.inf
         for _ in range(_MAX_ITERATIONS):
             forces = system.forces(positions, v, now, self.number)
-            following = system.motion.project_velocities(point.x, drifted + half_kick * forces, time=now)
+            push = half_kick * forces
+            following = system.motion.project_velocities(point.x, drifted + push, time=now)
             last, change = change, float(np.abs(following - v).max(initial=0.0))
-            speed = float(np.abs(following).max(initial=0.0))
             v = following
-            if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
+            # Where the system comes to rest, v is the small difference of what it had and the kick: these are rounded.
+            size = max(start, float(np.abs(push).max(initial=0.0)), float(np.abs(v).max(initial=0.0)))
+            if change <= 2 * _EPS * size or (change >= last and change <= 1e-13 * size):
                 self.forces = system.forces(positions, v, now, self.number)
                 point.restart(v)
                 return
         raise ConvergenceError(
             f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
             f"after {_MAX_ITERATIONS} iterations; time step too large",
-            residual=change / max(speed, float(np.finfo(float).tiny)),
+            residual=change / max(size, float(np.finfo(float).tiny)),
             tolerance=2 * _EPS,
             iterations=_MAX_ITERATIONS,
         )

@@ -30,6 +30,9 @@ FAR = 8.0
 #: speed) that is still taken for rounding; the first step removes it.
 START_TOLERANCE = 1e-9
 
+#: What the stages of a step together round, of its kick.
+KICK_ROUNDING = 64 * float(np.finfo(float).eps)
+
 _FLOAT = np.dtype(np.float64)
 
 
@@ -271,7 +274,11 @@ class System:
             remainder = local - (x - shift)
         tangent = motion.project_velocities(local, v, time=time)
         away = np.abs(tangent - v)
-        if given and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+        if (
+            given
+            and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max())
+            and away.max() > self.rest(x, v, time)
+        ):
             if motion.degrees_of_freedom == 0:
                 raise OverdeterminedError(
                     f"rank {motion.rank} leaves no degree of freedom, yet atoms move: hold fewer rows, "
@@ -291,6 +298,11 @@ class System:
         elif not given:
             v = tangent
         return State(x, v, time, remainder=remainder)
+
+    def rest(self, x: FloatArray, v: FloatArray, time: float) -> float:
+        """Speed below which velocities are rounding: that of a kick by which atoms cross the system in a step."""
+        kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
+        return KICK_ROUNDING * math.sqrt(kick * float(np.ptp(x, axis=0).max(initial=0.0)))
 
     def forces(
         self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True, finite: bool = True
