@@ -101,7 +101,9 @@ def test_the_check_of_reversibility_still_sees_what_moves() -> None:
     class Pushed(Rattle):
         def step(self, system, state, dt):
             after = super().step(system, state, dt)
-            return State(after.positions, after.velocities + [0.0, 1e-12, 0.0], after.time, after.forces, after.step)
+            return State(
+                after.positions, after.velocities + np.array([0.0, 1e-12, 0.0]), after.time, after.forces, after.step
+            )
 
     with pytest.raises(Exception, match="not reversible"):
         ReversibilityCheck(Pushed()).step(system, rest, 0.1)
