@@ -15,6 +15,7 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
 from kcons.ase.host import START_TOLERANCE, require_on_surface
@@ -131,8 +132,11 @@ class ConstrainedDynamics(MolecularDynamics):
 
     @property
     def state(self) -> State:
-        """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`."""
-        return self._start(self._systems())
+        """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`.
+
+        Its arrays cannot be changed; the atoms' own can.
+        """
+        return self._start(self._systems()).shown()
 
     @property
     def motion(self) -> Motion:
@@ -270,7 +274,7 @@ class ConstrainedDynamics(MolecularDynamics):
             )
         self.time, self.nsteps = float(state.time), int(state.step)
         self._momenta, _ = self._put(x, v)
-        self._state = replace(state, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
         self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
@@ -362,7 +366,7 @@ def _check_timestep(timestep: float) -> None:
 
 
 def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
-    array = np.array(values, dtype=np.float64)
+    array = np.array(numbers(values, item))
     if array.shape != (n_atoms, 3) or not np.isfinite(array).all():
         raise InputError(f"{item} must be finite, of shape ({n_atoms}, 3), not {array.shape}", item=item)
     return array

@@ -151,7 +151,7 @@ class Extrapolation:
         plan = _Plan(first_step or (min(0.1 / rate, left) if rate > 0 else left), self._first_columns())
         while state.time != until:
             state, plan = self._advanced(system, state, until, plan, speed)
-            yield state
+            yield state.shown()
 
     def _first_columns(self) -> int:
         # Hairer, Norsett, Wanner II.9: a column for less than two digits.

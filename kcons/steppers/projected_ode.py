@@ -116,7 +116,7 @@ class ProjectedVerlet(ProjectedOde):
     def _advance(
         self, system: System, start: State, dt: float, time: float, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, f0 = start.positions, start.velocities, start.forces
+        x0, v0, f0 = system.taken(start)
         assert f0 is not None
         a0 = self._acceleration(system, x0, v0, f0, start.time, number)
         half = v0 + (0.5 * dt) * a0
@@ -149,7 +149,7 @@ class ProjectedRungeKutta4(ProjectedOde):
     def _advance(
         self, system: System, start: State, dt: float, time: float, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0 = start.positions, start.velocities
+        x0, v0, _ = system.taken(start)
         middle = start.time + 0.5 * dt
 
         def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:

@@ -8,11 +8,12 @@ also where a stage goes back.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from kcons.arrays import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
@@ -24,6 +25,8 @@ from kcons.steppers.summation import NO_WORK, Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
+#: Positions of as many stages as fit here are one array, in bytes.
+_BLOCK = 16384
 
 
 class Splitting:
@@ -133,10 +136,10 @@ class Splitting:
         """As many of the steps as the kernels can do without the engine: the state after them, and their number."""
         force, kicks, number = system.force, self.kicks, start.step
         x, v, f = start.positions, start.velocities, start.forces
+        if start is not flights.last:
+            x, v, f = system.taken(start)
         if force is None or f is None:
             kicks, f = self._no_kicks, system.weights
-        if start is not flights.last:
-            x, v, f = flights.known(x, v, f)
         shape, first, last = x.shape, kicks[0] * dt, kicks[-1] * dt
         work, fractions = np.empty((3, *shape)), self._fractions[0]
         later = list(zip(kicks[1:], self._stages, self._fractions[1:], strict=False)) if self._many else None
@@ -146,7 +149,8 @@ class Splitting:
         here = before = x, v, time, left_over
         u, spare, next_spare = np.empty(shape), np.empty(shape), np.empty(shape)
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
-        new, array, double = np.empty, np.ndarray, np.dtype(np.float64)
+        array, double = np.ndarray, np.dtype(np.float64)
+        rooms = _rooms(shape, steps * len(self._stages))
         tables, (given, held) = flights.tables(), system.motion.sources
         cell = held.lattice
         one = many = flights.many if self._many else flights.one
@@ -155,7 +159,7 @@ class Splitting:
                 if held.lattice is not cell or given.lattice is not cell:
                     # The force function is a barostat, too.
                     tables, cell = flights.tables(), held.lattice
-                out = new(shape)
+                out, seen = next(rooms)
                 if later is None:
                     found = one(what, dt, x, v, u, last, first, f, out, *tables)
                 else:
@@ -169,8 +173,8 @@ class Splitting:
                             break
                         if force is not None:
                             now = time + (stage.ends[-1] * dt + left_over)
-                            f = system.accepted(force(out, now), number + made + 1, False)
-                        x, out = out, new(shape)
+                            f = system.accepted(force(seen, now), number + made + 1, False)
+                        x, (out, seen) = out, next(rooms)
                         found = many(FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
                 if found < 0:
                     return _at(here, start, made), made
@@ -181,7 +185,7 @@ class Splitting:
                 left_over = (time - (then - part)) + (change - part)
                 time = then
                 if force is not None:
-                    raw: Any = force(out, time)
+                    raw: Any = force(seen, time)
                     # What System.accepted finds most often.
                     if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
                         f = raw
@@ -196,7 +200,8 @@ class Splitting:
             flights.took = found
             flights.motion.took(found)
         forces = start.forces if force is None else f.copy()
-        state = flights.last = State(x, v, time, forces, number + steps, None, left_over)
+        # A copy: whoever keeps the state does not keep the positions of the stages before it.
+        state = flights.last = State(x.copy(), v, time, forces, number + steps, None, left_over)
         return state, steps
 
     def _piecewise(self, system: System, start: State, dt: float) -> State:
@@ -226,6 +231,8 @@ class Splitting:
     def _compiled(self, system: System, start: State, dt: float, flights: Flights) -> State:
         """K D K ... D K in few calls, each of which costs as much as its work on a few molecules."""
         x, before, forces = start.positions, start.velocities, start.forces
+        if start is not flights.last:
+            x, before, forces = system.taken(start)
         shape, number = x.shape, start.step + 1
         time, time_remainder = start.later(dt)
         shift: FloatArray | None = None
@@ -235,8 +242,6 @@ class Splitting:
         force, kicks, f = system.force, self.kicks, forces
         if force is None or f is None:
             kicks, f = self._no_kicks, system.weights
-        if start is not flights.last:
-            x, before, f = flights.known(x, before, f)
         v, work, many, tables = np.empty(shape), NO_WORK, self._many, flights.tables()
         fly = flights.many if many else flights.one
         if many:
@@ -259,7 +264,7 @@ class Splitting:
                         check_finite(f, bad, number)
                 x, before = out, v
                 if force is not None:
-                    f = system.accepted(force(x if shift is None else x + shift, now), number, not left)
+                    f = system.accepted(force(lent(x if shift is None else x + shift), now), number, not left)
             bad = ""
             found = flights.end(dt, x, v, work, kicks[-1] * dt, f, tables)
             if found:
@@ -288,6 +293,18 @@ def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: 
     """Where a step began, `made` steps after `start`; its forces have been forgotten since."""
     x, v, time, left_over = begin
     return State(x, v.copy(), time, None, start.step + made, None, left_over) if made else start
+
+
+def _rooms(shape: tuple[int, ...], most: int) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Room for the positions of one stage after the other, and the same as it is lent to the force function.
+
+    The function may keep what it is lent, so that no room is used twice. Parts of a larger array, which cost together
+    what an array of its own costs.
+    """
+    count = max(1, min(most, _BLOCK // max(8 * math.prod(shape), 1)))
+    while True:
+        block = np.empty((count, *shape))
+        yield from zip(block, lent(block), strict=True)
 
 
 class Stage(NamedTuple):
@@ -323,13 +340,12 @@ class _Step:
         self.tables: Packed = (NO_WORK, None, None, None)
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
-        x = start.positions
+        x, v, self.forces = system.taken(start)
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
-        self.point = Point(x, start.velocities, system.weights, exact=many or self.exact)
+        self.point = Point(x, v, system.weights, exact=many or self.exact)
         self.out = x
-        self.forces = start.forces
         self.now = start.time
 
     # -- stages ---------------------------------------------------------------------------------

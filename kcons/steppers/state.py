@@ -6,18 +6,22 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import SEEK_END, BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO
-from zipfile import BadZipFile
+from struct import Struct
+from typing import Any, BinaryIO
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import as_array, lent, numbers
 from kcons.certificate import Schedule
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, OverdeterminedError
+from kcons.files import in_one_piece
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.flights import Flights
@@ -34,6 +38,8 @@ START_TOLERANCE = 1e-9
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
+#: The record at the end of an archive without comment; the fifth number is how many files there are.
+_LAST_RECORD = Struct("<4s4H2LH")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -43,7 +49,8 @@ class State:
     Attributes
     ----------
     positions, velocities : ndarray, shape (n_atoms, 3)
-        In the caller's units. Treat them as read-only: states share arrays where nothing changed.
+        In the caller's units. Treat them as read-only: states share arrays where nothing changed. Those of states
+        that observers see cannot be changed.
     time : float
     forces : ndarray, shape (n_atoms, 3), or None
         Applied forces at this state, None before they are known. With them in hand a step evaluates the
@@ -114,11 +121,8 @@ class State:
         if not isinstance(file, str | PathLike):
             np.savez(file, **present)
             return
-        target = Path(file)
-        unfinished = target.with_name(target.name + ".unfinished")
-        with unfinished.open("wb") as opened:
+        with in_one_piece(file) as opened:
             np.savez(opened, **present)
-        unfinished.replace(target)
 
     @classmethod
     def load(cls, file: str | PathLike[str] | BinaryIO) -> State:
@@ -127,18 +131,75 @@ class State:
         Raises
         ------
         InputError
-            The file holds no state.
+            The file holds no state, or not all of it is as it was written.
         """
         if isinstance(file, str | PathLike):
-            with Path(file).open("rb") as opened:  # NumPy would leave a broken archive open
+            with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            with np.load(file) as stored:
-                values = {name: stored[name] for name in stored.files}
-            return cls(**{name: a if a.ndim else a.item() for name, a in values.items()})
-        except (TypeError, ValueError, BadZipFile, EOFError) as error:
+            return cls(**_checked(_stored(file)))
+        except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
+
+    def shown(self) -> State:
+        """The same state for a function of the user, who can read its arrays and not change them."""
+        view = object.__new__(_Shown)
+        object.__setattr__(view, "__dict__", vars(self))
+        return view
+
+    def copied(self) -> State:
+        """The same state with arrays of its own."""
+        return State(**{name: a.copy() if isinstance(a, np.ndarray) else a for name, a in vars(self).items()})
+
+
+class _Shown(State):
+    """A state that shares the arrays of another one, and lends them only."""
+
+    positions = property(lambda self: lent(vars(self)["positions"]))  # type: ignore[assignment]
+    velocities = property(lambda self: lent(vars(self)["velocities"]))  # type: ignore[assignment]
+    forces = property(lambda self: _lent(vars(self)["forces"]))  # type: ignore[assignment]
+    remainder = property(lambda self: _lent(vars(self)["remainder"]))  # type: ignore[assignment]
+    thermostat = property(lambda self: _lent(vars(self)["thermostat"]))  # type: ignore[assignment]
+
+
+def _lent(array: FloatArray | None) -> FloatArray | None:
+    return None if array is None else lent(array)
+
+
+def _stored(file: BinaryIO) -> dict[str, Any]:
+    """The arrays of an archive, each with its checksum compared."""
+    found: dict[str, Any] = {}
+    with ZipFile(file) as archive:
+        # A damaged entry of the directory may hide the next one; its last record says how many there are.
+        file.seek(-_LAST_RECORD.size, SEEK_END)
+        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
+        if count != len(archive.namelist()):
+            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
+        for name in archive.namelist():
+            # Read whole: what `numpy.load` does not look at, it does not check either.
+            content = BytesIO(archive.read(name))
+            array = np.lib.format.read_array(content, allow_pickle=False)
+            if content.read(1):
+                raise ValueError(f"{name} is longer than what it holds")
+            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
+    return found
+
+
+def _checked(values: dict[str, Any]) -> dict[str, Any]:
+    """What a state is made of, as a step needs it."""
+    shape = np.shape(values["positions"])
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"positions have shape {shape}")
+    for name in ("positions", "velocities", "forces", "remainder"):
+        if name in values:
+            values[name] = as_array(values[name], shape, name)
+    if "thermostat" in values:
+        values["thermostat"] = np.atleast_1d(numbers(values["thermostat"], "thermostat"))
+    for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
+        if not isinstance(values.get(name, 0), kind):
+            raise ValueError(f"{name} is {values[name]!r:.40}")
+    return values
 
 
 class System:
@@ -314,7 +375,7 @@ class System:
         """
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
-        raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
+        raw = self.force(lent(x), lent(v), time) if self.velocity_dependent else self.force(lent(x), time)
         f = self.accepted(raw, step, copy)
         if finite:
             check_finite(f, "force", step)
@@ -326,11 +387,9 @@ class System:
         if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.shape == self._shape and raw.flags.carray:
             return raw.copy() if copy else raw
         try:
-            f = np.array(raw, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"the force function returned no array of numbers at step {step}: {error}", item="forces"
-            ) from None
+            f = np.array(numbers(raw, "forces"), order="C")
+        except InputError as error:
+            raise InputError(f"the force function, at step {step}: {error}", item="forces") from None
         if f.shape != self._shape:
             raise InputError(
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
@@ -338,11 +397,25 @@ class System:
             )
         return f
 
+    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Positions, velocities and forces of a state, as the kernels can take them.
+
+        Raises
+        ------
+        InputError
+            Wrong shapes, complex numbers, masked arrays: a state may have been made by hand.
+        """
+        x, v = (
+            as_array(a, self._shape, n) for a, n in ((state.positions, "positions"), (state.velocities, "velocities"))
+        )
+        return x, v, None if state.forces is None else as_array(state.forces, self._shape, "forces")
+
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
         if state.forces is not None:
             return state
-        return replace(state, forces=self.forces(state.positions, state.velocities, state.time, state.step))
+        x, v, _ = self.taken(state)
+        return replace(state, forces=self.forces(x, v, state.time, state.step))
 
     # -- energies -------------------------------------------------------------------------------
 
@@ -357,7 +430,7 @@ class System:
             raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
         energy = self.kinetic_energy(state.velocities)
         if self.potential is not None:
-            energy += float(self.potential(state.positions, state.time))
+            energy += float(self.potential(lent(state.positions), state.time))
         return energy
 
     # -- inner ----------------------------------------------------------------------------------
@@ -398,10 +471,7 @@ class System:
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
-        try:
-            array = np.array(values, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+        array = np.array(numbers(values, item), order="C")
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         bad = ~np.isfinite(array).all(axis=1)

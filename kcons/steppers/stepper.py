@@ -168,7 +168,8 @@ def run(
     stepper : Stepper, optional
         `Rattle` by default.
     observers : iterable of callable
-        Each is called with the state at the start and after every `every` steps.
+        Each is called with the state at the start and after every `every` steps; it can keep the state, and not
+        change its arrays.
     every : int
     check_every : int, optional
         The first state, and one in so many, is certified: sigma and A v evaluated by the constraint set itself, beside
@@ -200,7 +201,7 @@ def run(
     schedule = system.schedule
     watching = tuple(observers)
     for observer in watching:
-        observer(state)
+        observer(state.shown())
     march = getattr(stepper, "march", None)
     done = 0
     while done < steps:
@@ -216,7 +217,7 @@ def run(
         schedule.made(n, check_every, state, spare=spare)
         if done % every == 0:
             for observer in watching:
-                observer(state)
+                observer(state.shown())
     return state
 
 

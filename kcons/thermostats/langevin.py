@@ -116,14 +116,14 @@ class Langevin:
         middle = state.time + (0.5 * dt + state.time_remainder)
         motion = system.motion
         shift = None
-        x = start.positions
+        x, v, f = system.taken(start)
         if start.remainder is not None:
             shift = x[system.anchor]
             x = (x - shift) + start.remainder
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
             try:
-                assert start.forces is not None
-                v = start.velocities + (0.5 * dt) * (start.forces * system.inverse_masses)
+                assert f is not None
+                v = v + (0.5 * dt) * (f * system.inverse_masses)
                 x, v = self._fly(system, x, v, state.time, middle, 0.5 * dt)
                 v, heat = self._exchange(system, x, v, middle, dt, number)
                 x, v = self._fly(system, x, v, middle, time, 0.5 * dt)
