@@ -64,6 +64,9 @@ class ConstrainedDynamics(MolecularDynamics):
         See `Constraints`.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
+    friction : array_like, shape () or (n_atoms,)
+        Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
+        come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
         As for all dynamics of ASE.
 
@@ -96,6 +99,7 @@ class ConstrainedDynamics(MolecularDynamics):
         state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
+        friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
         _check_timestep(timestep)
@@ -105,6 +109,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         self.time = float(time)
         self._degenerate = degenerate
+        self._friction = friction
         self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
@@ -298,7 +303,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force, far=_FAR)
+            self._system = System(bound.motion, self._force, friction=self._friction, far=_FAR)
             self.stepper.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)

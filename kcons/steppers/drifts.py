@@ -28,7 +28,7 @@ class Drift(Protocol):
     """Constrained flight over one interval."""
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        """Fly from time `start` to `end` = start + h; the new positions are put into `out`, which becomes point.x.
+        """Fly for `h` from time `start` to `end`; the new positions are put into `out`, which becomes point.x.
 
         After an error the contents of `point` and `out` mean nothing, but for point.x.
         """
@@ -75,7 +75,8 @@ class NonholonomicFlight:
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
         point.land()
         x, v = point.x, point.v
-        x0, middle = x[self.atoms], start + 0.5 * h
+        # Where there is friction, the time that passes is not that of the flight.
+        x0, middle = x[self.atoms], 0.5 * (start + end)
         coefficients = self.held.jacobian(x0, start).toarray()
         spread = coefficients * self.weights
         size = np.sqrt(np.einsum("ij,ij->i", coefficients, coefficients))

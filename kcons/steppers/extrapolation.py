@@ -163,7 +163,8 @@ class Extrapolation:
         assert state.forces is not None
         v = state.velocities
         speed = _rms(v, system)
-        a = _rms(system.motion.acceleration(state.positions, v, state.forces, state.time), system)
+        forces = system.resisted(state.forces, v)
+        a = _rms(system.motion.acceleration(state.positions, v, forces, state.time), system)
         scale = self.speed or max(speed, math.sqrt(a * self.length)) or 1.0
         return scale, speed / self.length + a / scale
 

@@ -19,12 +19,14 @@ from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteErro
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
+from kcons.steppers.friction import Friction
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import NO_WORK, Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
+_WHOLE = np.ones(1)
 #: Positions of as many stages as fit here are one array, in bytes.
 _BLOCK = 16384
 
@@ -128,7 +130,7 @@ class Splitting:
     def _flights(self, system: System) -> Flights | None:
         """Compiled stages, where steps are made of them."""
         flights = system.flights
-        if flights is None or system.velocity_dependent or not self.kick_first:
+        if flights is None or system.velocity_dependent or system.friction is not None or not self.kick_first:
             return None
         return None if self.exact_flight and system.great_circles is not None else flights
 
@@ -206,13 +208,15 @@ class Splitting:
 
     def _piecewise(self, system: System, start: State, dt: float) -> State:
         step = _Step(system, start, dt, self._many, self.exact_flight)
-        stages = self._whole_stages if step.exact else self._stages
+        # With rates of its own for each atom, friction and flight are only composed as RATTLE flights are.
+        whole = step.exact and (system.friction is None or system.friction.uniform)
+        stages = self._whole_stages if whole else self._stages
         if step.flights is not None:
             step.fractions = self._fractions
             step.tables = step.flights.tables()
         try:
             if system.velocity_dependent:
-                step.with_friction(self.drifts, stages)
+                step.with_velocities(self.drifts, stages)
             elif self.kick_first:
                 step.kick_first(self.kicks, stages)
             else:
@@ -372,7 +376,7 @@ class _Step:
         self.forces = None
         self.project()
 
-    def with_friction(self, weights: Sequence[float], stages: list[Stage]) -> None:
+    def with_velocities(self, weights: Sequence[float], stages: list[Stage]) -> None:
         """Forces depend on v: half a kick with f(x0, v0), and half a one with f(x1, v1), solved for v1.
 
         Step and adjoint in one: symmetric, so that compositions keep their order.
@@ -391,6 +395,9 @@ class _Step:
 
     def drift(self, stage: Stage) -> None:
         dt, point = self.dt, self.point
+        if self.system.friction is not None:
+            self.damped_drift(stage, self.system.friction)
+            return
         # Positions that the force function has seen are never written to again.
         self.out = out = np.empty_like(point.x)
         if self.flights is not None:
@@ -405,6 +412,27 @@ class _Step:
             left -= 1
             self.flight.move(point, point.work[2] if left % 2 else out, then, self.now, fraction * dt)
         self.refuse_unsound()
+
+    def damped_drift(self, stage: Stage, friction: Friction) -> None:
+        """Each flight between two halves of the friction."""
+        point = self.point
+        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
+            then, self.now = self.now, self.ended(end)
+            h = fraction * self.dt
+            self.damp(friction, 0.5 * h, then)
+            self.out = out = np.empty_like(point.x)
+            if self.flights is None:
+                self.flight.move(point, out, then, self.now, friction.flight(h))
+            else:
+                bad = self.flights.move(point, _WHOLE, friction.flight(h), out, self.now, self.tables)
+                if bad:
+                    self.refuse(bad)
+            self.damp(friction, 0.5 * h, self.now)
+
+    def damp(self, friction: Friction, h: float, time: float) -> None:
+        self.point.land()
+        self.refuse_unsound()
+        friction.damp(self.point.x, self.point.v, h, time)
 
     def ended(self, end: float) -> float:
         """The time at the fraction `end` of the step."""

@@ -25,6 +25,7 @@ from kcons.files import in_one_piece
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.flights import Flights
+from kcons.steppers.friction import Friction
 from kcons.steppers.summation import all_finite, beyond
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
@@ -216,7 +217,11 @@ class System:
     potential : callable, optional
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
-        Whether `force` takes the velocities too (friction, magnetic fields).
+        Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
+    friction : array_like, shape () or (n_atoms,)
+        Rates at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time: for all atoms,
+        or for each. Solved exactly, so that it takes no shorter step and no further evaluation of the force; see
+        `kcons.steppers.friction`. Relative to space at rest, also where targets move.
     far : float
         From this many times the size of what is held away from the origin, states carry the remainder of their
         positions. Infinite: never, so that positions and velocities alone are the whole state.
@@ -224,7 +229,7 @@ class System:
     Raises
     ------
     InputError
-        An atom that is not held by FixedAtoms has a mass that is not positive.
+        An atom that is not held by FixedAtoms has a mass that is not positive; bad rates of friction.
     """
 
     def __init__(
@@ -234,6 +239,7 @@ class System:
         *,
         potential: Callable[[FloatArray, float], float] | None = None,
         velocity_dependent: bool = False,
+        friction: ArrayLike = 0.0,
         far: float = FAR,
     ) -> None:
         if not far >= 1:
@@ -263,6 +269,9 @@ class System:
         self.inverse_masses[fixed] = 0.0
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
+        rates = Friction(friction, motion, self.inverse_masses)
+        #: None where nothing is slowed down.
+        self.friction: Friction | None = rates if rates.largest > 0 else None
 
     @cached_property
     def schedule(self) -> Schedule:
@@ -409,6 +418,10 @@ class System:
             as_array(a, self._shape, n) for a, n in ((state.positions, "positions"), (state.velocities, "velocities"))
         )
         return x, v, None if state.forces is None else as_array(state.forces, self._shape, "forces")
+
+    def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
+        """Applied forces and friction together, where friction is not solved exactly."""
+        return f if self.friction is None else f + self.friction.force(v)
 
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""

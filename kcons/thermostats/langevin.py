@@ -12,7 +12,7 @@ from kcons.steppers import State, System
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
 
 
 class Langevin:
@@ -87,7 +87,8 @@ class Langevin:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces."""
+        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
+        refuse_friction(system)
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
 
