@@ -87,7 +87,7 @@ class NonholonomicFlight:
         impulses = np.zeros(len(push))
         kicked = v.copy()
         # A kick that the rows take up whole leaves no speed to compare with, only the rounding of the kick.
-        start = float(np.abs(kicked[self.atoms]).max())
+        before = float(np.abs(kicked[self.atoms]).max())
         error = np.inf
         for _ in range(_MAX_ITERATIONS):
             np.copyto(v, kicked)
@@ -100,7 +100,7 @@ class NonholonomicFlight:
             wanted = self.held.velocity_target(between, middle)[self.is_velocity]
             local = v[self.atoms].ravel()
             miss = (rows @ local - wanted) / size[self.is_velocity]
-            speed = max(start, float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
+            speed = max(before, float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
             last, error = error, float(np.abs(miss).max())
             if error <= 4 * _EPS * speed or (error >= last and error <= 1e-13 * speed):
                 point.x = out
