@@ -20,7 +20,7 @@ from kcons.arrays import as_array, lent, numbers
 from kcons.certificate import Schedule
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, NonFiniteError, OverdeterminedError
+from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
 from kcons.files import in_one_piece
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
@@ -276,7 +276,21 @@ class System:
     @cached_property
     def schedule(self) -> Schedule:
         """When states of this system are certified."""
-        return Schedule(self.motion.certify)
+        return Schedule(self._certify)
+
+    def _certify(self, x: FloatArray, v: FloatArray, time: float) -> None:
+        try:
+            self.motion.certify(x, v, time)
+        except CertificateError:
+            # Relative to the speed alone nothing that has come to rest could be certified.
+            held, still = self.motion.constraint_set, np.zeros_like(v)
+            slow = np.full_like(v, self.rest(x, v, time))
+            rates, allowed = held.residuals(x, v, time).rates, held.residuals(x, slow, time).speeds
+            wanted = held.residuals(x, still, time).speeds
+            assert rates is not None and allowed is not None and wanted is not None
+            if not np.all(np.abs(rates) <= allowed - wanted):
+                raise
+            self.motion.certify(x, None, time)
 
     # -- states ---------------------------------------------------------------------------------
 
