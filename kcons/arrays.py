@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ _FLOAT = np.dtype(np.float64)
 _REAL = "biuf"
 
 
-def numbers(values: ArrayLike, item: str) -> FloatArray:
+def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
     """`values` themselves if they are an array of float64, or a float64 copy of real numbers.
 
     Raises
@@ -41,7 +41,7 @@ def numbers(values: ArrayLike, item: str) -> FloatArray:
         raise InputError(f"{item} has complex numbers; give real ones, for example their .real", item=item)
     if array.dtype.kind not in _REAL:
         raise InputError(f"{item} is no array of numbers: its dtype is {array.dtype}; give float64", item=item)
-    return array.astype(np.float64, copy=False)
+    return np.asarray(array, dtype=np.float64)
 
 
 def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray:
@@ -52,7 +52,7 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
     if array.shape != shape:
         raise InputError(f"{item} must have shape {shape}, not {array.shape}", item=item)
     # Kernels are compiled for arrays that may be written to; for others Numba would compile them once more.
-    return np.require(array, requirements="CAW").view(np.ndarray)
+    return np.require(array, requirements=["C", "A", "W"])
 
 
 def lent(array: FloatArray) -> FloatArray:

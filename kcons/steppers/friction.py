@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kcons.arrays import FloatArray, numbers
 from kcons.errors import InputError
@@ -64,7 +64,7 @@ class Friction:
             )
         bad = ~(np.isfinite(given) & (given >= 0))
         if bad.any():
-            atoms = np.flatnonzero(bad)[:1] if given.ndim else []
+            atoms = np.flatnonzero(bad).tolist()[:1] if given.ndim else []
             raise InputError(
                 f"friction is {given[bad].ravel()[0] if given.ndim else given}"
                 f"{f' for atom {atoms[0]}' if given.ndim else ''}; give rates of 0 or more, in inverse units of time",
@@ -127,7 +127,7 @@ class Friction:
         motion.project_velocities(x, v, time=time, out=v)
 
 
-def _within_rows(motion: Motion, rates: FloatArray, moving: FloatArray) -> bool:
+def _within_rows(motion: Motion, rates: FloatArray, moving: NDArray[np.bool_]) -> bool:
     """Whether no row ties atoms that move at different rates."""
     rows = motion.constraint_set.incidence.tocoo()
     inside = moving[rows.col]

@@ -151,7 +151,8 @@ class State:
 
     def copied(self) -> State:
         """The same state with arrays of its own."""
-        return State(**{name: a.copy() if isinstance(a, np.ndarray) else a for name, a in vars(self).items()})
+        own: dict[str, Any] = {n: a.copy() if isinstance(a, np.ndarray) else a for n, a in vars(self).items()}
+        return State(**own)
 
 
 class _Shown(State):
@@ -498,7 +499,7 @@ class System:
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
-        array = np.array(numbers(values, item), order="C")
+        array: FloatArray = np.array(numbers(values, item), order="C")
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         bad = ~np.isfinite(array).all(axis=1)

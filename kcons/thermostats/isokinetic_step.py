@@ -151,7 +151,6 @@ class IsokineticStep:
     """The arrays of one step on its way: velocities v = drive + u, the drive None where targets rest."""
 
     def __init__(self, system: System, share: Share, start: State, dt: float) -> None:
-        assert start.thermostat is not None and start.forces is not None
         self.system, self.share, self.dt = system, share, dt
         self.stages = share.stages if system.force is not None else None
         self.tables: tuple[Any, ...] = () if self.stages is None else self.stages.tables()
@@ -160,7 +159,9 @@ class IsokineticStep:
         self.time, self.time_remainder = start.later(dt)
         self.now = start.time
         self.shift = None
-        x, self.u, self.forces = system.taken(start)
+        x, self.u, forces = system.taken(start)
+        assert start.thermostat is not None and forces is not None
+        self.forces: FloatArray = forces
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder

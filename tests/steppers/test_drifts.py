@@ -141,6 +141,13 @@ def turning(rate: float = 1.3) -> ImplicitSurface:
     )
 
 
+def pushed(speed) -> CustomVelocity:
+    """Atom 2 moves at a given speed in a direction that turns with the time and depends on the place."""
+    return CustomVelocity(
+        [2], lambda r, t: np.array([[np.cos(2 * t), np.sin(2 * t), r[0, 0]]]), target=speed, time_dependent=True
+    )
+
+
 def swept(*more) -> tuple:
     x = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.8], [1.7, 0.3, 0.8]])
     system = system_of([turning(), Distance([[0, 1], [1, 2]]), *more], x, [1.0, 0.4, 2.0])
@@ -152,8 +159,7 @@ def swept(*more) -> tuple:
 @pytest.mark.parametrize("driven", [False, True], ids=["position rows", "with a velocity row"])
 def test_impulses_act_along_the_gradients_of_the_time_of_the_start(driven, h) -> None:
     """u - v = M^-1 A(x0, t0)^T l: the plane has turned by the end, and pushes where it was."""
-    more = [LinearVelocity(1, [[0, 0, 1]], target=lambda t: np.sin(3 * t))] if driven else []
-    system, state = swept(*more)
+    system, state = swept(*([pushed(np.cos)] if driven else []))
     drift = rattle_drift(system.motion, system.inverse_masses)
     x, u = flown(drift, system, state, h)
     held = system.motion.constraint_set
@@ -170,10 +176,7 @@ def test_impulses_act_along_the_gradients_of_the_time_of_the_start(driven, h) ->
 def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
     """a((x0 + x1)/2, t0 + h/2) . u = c(t0 + h/2), for coefficients and for speeds that depend on time."""
     speed = lambda t: np.cos(3 * t + 0.4)  # noqa: E731
-    turned = CustomVelocity(
-        [2], lambda r, t: np.array([[np.cos(2 * t), np.sin(2 * t), r[0, 0]]]), target=speed, time_dependent=True
-    )
-    system, state = swept(turned)
+    system, state = swept(pushed(speed))
     x, u = flown(rattle_drift(system.motion, system.inverse_masses), system, state, h)
     middle = 0.5 * (state.positions + x)[2, 0]
     assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)

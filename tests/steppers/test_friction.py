@@ -157,6 +157,17 @@ def test_friction_alone_at_fixed_positions_is_the_exponential_of_the_projected_r
         np.testing.assert_allclose(v[1:].ravel(), wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
 
 
+def test_spheres_at_different_rates_keep_high_orders() -> None:
+    """Great circles are exact, friction beside them is not: both are composed as the order demands."""
+    x = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    pull = lambda x, t: 0.7 * (x[::-1] - x)  # noqa: E731
+    system = system_of([Sphere([0, 1], np.zeros(3))], x, [1.0, 2.0], pull, friction=[0.4, 1.5])
+    start = system.initial_state(x, [[0.0, 1.0, 0.3], [0.5, 0.0, -0.4]])
+    known = run(system, start, 1 / 40, 40, stepper=KahanLi6()).positions
+    errors = [np.abs(run(system, start, 1 / n, n, stepper=BlanesMoan6()).positions - known).max() for n in (2, 4)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(6, abs=0.5)
+
+
 # -- what it goes together with ---------------------------------------------------------------------
 
 
