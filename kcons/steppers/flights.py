@@ -68,8 +68,6 @@ class Flights:
         self.motion = motion
         self._tables = found
         self._cell = motion.cell
-        #: The state that the last step ended in, whose arrays need not be looked at.
-        self.last: object = None
         #: Iterations that the engine has been told of.
         self.took = _UNKNOWN
         self._lattice = motion.lattice

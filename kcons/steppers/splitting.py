@@ -8,7 +8,7 @@ also where a stage goes back.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +27,6 @@ from kcons.steppers.summation import NO_WORK, Point
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
 _WHOLE = np.ones(1)
-#: Positions of as many stages as fit here are one array, in bytes.
-_BLOCK = 16384
 
 
 class Splitting:
@@ -137,9 +135,7 @@ class Splitting:
     def _marched(self, system: System, start: State, dt: float, steps: int, flights: Flights) -> tuple[State, int]:
         """As many of the steps as the kernels can do without the engine: the state after them, and their number."""
         force, kicks, number = system.force, self.kicks, start.step
-        x, v, f = start.positions, start.velocities, start.forces
-        if start is not flights.last:
-            x, v, f = system.taken(start)
+        x, v, f = system.taken(start)
         if force is None or f is None:
             kicks, f = self._no_kicks, system.weights
         shape, first, last = x.shape, kicks[0] * dt, kicks[-1] * dt
@@ -151,8 +147,7 @@ class Splitting:
         here = before = x, v, time, left_over
         u, spare, next_spare = np.empty(shape), np.empty(shape), np.empty(shape)
         # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
-        array, double = np.ndarray, np.dtype(np.float64)
-        rooms = _rooms(shape, steps * len(self._stages))
+        new, array, double = np.empty, np.ndarray, np.dtype(np.float64)
         tables, (given, held) = flights.tables(), system.motion.sources
         cell = held.lattice
         one = many = flights.many if self._many else flights.one
@@ -161,7 +156,7 @@ class Splitting:
                 if held.lattice is not cell or given.lattice is not cell:
                     # The force function is a barostat, too.
                     tables, cell = flights.tables(), held.lattice
-                out, seen = next(rooms)
+                out = new(shape)
                 if later is None:
                     found = one(what, dt, x, v, u, last, first, f, out, *tables)
                 else:
@@ -175,8 +170,9 @@ class Splitting:
                             break
                         if force is not None:
                             now = time + (stage.ends[-1] * dt + left_over)
-                            f = system.accepted(force(seen, now), number + made + 1, False)
-                        x, (out, seen) = out, next(rooms)
+                            out.setflags(False)
+                            f = system.accepted(force(out, now), number + made + 1, False)
+                        x, out = out, new(shape)
                         found = many(FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
                 if found < 0:
                     return _at(here, start, made), made
@@ -187,7 +183,9 @@ class Splitting:
                 left_over = (time - (then - part)) + (change - part)
                 time = then
                 if force is not None:
-                    raw: Any = force(seen, time)
+                    # The function can neither write to it nor will anybody else: it may keep what it sees.
+                    out.setflags(False)
+                    raw: Any = force(out, time)
                     # What System.accepted finds most often.
                     if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
                         f = raw
@@ -196,14 +194,14 @@ class Splitting:
                 x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
         except InputError:
             return _at(here, start, made), made
+        x = x.copy()  # other kernels are compiled for arrays that can be written to
         if flights.end(dt, x, v, work if self._many else NO_WORK, last, f, flights.tables()):
             return _at(before, start, steps - 1), steps - 1
         if found != flights.took:
             flights.took = found
             flights.motion.took(found)
         forces = start.forces if force is None else f.copy()
-        # A copy: whoever keeps the state does not keep the positions of the stages before it.
-        state = flights.last = State(x.copy(), v, time, forces, number + steps, None, left_over)
+        state = system.last = State(x, v, time, forces, number + steps, None, left_over)
         return state, steps
 
     def _piecewise(self, system: System, start: State, dt: float) -> State:
@@ -234,9 +232,7 @@ class Splitting:
 
     def _compiled(self, system: System, start: State, dt: float, flights: Flights) -> State:
         """K D K ... D K in few calls, each of which costs as much as its work on a few molecules."""
-        x, before, forces = start.positions, start.velocities, start.forces
-        if start is not flights.last:
-            x, before, forces = system.taken(start)
+        x, before, forces = system.taken(start)
         shape, number = x.shape, start.step + 1
         time, time_remainder = start.later(dt)
         shift: FloatArray | None = None
@@ -289,7 +285,7 @@ class Splitting:
             remainder = x - (out - shift)
         elif bad:  # far by now: from here on relative to one atom
             remainder = work[0].copy() if many else np.zeros(shape)
-        last = flights.last = State(out, v, time, forces, number, remainder, time_remainder)
+        last = system.last = State(out, v, time, forces, number, remainder, time_remainder)
         return last
 
 
@@ -297,18 +293,6 @@ def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: 
     """Where a step began, `made` steps after `start`; its forces have been forgotten since."""
     x, v, time, left_over = begin
     return State(x, v.copy(), time, None, start.step + made, None, left_over) if made else start
-
-
-def _rooms(shape: tuple[int, ...], most: int) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Room for the positions of one stage after the other, and the same as it is lent to the force function.
-
-    The function may keep what it is lent, so that no room is used twice. Parts of a larger array, which cost together
-    what an array of its own costs.
-    """
-    count = max(1, min(most, _BLOCK // max(8 * math.prod(shape), 1)))
-    while True:
-        block = np.empty((count, *shape))
-        yield from zip(block, lent(block), strict=True)
 
 
 class Stage(NamedTuple):
@@ -504,7 +488,9 @@ class _Step:
             remainder = x - (positions - self.shift)
         elif self.system.is_far(x):  # by now: from here on relative to one atom
             remainder = np.zeros_like(x) if self.point.x_low is None else self.point.x_low.copy()
-        return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
+        last = State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
+        self.system.last = last
+        return last
 
     def refuse(self, item: str) -> None:
         """Raise for what a compiled stage found."""

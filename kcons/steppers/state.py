@@ -271,6 +271,8 @@ class System:
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
         rates = Friction(friction, motion, self.inverse_masses)
+        #: The state that the last step ended in, whose arrays need not be looked at.
+        self.last: State | None = None
         #: None where nothing is slowed down.
         self.friction: Friction | None = rates if rates.largest > 0 else None
 
@@ -429,10 +431,11 @@ class System:
         InputError
             Wrong shapes, complex numbers, masked arrays: a state may have been made by hand.
         """
-        x, v = (
-            as_array(a, self._shape, n) for a, n in ((state.positions, "positions"), (state.velocities, "velocities"))
-        )
-        return x, v, None if state.forces is None else as_array(state.forces, self._shape, "forces")
+        x, v, f = state.positions, state.velocities, state.forces
+        if state is self.last:
+            return x, v, f
+        x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
+        return x, v, None if f is None else as_array(f, self._shape, "forces")
 
     def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
         """Applied forces and friction together, where friction is not solved exactly."""
