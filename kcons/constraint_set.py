@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
@@ -566,7 +567,7 @@ class ConstraintSet:
         return _joined([function(c) for c in self.constraints])
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
-        array = np.asarray(x, dtype=np.float64)
+        array = numbers(x, item)
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         return array
@@ -587,10 +588,7 @@ def _rate_at(c: Constraint, time: float) -> FloatArray:
 
 
 def _array(values: ArrayLike, item: str) -> FloatArray:
-    try:
-        return np.ascontiguousarray(np.asarray(values, dtype=np.float64))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+    return np.ascontiguousarray(numbers(values, item))
 
 
 def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:

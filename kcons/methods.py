@@ -25,7 +25,6 @@ from kcons.openmm_methods import OPENMM_METHODS
 from kcons.peers import PEERS
 from kcons.runs import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
 from kcons.scenes import Scene
-from kcons.scenes.friction import Damped
 from kcons.steppers import Rattle, State, Stepper, System
 
 #: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
@@ -74,7 +73,7 @@ class _CoreRun(_StateRun):
     def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
         super().__init__()
         self.constraints.watch(motion, ENGINE_CALLS)
-        stepper.check(system := System(motion, scene.potential.forces))
+        stepper.check(system := System(motion, scene.potential.forces, friction=scene.friction))
         self._system = system
         self._stepper = stepper
         self._start = self._system.with_forces(State(scene.positions, scene.velocities))
@@ -133,7 +132,8 @@ class CoreStepper(Method):
 
     def warm_up(self, scene: Scene) -> None:
         dt = min(scene.time_steps)
-        system, start = System(scene.motion, scene.potential.forces), State(scene.positions, scene.velocities)
+        system = System(scene.motion, scene.potential.forces, friction=scene.friction)
+        start = State(scene.positions, scene.velocities)
         stepper = self.make(dt)
         stepper.step(system, start, dt)
         steppers.run(system, start, dt, 2, stepper=stepper)
@@ -142,8 +142,6 @@ class CoreStepper(Method):
         # What does not keep the positions on the surface cannot have rows that depend on each other there.
         held = scene.constraint_set if self.stepper.symplectic else independent_rows(scene)
         stepper = self.make(setting)
-        if scene.friction:
-            stepper = Damped(stepper, scene.friction)
         return _CoreRun(scene, Motion(held, scene.positions), stepper, setting)
 
 
@@ -194,12 +192,10 @@ class _ExtrapolatedRun(_StateRun):
         super().__init__()
         motion = Motion(scene.constraint_set, scene.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
-        base: Stepper = steppers.Geodesic(4)
-        if scene.friction:
-            base = Damped(base, scene.friction)
-        system, self._state = System(motion, scene.potential.forces), State(scene.positions, scene.velocities)
+        system = System(motion, scene.potential.forces, friction=scene.friction)
+        self._state = State(scene.positions, scene.velocities)
         self._horizon = scene.horizon
-        self._states = steppers.Extrapolation(tolerance, base=base).states(system, self._state, scene.horizon)
+        self._states = steppers.Extrapolation(tolerance).states(system, self._state, scene.horizon)
 
     def advance(self) -> None:
         self._state = next(self._states)

@@ -331,3 +331,21 @@ def test_nothing_held() -> None:
         assert len(motion.multipliers(WATER, f, f)) == 0
         report = motion.report(WATER, f)
         assert report.condition == 1.0 and report.iterations == 0 and "rows 0" in str(report)
+
+
+@pytest.mark.parametrize("fixed", [False, True], ids=["solvers", "fixed atoms"])
+def test_velocities_are_put_back_when_a_later_solver_fails(fixed):
+    """One cluster has been solved, the next has no solution: positions, velocities and all are as they were."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [6, 0, 0], [6, 1, 0], [9, 9, 9]], dtype=float)
+    rows = [held.Distance([0, 1]), held.Distance([2, 3]), held.Angle([2, 3, 4])]
+    motion = Motion(ConstraintSet([*rows, held.FixedAtoms([5])] if fixed else rows, x, np.ones(6)), x)
+    assert len(motion.plan.solvers) > 1
+    for far in ([0, 1], [2, 3]):
+        new = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
+        new[far] += [[0.0, 40.0, 0.0], [0.0, -40.0, 0.0]]
+        v = np.random.default_rng(1).normal(size=x.shape)
+        before = new.copy(), v.copy()
+        with pytest.raises(ConvergenceError):
+            motion.project_positions(new, x, velocities=v, dt=0.1, out=new)
+        np.testing.assert_array_equal(new, before[0])
+        np.testing.assert_array_equal(v, before[1])

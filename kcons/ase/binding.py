@@ -12,6 +12,7 @@ import numpy as np
 from ase import Atoms
 from numpy.typing import NDArray
 
+from kcons.arrays import numbers
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
@@ -160,7 +161,7 @@ def _weights(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def applied_forces(atoms: Atoms) -> FloatArray:
     """Forces of the calculator and of ASE objects that only add forces; a copy."""
-    forces = np.array(atoms.get_forces(apply_constraint=False), dtype=np.float64)
+    forces = np.array(numbers(atoms.get_forces(apply_constraint=False), "forces of the calculator"))
     if forces.shape == (len(atoms), 3):  # otherwise whoever asked complains
         for item in atoms.constraints:
             if isinstance(item, FORCES_ONLY):

@@ -10,6 +10,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
+from kcons.arrays import numbers
 from kcons.ase.constraint import Constraints
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraints import Constraint
@@ -101,7 +102,7 @@ class ConstrainedCalculator(Calculator):
             forces = _checked(results["forces"], len(work))
             results["forces"] = motion.project_forces(x, forces)
             if "stress" in results:
-                stress = np.array(results["stress"], dtype=np.float64)
+                stress = np.array(numbers(results["stress"], "stress of the calculator"))
                 if stress.shape == (3, 3):
                     stress = stress[VOIGT]
                 virial = constraint_virial(motion, x, np.zeros_like(x), forces)
@@ -119,7 +120,7 @@ class ConstrainedCalculator(Calculator):
 
 
 def _checked(values: Any, n_atoms: int) -> NDArray[np.float64]:
-    forces = np.array(values, dtype=np.float64)
+    forces = np.array(numbers(values, "forces of the calculator"))
     if forces.shape != (n_atoms, 3):
         raise InputError(f"the calculator returned forces of shape {forces.shape}, not ({n_atoms}, 3)", item="forces")
     bad = ~np.isfinite(forces).all(axis=1)

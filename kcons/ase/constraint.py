@@ -12,6 +12,7 @@ from ase import Atoms
 from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
+from kcons.arrays import numbers
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.host import Watch, require_on_surface
 from kcons.ase.virial import VOIGT, constraint_virial
@@ -231,7 +232,7 @@ class Constraints(FixConstraint):
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
         bound = self._binding
         if bound is not None and bound.fits(atoms):
-            bound.follow_cell(atoms, np.asarray(cell, dtype=np.float64))
+            bound.follow_cell(atoms, numbers(cell, "cell"))
 
     def adjust_forces(self, atoms: Atoms, forces: FloatArray) -> None:
         """Add the constraint force for b = 0 in place; any float dtype, positions may be off the surface."""

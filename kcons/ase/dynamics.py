@@ -15,6 +15,7 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
 from kcons.ase.host import START_TOLERANCE, require_on_surface
@@ -63,6 +64,9 @@ class ConstrainedDynamics(MolecularDynamics):
         See `Constraints`.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
+    friction : array_like, shape () or (n_atoms,)
+        Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
+        come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
         As for all dynamics of ASE.
 
@@ -95,6 +99,7 @@ class ConstrainedDynamics(MolecularDynamics):
         state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
+        friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
         _check_timestep(timestep)
@@ -104,6 +109,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.stepper: Stepper = Rattle() if stepper is None else stepper
         self.time = float(time)
         self._degenerate = degenerate
+        self._friction = friction
         self._more = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         self._present: tuple[Any, ...] | None = None
         self._bound: Binding | None = None
@@ -131,8 +137,11 @@ class ConstrainedDynamics(MolecularDynamics):
 
     @property
     def state(self) -> State:
-        """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`."""
-        return self._start(self._systems())
+        """All that the next step depends on, to be saved (`State.save`) and given to another run as `state`.
+
+        Its arrays cannot be changed; the atoms' own can.
+        """
+        return self._start(self._systems()).shown()
 
     @property
     def motion(self) -> Motion:
@@ -264,13 +273,13 @@ class ConstrainedDynamics(MolecularDynamics):
         x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
         require_on_surface(system.motion.constraint_set, x, state.time)
         away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
-        if away > START_TOLERANCE * np.abs(v).max(initial=0.0):
+        if away > START_TOLERANCE * np.abs(v).max(initial=0.0) and away > system.rest(x, v, state.time):
             raise InputError(
                 f"velocities of the state leave the constraints by {away:.3g}; was it saved with others?", item="state"
             )
         self.time, self.nsteps = float(state.time), int(state.step)
         self._momenta, _ = self._put(x, v)
-        self._state = replace(state, positions=x, velocities=v, time=self.time, step=self.nsteps)
+        self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
         self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
@@ -294,7 +303,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force, far=_FAR)
+            self._system = System(bound.motion, self._force, friction=self._friction, far=_FAR)
             self.stepper.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
@@ -362,7 +371,7 @@ def _check_timestep(timestep: float) -> None:
 
 
 def _array(values: ArrayLike, n_atoms: int, item: str) -> FloatArray:
-    array = np.array(values, dtype=np.float64)
+    array = np.array(numbers(values, item))
     if array.shape != (n_atoms, 3) or not np.isfinite(array).all():
         raise InputError(f"{item} must be finite, of shape ({n_atoms}, 3), not {array.shape}", item=item)
     return array

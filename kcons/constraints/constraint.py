@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.errors import ConstraintError, InputError
 
@@ -85,8 +86,10 @@ class Constraint(ABC):
         for name, value in data.items():
             shape = (self.n_rows, *(self.width if size < 0 else size for size in self.per_row[name]))
             try:
-                array = np.broadcast_to(np.asarray(value, dtype=np.float64), shape)
-            except (TypeError, ValueError):
+                array = np.broadcast_to(numbers(value, f"{self.family}: {name}"), shape)
+            except InputError:
+                raise
+            except ValueError:
                 raise InputError(
                     f"{self.family}: {name} has shape {np.shape(value)}; give {shape[1:] or 'one number'} "
                     f"for all rows or {shape}",

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.differences import first_derivative, first_derivative_4, second_derivative
 from kcons.constraints.target import FloatArray, Target
@@ -228,11 +229,11 @@ class ImplicitSurface(FunctionRows):
         )
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
-        flat = [a[:, 0] if isinstance(a, np.ndarray) else a for a in arguments]
+        flat = [lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments]
         found = function(*flat)
         if name == "time_derivatives":
-            found = np.stack([np.broadcast_to(part, (self.n_rows,)) for part in found], axis=-1)
-        result = np.asarray(found, dtype=np.float64)
+            found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
+        result = numbers(found, f"ImplicitSurface: {name}")
         wanted = (self.n_rows, 3) if shape == (1, 3) else (self.n_rows, *shape)
         if result.shape != wanted:
             raise InputError(
@@ -307,9 +308,8 @@ class Custom(FunctionRows):
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         out = np.empty((self.n_rows, *shape))
         for k in range(self.n_rows):
-            result = np.asarray(
-                function(*(a[k] if isinstance(a, np.ndarray) else a for a in arguments)), dtype=np.float64
-            )
+            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            result = numbers(found, f"{self.row_name(k)}: {name}")
             if result.shape != shape:
                 raise InputError(
                     f"Custom: {name} returned shape {result.shape} for row {k}; it must return "

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.errors import InputError
@@ -128,8 +129,10 @@ class LinearRelation(LinearRows):
         base = np.atleast_2d(np.asarray(bases))
         try:
             base = np.broadcast_to(base, (len(dependent), base.shape[-1]))
-            w = np.broadcast_to(np.asarray(weights, dtype=np.float64), base.shape)
-        except (TypeError, ValueError):
+            w = np.broadcast_to(numbers(weights, "weights"), base.shape)
+        except InputError:
+            raise
+        except ValueError:
             raise InputError(
                 f"LinearRelation: {len(dependent)} atoms, bases of shape {np.shape(bases)} and weights of shape "
                 f"{np.shape(weights)} do not fit; give n_bases bases and as many weights, for all atoms or for each",
@@ -171,7 +174,7 @@ class FixedAtoms(LinearRows):
             atom = int(values[np.argmax(counts > 1)])
             raise InputError(f"FixedAtoms names atom {atom} twice; name it once", item="atoms", atoms=[atom])
         if target is not None and not callable(target) and np.shape(target) == (3,):  # type: ignore[arg-type]
-            target = np.tile(np.asarray(target, dtype=np.float64), len(column))
+            target = np.tile(numbers(target, "target"), len(column))
         super().__init__(np.repeat(column, 3, axis=0), target)
         self._keep(coefficients=np.tile(np.eye(3), (len(column), 1))[:, None, :])
         self._settle()

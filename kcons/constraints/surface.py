@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import FloatArray, Target
@@ -268,7 +269,7 @@ class Ellipsoid(Constraint):
         target: Target = 0.0,
     ) -> None:
         super().__init__(np.asarray(atoms).reshape(-1, 1), target)
-        axes = np.asarray(semi_axes, dtype=np.float64)
+        axes = numbers(semi_axes, "semi_axes")
         if not np.all(axes > 0):
             raise InputError(f"Ellipsoid: semi-axes must be positive, not {axes}", item="semi_axes")
         self._keep(center=center, inverse_axes=1.0 / axes, rotation=np.eye(3) if rotation is None else rotation)
@@ -399,7 +400,7 @@ def _across(d: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def _for_each(vectors: ArrayLike, count: int, name: str) -> FloatArray:
-    array = np.asarray(vectors, dtype=np.float64)
+    array = numbers(vectors, name)
     if array.shape not in ((3,), (count, 3)):
         raise InputError(f"{name} has shape {array.shape}; give (3,) or ({count}, 3)", item=name)
     return np.broadcast_to(array, (count, 3))

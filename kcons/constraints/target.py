@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from kcons.arrays import FloatArray as FloatArray
+from kcons.arrays import numbers
 from kcons.constraints.differences import first_derivative, second_derivative
 from kcons.errors import InputError
 
-FloatArray: TypeAlias = NDArray[np.float64]
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
 
 
@@ -62,7 +63,7 @@ Target: TypeAlias = float | ArrayLike | MovingTarget | TimeFunction | None
 
 
 def _per_row(value: ArrayLike, rows: int, time: float) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
+    array = numbers(value, "target")
     if array.ndim > 1 and array.size == rows:
         array = array.ravel()  # for example (n, 3) for three rows an atom
     try:
@@ -88,10 +89,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
         return target
     if callable(target):
         return MovingTarget(target)
-    try:
-        array = np.asarray(target, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"target {target!r} is no number or array of numbers", item="target") from None
+    array = numbers(target, "target")
     if array.ndim > 1 and array.size == rows:
         array = array.ravel()
     if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, rows)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kcons.arrays import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -30,10 +31,7 @@ def unit(vectors: ArrayLike, name: str) -> FloatArray:
     InputError
         If the last axis is not 3, or a vector is zero or not finite.
     """
-    try:
-        array = np.asarray(vectors, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be vectors of three numbers, not {vectors!r:.60}", item=name) from None
+    array = numbers(vectors, name)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise InputError(f"{name} must be vectors of three numbers; its shape is {array.shape}", item=name)
     length = norm(array)

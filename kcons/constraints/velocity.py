@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.differences import first_derivative_4
 from kcons.constraints.target import FloatArray, Target
@@ -291,7 +292,8 @@ class CustomVelocity(VelocityRows):
 
     def _call(self, function: Callable[..., Any], name: str, k: int, *arguments: Any) -> FloatArray:
         given = arguments if self.time_dependent else arguments[:-1]
-        result = np.asarray(function(*given), dtype=np.float64)
+        lent_to = [lent(a) if isinstance(a, np.ndarray) else a for a in given]
+        result = numbers(function(*lent_to), f"{self.row_name(k)}: {name}")
         if result.shape != (self.width, 3):
             raise InputError(
                 f"CustomVelocity: {name} returned shape {result.shape} for row {k}; it must return ({self.width}, 3)",

@@ -12,6 +12,7 @@ from typing import Any
 from kcons import __version__
 from kcons.compare import Watcher, environment
 from kcons.errors import InputError
+from kcons.files import in_one_piece
 from kcons.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.hard_cases.worker import Worker
 
@@ -106,9 +107,8 @@ def save(result: Mapping[str, Any], path: Path, before: Mapping[str, Any] | None
     cells = {**(before or {})}
     for name, row in result["cells"].items():
         cells[name] = {**cells.get(name, {}), **row}
-    unfinished = path.with_name(path.name + ".unfinished")
-    unfinished.write_text(json.dumps({**result, "cells": cells}, indent=1) + "\n", encoding="utf-8")
-    unfinished.replace(path)
+    with in_one_piece(path) as file:
+        file.write((json.dumps({**result, "cells": cells}, indent=1) + "\n").encode())
 
 
 def load(path: Path) -> dict[str, Any]:

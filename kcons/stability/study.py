@@ -11,6 +11,7 @@ from typing import Any
 from kcons import __version__
 from kcons.compare import Watcher, environment
 from kcons.errors import InputError
+from kcons.files import in_one_piece
 from kcons.hard_cases.study import fingerprint
 from kcons.stability import fuzz, runs
 from kcons.stability.scenes import SCENES
@@ -99,9 +100,8 @@ def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> list[tuple[str, Ca
 
 def save(result: dict[str, Any], path: Path) -> None:
     """Write in one piece."""
-    unfinished = path.with_name(path.name + ".unfinished")
-    unfinished.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    unfinished.replace(path)
+    with in_one_piece(path) as file:
+        file.write((json.dumps(result, indent=1) + "\n").encode())
 
 
 def digest(result: dict[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Drift(Protocol):
     """Constrained flight over one interval."""
 
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
-        """Fly from time `start` to `end` = start + h; the new positions are put into `out`, which becomes point.x.
+        """Fly for `h` from time `start` to `end`; the new positions are put into `out`, which becomes point.x.
 
         After an error the contents of `point` and `out` mean nothing, but for point.x.
         """
@@ -75,7 +75,8 @@ class NonholonomicFlight:
     def move(self, point: Point, out: FloatArray, start: float, end: float, h: float) -> None:
         point.land()
         x, v = point.x, point.v
-        x0, middle = x[self.atoms], start + 0.5 * h
+        # Where there is friction, the time that passes is not that of the flight.
+        x0, middle = x[self.atoms], 0.5 * (start + end)
         coefficients = self.held.jacobian(x0, start).toarray()
         spread = coefficients * self.weights
         size = np.sqrt(np.einsum("ij,ij->i", coefficients, coefficients))
@@ -85,6 +86,8 @@ class NonholonomicFlight:
         push = (spread / size[:, None])[self.is_velocity]
         impulses = np.zeros(len(push))
         kicked = v.copy()
+        # A kick that the rows take up whole leaves no speed to compare with, only the rounding of the kick.
+        before = float(np.abs(kicked[self.atoms]).max())
         error = np.inf
         for _ in range(_MAX_ITERATIONS):
             np.copyto(v, kicked)
@@ -97,7 +100,7 @@ class NonholonomicFlight:
             wanted = self.held.velocity_target(between, middle)[self.is_velocity]
             local = v[self.atoms].ravel()
             miss = (rows @ local - wanted) / size[self.is_velocity]
-            speed = max(float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
+            speed = max(before, float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
             last, error = error, float(np.abs(miss).max())
             if error <= 4 * _EPS * speed or (error >= last and error <= 1e-13 * speed):
                 point.x = out

@@ -151,7 +151,7 @@ class Extrapolation:
         plan = _Plan(first_step or (min(0.1 / rate, left) if rate > 0 else left), self._first_columns())
         while state.time != until:
             state, plan = self._advanced(system, state, until, plan, speed)
-            yield state
+            yield state.shown()
 
     def _first_columns(self) -> int:
         # Hairer, Norsett, Wanner II.9: a column for less than two digits.
@@ -163,7 +163,8 @@ class Extrapolation:
         assert state.forces is not None
         v = state.velocities
         speed = _rms(v, system)
-        a = _rms(system.motion.acceleration(state.positions, v, state.forces, state.time), system)
+        forces = system.resisted(state.forces, v)
+        a = _rms(system.motion.acceleration(state.positions, v, forces, state.time), system)
         scale = self.speed or max(speed, math.sqrt(a * self.length)) or 1.0
         return scale, speed / self.length + a / scale
 

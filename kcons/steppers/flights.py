@@ -8,7 +8,6 @@ as it was for the engine, which has more means and names the row.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numba
@@ -48,7 +47,6 @@ _MANY = (
     *(numba.int64, numba.float64[::1], numba.float64, numba.int64, _POINTS, _POINTS, _POINTS, numba.float64[:, :, ::1]),
     *(numba.float64, numba.float64, _POINTS, numba.boolean, _POINTS, numba.float64[::1]),
 )
-_DOUBLE = np.dtype(np.float64)
 #: Of a stage that is not flown.
 NO_FRACTIONS = np.empty(0)
 #: What it reports of the end of a step; less than 0 where the engine has to do it.
@@ -70,8 +68,6 @@ class Flights:
         self.motion = motion
         self._tables = found
         self._cell = motion.cell
-        #: The state that the last step ended in, whose arrays need no `known`.
-        self.last: object = None
         #: Iterations that the engine has been told of.
         self.took = _UNKNOWN
         self._lattice = motion.lattice
@@ -124,12 +120,6 @@ class Flights:
             found = self._kernels[function] = function.compile((*types, *flags))
         return found
 
-    def known(self, *arrays: FloatArray) -> Iterator[FloatArray]:
-        """Arrays as the kernels were compiled for, or copies."""
-        return (
-            a if a.flags.carray and a.dtype is _DOUBLE else np.array(a, dtype=np.float64, order="C") for a in arrays
-        )
-
     def move(self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: Packed) -> str:
         """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.
 
@@ -145,7 +135,6 @@ class Flights:
         """
         kick, force = point.take_kick()
         x, before, fresh = point.x, point.v, point.fresh
-        x, before, force = self.known(x, before, force)
         if fresh:
             point.v = np.empty_like(before)
             if point.x_low is None:

@@ -21,6 +21,9 @@ from kcons.errors import ConvergenceError, InputError
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 
+#: Friction times the step above which velocities grow that should die away: 2 for Verlet, 2.8 for Runge-Kutta.
+STABLE = 2.0
+
 
 class ProjectedOde:
     """Base of the schemes that integrate (105).
@@ -60,12 +63,18 @@ class ProjectedOde:
         NonFiniteError
             The motion diverged; carries `step`.
         InputError
-            `dt` is not finite; the force function returned a wrong shape.
+            `dt` is not finite, or too long for the friction; the force function returned a wrong shape.
         """
         still = stays(state, dt)
         if still is not None:
             return still
         number = state.step + 1
+        if system.friction is not None and system.friction.largest * abs(dt) > STABLE:
+            raise InputError(
+                f"{self!r} takes friction for a force, which is unstable above {STABLE:g} times the step: "
+                f"{system.friction.largest:g} at a step of {dt:g}. Use a shorter step, or Rattle, which is exact",
+                item="dt",
+            )
         time, time_remainder = state.later(dt)
         start = self._with_forces(system, state)
         try:
@@ -98,7 +107,7 @@ class ProjectedOde:
     ) -> FloatArray:
         check_finite(x, "position", number)
         check_finite(v, "velocity", number)
-        return system.motion.acceleration(x, v, f, time)
+        return system.motion.acceleration(x, v, system.resisted(f, v), time)
 
 
 class ProjectedVerlet(ProjectedOde):
@@ -116,7 +125,7 @@ class ProjectedVerlet(ProjectedOde):
     def _advance(
         self, system: System, start: State, dt: float, time: float, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0, f0 = start.positions, start.velocities, start.forces
+        x0, v0, f0 = system.taken(start)
         assert f0 is not None
         a0 = self._acceleration(system, x0, v0, f0, start.time, number)
         half = v0 + (0.5 * dt) * a0
@@ -149,7 +158,7 @@ class ProjectedRungeKutta4(ProjectedOde):
     def _advance(
         self, system: System, start: State, dt: float, time: float, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        x0, v0 = start.positions, start.velocities
+        x0, v0, _ = system.taken(start)
         middle = start.time + 0.5 * dt
 
         def slope(x: FloatArray, v: FloatArray, t: float) -> FloatArray:
@@ -198,4 +207,4 @@ class Baumgarte(ProjectedRungeKutta4):
         held = system.motion.constraint_set
         slip = held.jacobian(x, time) @ v.ravel() - held.velocity_target(x, time)
         feedback = -2 * self.rate * slip - self.rate**2 * held.value(x, time)
-        return system.motion.acceleration(x, v, f, time, feedback=feedback)
+        return system.motion.acceleration(x, v, system.resisted(f, v), time, feedback=feedback)

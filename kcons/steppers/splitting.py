@@ -13,17 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kcons.arrays import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
+from kcons.steppers.friction import Friction
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import NO_WORK, Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)
+_WHOLE = np.ones(1)
 
 
 class Splitting:
@@ -125,18 +128,16 @@ class Splitting:
     def _flights(self, system: System) -> Flights | None:
         """Compiled stages, where steps are made of them."""
         flights = system.flights
-        if flights is None or system.velocity_dependent or not self.kick_first:
+        if flights is None or system.velocity_dependent or system.friction is not None or not self.kick_first:
             return None
         return None if self.exact_flight and system.great_circles is not None else flights
 
     def _marched(self, system: System, start: State, dt: float, steps: int, flights: Flights) -> tuple[State, int]:
         """As many of the steps as the kernels can do without the engine: the state after them, and their number."""
         force, kicks, number = system.force, self.kicks, start.step
-        x, v, f = start.positions, start.velocities, start.forces
+        x, v, f = system.taken(start)
         if force is None or f is None:
             kicks, f = self._no_kicks, system.weights
-        if start is not flights.last:
-            x, v, f = flights.known(x, v, f)
         shape, first, last = x.shape, kicks[0] * dt, kicks[-1] * dt
         work, fractions = np.empty((3, *shape)), self._fractions[0]
         later = list(zip(kicks[1:], self._stages, self._fractions[1:], strict=False)) if self._many else None
@@ -169,6 +170,7 @@ class Splitting:
                             break
                         if force is not None:
                             now = time + (stage.ends[-1] * dt + left_over)
+                            out.setflags(False)
                             f = system.accepted(force(out, now), number + made + 1, False)
                         x, out = out, new(shape)
                         found = many(FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
@@ -181,6 +183,8 @@ class Splitting:
                 left_over = (time - (then - part)) + (change - part)
                 time = then
                 if force is not None:
+                    # The function can neither write to it nor will anybody else: it may keep what it sees.
+                    out.setflags(False)
                     raw: Any = force(out, time)
                     # What System.accepted finds most often.
                     if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
@@ -190,24 +194,27 @@ class Splitting:
                 x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
         except InputError:
             return _at(here, start, made), made
+        x = x.copy()  # other kernels are compiled for arrays that can be written to
         if flights.end(dt, x, v, work if self._many else NO_WORK, last, f, flights.tables()):
             return _at(before, start, steps - 1), steps - 1
         if found != flights.took:
             flights.took = found
             flights.motion.took(found)
         forces = start.forces if force is None else f.copy()
-        state = flights.last = State(x, v, time, forces, number + steps, None, left_over)
+        state = system.last = State(x, v, time, forces, number + steps, None, left_over)
         return state, steps
 
     def _piecewise(self, system: System, start: State, dt: float) -> State:
         step = _Step(system, start, dt, self._many, self.exact_flight)
-        stages = self._whole_stages if step.exact else self._stages
+        # With rates of its own for each atom, friction and flight are only composed as RATTLE flights are.
+        whole = step.exact and (system.friction is None or system.friction.uniform)
+        stages = self._whole_stages if whole else self._stages
         if step.flights is not None:
             step.fractions = self._fractions
             step.tables = step.flights.tables()
         try:
             if system.velocity_dependent:
-                step.with_friction(self.drifts, stages)
+                step.with_velocities(self.drifts, stages)
             elif self.kick_first:
                 step.kick_first(self.kicks, stages)
             else:
@@ -225,7 +232,7 @@ class Splitting:
 
     def _compiled(self, system: System, start: State, dt: float, flights: Flights) -> State:
         """K D K ... D K in few calls, each of which costs as much as its work on a few molecules."""
-        x, before, forces = start.positions, start.velocities, start.forces
+        x, before, forces = system.taken(start)
         shape, number = x.shape, start.step + 1
         time, time_remainder = start.later(dt)
         shift: FloatArray | None = None
@@ -235,8 +242,6 @@ class Splitting:
         force, kicks, f = system.force, self.kicks, forces
         if force is None or f is None:
             kicks, f = self._no_kicks, system.weights
-        if start is not flights.last:
-            x, before, f = flights.known(x, before, f)
         v, work, many, tables = np.empty(shape), NO_WORK, self._many, flights.tables()
         fly = flights.many if many else flights.one
         if many:
@@ -259,7 +264,7 @@ class Splitting:
                         check_finite(f, bad, number)
                 x, before = out, v
                 if force is not None:
-                    f = system.accepted(force(x if shift is None else x + shift, now), number, not left)
+                    f = system.accepted(force(lent(x if shift is None else x + shift), now), number, not left)
             bad = ""
             found = flights.end(dt, x, v, work, kicks[-1] * dt, f, tables)
             if found:
@@ -280,7 +285,7 @@ class Splitting:
             remainder = x - (out - shift)
         elif bad:  # far by now: from here on relative to one atom
             remainder = work[0].copy() if many else np.zeros(shape)
-        last = flights.last = State(out, v, time, forces, number, remainder, time_remainder)
+        last = system.last = State(out, v, time, forces, number, remainder, time_remainder)
         return last
 
 
@@ -323,13 +328,12 @@ class _Step:
         self.tables: Packed = (NO_WORK, None, None, None)
         #: Where positions are far from the origin they are taken relative to one atom.
         self.shift: FloatArray | None = None
-        x = start.positions
+        x, v, self.forces = system.taken(start)
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
-        self.point = Point(x, start.velocities, system.weights, exact=many or self.exact)
+        self.point = Point(x, v, system.weights, exact=many or self.exact)
         self.out = x
-        self.forces = start.forces
         self.now = start.time
 
     # -- stages ---------------------------------------------------------------------------------
@@ -356,7 +360,7 @@ class _Step:
         self.forces = None
         self.project()
 
-    def with_friction(self, weights: Sequence[float], stages: list[Stage]) -> None:
+    def with_velocities(self, weights: Sequence[float], stages: list[Stage]) -> None:
         """Forces depend on v: half a kick with f(x0, v0), and half a one with f(x1, v1), solved for v1.
 
         Step and adjoint in one: symmetric, so that compositions keep their order.
@@ -375,6 +379,9 @@ class _Step:
 
     def drift(self, stage: Stage) -> None:
         dt, point = self.dt, self.point
+        if self.system.friction is not None:
+            self.damped_drift(stage, self.system.friction)
+            return
         # Positions that the force function has seen are never written to again.
         self.out = out = np.empty_like(point.x)
         if self.flights is not None:
@@ -389,6 +396,27 @@ class _Step:
             left -= 1
             self.flight.move(point, point.work[2] if left % 2 else out, then, self.now, fraction * dt)
         self.refuse_unsound()
+
+    def damped_drift(self, stage: Stage, friction: Friction) -> None:
+        """Each flight between two halves of the friction."""
+        point = self.point
+        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
+            then, self.now = self.now, self.ended(end)
+            h = fraction * self.dt
+            self.damp(friction, 0.5 * h, then)
+            self.out = out = np.empty_like(point.x)
+            if self.flights is None:
+                self.flight.move(point, out, then, self.now, friction.flight(h))
+            else:
+                bad = self.flights.move(point, _WHOLE, friction.flight(h), out, self.now, self.tables)
+                if bad:
+                    self.refuse(bad)
+            self.damp(friction, 0.5 * h, self.now)
+
+    def damp(self, friction: Friction, h: float, time: float) -> None:
+        self.point.land()
+        self.refuse_unsound()
+        friction.damp(self.point.x, self.point.v, h, time)
 
     def ended(self, end: float) -> float:
         """The time at the fraction `end` of the step."""
@@ -408,21 +436,24 @@ class _Step:
         half_kick = (fraction * self.dt) * system.inverse_masses
         point.land()
         drifted = point.v
+        start = float(np.abs(drifted).max(initial=0.0))
         v, change = drifted, math.inf
         for _ in range(_MAX_ITERATIONS):
             forces = system.forces(positions, v, now, self.number)
-            following = system.motion.project_velocities(point.x, drifted + half_kick * forces, time=now)
+            push = half_kick * forces
+            following = system.motion.project_velocities(point.x, drifted + push, time=now)
             last, change = change, float(np.abs(following - v).max(initial=0.0))
-            speed = float(np.abs(following).max(initial=0.0))
             v = following
-            if change <= 2 * _EPS * speed or (change >= last and change <= 1e-13 * speed):
+            # Where the system comes to rest, v is the small difference of what it had and the kick: these are rounded.
+            size = max(start, float(np.abs(push).max(initial=0.0)), float(np.abs(v).max(initial=0.0)))
+            if change <= 2 * _EPS * size or (change >= last and change <= 1e-13 * size):
                 self.forces = system.forces(positions, v, now, self.number)
                 point.restart(v)
                 return
         raise ConvergenceError(
             f"velocity-dependent forces do not settle: the velocities still change by {change:.3g} "
             f"after {_MAX_ITERATIONS} iterations; time step too large",
-            residual=change / max(speed, float(np.finfo(float).tiny)),
+            residual=change / max(size, float(np.finfo(float).tiny)),
             tolerance=2 * _EPS,
             iterations=_MAX_ITERATIONS,
         )
@@ -457,7 +488,9 @@ class _Step:
             remainder = x - (positions - self.shift)
         elif self.system.is_far(x):  # by now: from here on relative to one atom
             remainder = np.zeros_like(x) if self.point.x_low is None else self.point.x_low.copy()
-        return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
+        last = State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder)
+        self.system.last = last
+        return last
 
     def refuse(self, item: str) -> None:
         """Raise for what a compiled stage found."""

@@ -6,21 +6,26 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import SEEK_END, BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO
-from zipfile import BadZipFile
+from struct import Struct
+from typing import Any, BinaryIO
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import as_array, lent, numbers
 from kcons.certificate import Schedule
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, NonFiniteError, OverdeterminedError
+from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
+from kcons.files import in_one_piece
 from kcons.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.flights import Flights
+from kcons.steppers.friction import Friction
 from kcons.steppers.summation import all_finite, beyond
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
@@ -30,7 +35,12 @@ FAR = 8.0
 #: speed) that is still taken for rounding; the first step removes it.
 START_TOLERANCE = 1e-9
 
+#: What the stages of a step together round, of its kick.
+KICK_ROUNDING = 64 * float(np.finfo(float).eps)
+
 _FLOAT = np.dtype(np.float64)
+#: The record at the end of an archive without comment; the fifth number is how many files there are.
+_LAST_RECORD = Struct("<4s4H2LH")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -40,7 +50,8 @@ class State:
     Attributes
     ----------
     positions, velocities : ndarray, shape (n_atoms, 3)
-        In the caller's units. Treat them as read-only: states share arrays where nothing changed.
+        In the caller's units. Treat them as read-only: states share arrays where nothing changed. Those of states
+        that observers see cannot be changed.
     time : float
     forces : ndarray, shape (n_atoms, 3), or None
         Applied forces at this state, None before they are known. With them in hand a step evaluates the
@@ -111,11 +122,8 @@ class State:
         if not isinstance(file, str | PathLike):
             np.savez(file, **present)
             return
-        target = Path(file)
-        unfinished = target.with_name(target.name + ".unfinished")
-        with unfinished.open("wb") as opened:
+        with in_one_piece(file) as opened:
             np.savez(opened, **present)
-        unfinished.replace(target)
 
     @classmethod
     def load(cls, file: str | PathLike[str] | BinaryIO) -> State:
@@ -124,18 +132,76 @@ class State:
         Raises
         ------
         InputError
-            The file holds no state.
+            The file holds no state, or not all of it is as it was written.
         """
         if isinstance(file, str | PathLike):
-            with Path(file).open("rb") as opened:  # NumPy would leave a broken archive open
+            with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            with np.load(file) as stored:
-                values = {name: stored[name] for name in stored.files}
-            return cls(**{name: a if a.ndim else a.item() for name, a in values.items()})
-        except (TypeError, ValueError, BadZipFile, EOFError) as error:
+            return cls(**_checked(_stored(file)))
+        except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
+
+    def shown(self) -> State:
+        """The same state for a function of the user, who can read its arrays and not change them."""
+        view = object.__new__(_Shown)
+        object.__setattr__(view, "__dict__", vars(self))
+        return view
+
+    def copied(self) -> State:
+        """The same state with arrays of its own."""
+        own: dict[str, Any] = {n: a.copy() if isinstance(a, np.ndarray) else a for n, a in vars(self).items()}
+        return State(**own)
+
+
+class _Shown(State):
+    """A state that shares the arrays of another one, and lends them only."""
+
+    positions = property(lambda self: lent(vars(self)["positions"]))  # type: ignore[assignment]
+    velocities = property(lambda self: lent(vars(self)["velocities"]))  # type: ignore[assignment]
+    forces = property(lambda self: _lent(vars(self)["forces"]))  # type: ignore[assignment]
+    remainder = property(lambda self: _lent(vars(self)["remainder"]))  # type: ignore[assignment]
+    thermostat = property(lambda self: _lent(vars(self)["thermostat"]))  # type: ignore[assignment]
+
+
+def _lent(array: FloatArray | None) -> FloatArray | None:
+    return None if array is None else lent(array)
+
+
+def _stored(file: BinaryIO) -> dict[str, Any]:
+    """The arrays of an archive, each with its checksum compared."""
+    found: dict[str, Any] = {}
+    with ZipFile(file) as archive:
+        # A damaged entry of the directory may hide the next one; its last record says how many there are.
+        file.seek(-_LAST_RECORD.size, SEEK_END)
+        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
+        if count != len(archive.namelist()):
+            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
+        for name in archive.namelist():
+            # Read whole: what `numpy.load` does not look at, it does not check either.
+            content = BytesIO(archive.read(name))
+            array = np.lib.format.read_array(content, allow_pickle=False)
+            if content.read(1):
+                raise ValueError(f"{name} is longer than what it holds")
+            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
+    return found
+
+
+def _checked(values: dict[str, Any]) -> dict[str, Any]:
+    """What a state is made of, as a step needs it."""
+    shape = np.shape(values["positions"])
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"positions have shape {shape}")
+    for name in ("positions", "velocities", "forces", "remainder"):
+        if name in values:
+            values[name] = as_array(values[name], shape, name)
+    if "thermostat" in values:
+        values["thermostat"] = np.atleast_1d(numbers(values["thermostat"], "thermostat"))
+    for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
+        if not isinstance(values.get(name, 0), kind):
+            raise ValueError(f"{name} is {values[name]!r:.40}")
+    return values
 
 
 class System:
@@ -152,7 +218,11 @@ class System:
     potential : callable, optional
         Potential energy ``potential(x, t)``, for `total_energy`.
     velocity_dependent : bool
-        Whether `force` takes the velocities too (friction, magnetic fields).
+        Whether `force` takes the velocities too (magnetic fields, drag that is not linear).
+    friction : array_like, shape () or (n_atoms,)
+        Rates at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time: for all atoms,
+        or for each. Solved exactly, so that it takes no shorter step and no further evaluation of the force; see
+        `kcons.steppers.friction`. Relative to space at rest, also where targets move.
     far : float
         From this many times the size of what is held away from the origin, states carry the remainder of their
         positions. Infinite: never, so that positions and velocities alone are the whole state.
@@ -160,7 +230,7 @@ class System:
     Raises
     ------
     InputError
-        An atom that is not held by FixedAtoms has a mass that is not positive.
+        An atom that is not held by FixedAtoms has a mass that is not positive; bad rates of friction.
     """
 
     def __init__(
@@ -170,6 +240,7 @@ class System:
         *,
         potential: Callable[[FloatArray, float], float] | None = None,
         velocity_dependent: bool = False,
+        friction: ArrayLike = 0.0,
         far: float = FAR,
     ) -> None:
         if not far >= 1:
@@ -199,11 +270,30 @@ class System:
         self.inverse_masses[fixed] = 0.0
         #: The same for each coordinate, shape (n_atoms, 3).
         self.weights: FloatArray = np.repeat(self.inverse_masses, 3, axis=1)
+        rates = Friction(friction, motion, self.inverse_masses)
+        #: The state that the last step ended in, whose arrays need not be looked at.
+        self.last: State | None = None
+        #: None where nothing is slowed down.
+        self.friction: Friction | None = rates if rates.largest > 0 else None
 
     @cached_property
     def schedule(self) -> Schedule:
         """When states of this system are certified."""
-        return Schedule(self.motion.certify)
+        return Schedule(self._certify)
+
+    def _certify(self, x: FloatArray, v: FloatArray, time: float) -> None:
+        try:
+            self.motion.certify(x, v, time)
+        except CertificateError:
+            # Relative to the speed alone nothing that has come to rest could be certified.
+            held, still = self.motion.constraint_set, np.zeros_like(v)
+            slow = np.full_like(v, self.rest(x, v, time))
+            rates, allowed = held.residuals(x, v, time).rates, held.residuals(x, slow, time).speeds
+            wanted = held.residuals(x, still, time).speeds
+            assert rates is not None and allowed is not None and wanted is not None
+            if not np.all(np.abs(rates) <= allowed - wanted):
+                raise
+            self.motion.certify(x, None, time)
 
     # -- states ---------------------------------------------------------------------------------
 
@@ -271,7 +361,11 @@ class System:
             remainder = local - (x - shift)
         tangent = motion.project_velocities(local, v, time=time)
         away = np.abs(tangent - v)
-        if given and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+        if (
+            given
+            and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max())
+            and away.max() > self.rest(x, v, time)
+        ):
             if motion.degrees_of_freedom == 0:
                 raise OverdeterminedError(
                     f"rank {motion.rank} leaves no degree of freedom, yet atoms move: hold fewer rows, "
@@ -292,6 +386,11 @@ class System:
             v = tangent
         return State(x, v, time, remainder=remainder)
 
+    def rest(self, x: FloatArray, v: FloatArray, time: float) -> float:
+        """Speed below which velocities are rounding: that of a kick by which atoms cross the system in a step."""
+        kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
+        return KICK_ROUNDING * math.sqrt(kick * float(np.ptp(x, axis=0).max(initial=0.0)))
+
     def forces(
         self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True, finite: bool = True
     ) -> FloatArray:
@@ -302,7 +401,7 @@ class System:
         """
         if self.force is None:
             return np.zeros((self.n_atoms, 3))
-        raw = self.force(x, v, time) if self.velocity_dependent else self.force(x, time)
+        raw = self.force(lent(x), lent(v), time) if self.velocity_dependent else self.force(lent(x), time)
         f = self.accepted(raw, step, copy)
         if finite:
             check_finite(f, "force", step)
@@ -314,11 +413,9 @@ class System:
         if type(raw) is np.ndarray and raw.dtype is _FLOAT and raw.shape == self._shape and raw.flags.carray:
             return raw.copy() if copy else raw
         try:
-            f = np.array(raw, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"the force function returned no array of numbers at step {step}: {error}", item="forces"
-            ) from None
+            f = np.array(numbers(raw, "forces"), order="C")
+        except InputError as error:
+            raise InputError(f"the force function, at step {step}: {error}", item="forces") from None
         if f.shape != self._shape:
             raise InputError(
                 f"the force function returned shape {f.shape} at step {step}; it must return ({self.n_atoms}, 3)",
@@ -326,11 +423,30 @@ class System:
             )
         return f
 
+    def taken(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Positions, velocities and forces of a state, as the kernels can take them.
+
+        Raises
+        ------
+        InputError
+            Wrong shapes, complex numbers, masked arrays: a state may have been made by hand.
+        """
+        x, v, f = state.positions, state.velocities, state.forces
+        if state is self.last:
+            return x, v, f
+        x, v = as_array(x, self._shape, "positions"), as_array(v, self._shape, "velocities")
+        return x, v, None if f is None else as_array(f, self._shape, "forces")
+
+    def resisted(self, f: FloatArray, v: FloatArray) -> FloatArray:
+        """Applied forces and friction together, where friction is not solved exactly."""
+        return f if self.friction is None else f + self.friction.force(v)
+
     def with_forces(self, state: State) -> State:
         """The state with its forces filled in."""
         if state.forces is not None:
             return state
-        return replace(state, forces=self.forces(state.positions, state.velocities, state.time, state.step))
+        x, v, _ = self.taken(state)
+        return replace(state, forces=self.forces(x, v, state.time, state.step))
 
     # -- energies -------------------------------------------------------------------------------
 
@@ -345,7 +461,7 @@ class System:
             raise InputError("this System has no potential; pass potential=... to follow the energy", item="potential")
         energy = self.kinetic_energy(state.velocities)
         if self.potential is not None:
-            energy += float(self.potential(state.positions, state.time))
+            energy += float(self.potential(lent(state.positions), state.time))
         return energy
 
     # -- inner ----------------------------------------------------------------------------------
@@ -386,10 +502,7 @@ class System:
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
     def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
-        try:
-            array = np.array(values, dtype=np.float64, order="C")
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{item} is no array of numbers: {error}", item=item) from None
+        array: FloatArray = np.array(numbers(values, item), order="C")
         if array.shape != (self.n_atoms, 3):
             raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
         bad = ~np.isfinite(array).all(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.certificate import checked_every
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
-from kcons.steppers.state import State, System
+from kcons.steppers.state import KICK_ROUNDING, State, System
 
 
 class Stepper(Protocol):
@@ -60,7 +60,8 @@ class ReversibilityCheck:
         The scheme; must be reversible.
     tolerance : float
         Largest allowed difference after a step forward and back: of positions relative to the distance travelled
-        or the size of the system, whichever is larger, and of velocities relative to the fastest one.
+        or the size of the system, whichever is larger, and of velocities relative to the fastest one. What rounding
+        leaves of positions, and of the kick of a step, is allowed besides: at rest there is nothing else.
 
     Raises
     ------
@@ -119,10 +120,13 @@ class ReversibilityCheck:
         speed = max(_largest(state.velocities), _largest(after.velocities))
         length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
         rounding = 8 * float(np.spacing(_largest(state.positions)))
-        moved = np.abs(back.positions - state.positions)
-        turned = np.abs(back.velocities - state.velocities)
+        forces = system.with_forces(after).forces
+        assert forces is not None
+        kick = abs(dt) * _largest(forces * system.inverse_masses)
+        moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
+        turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
         # A speed of zero both before and after leaves nothing to compare with.
-        off = np.maximum(np.maximum(moved - rounding, 0.0) / (length or 1.0), turned / (speed or 1.0))
+        off = np.maximum(moved / (length or 1.0), turned / (speed or 1.0))
         residual = float(off.max(initial=0.0))
         if not residual <= self.tolerance:
             atom = int(np.argmax(off.max(axis=1)))
@@ -164,7 +168,8 @@ def run(
     stepper : Stepper, optional
         `Rattle` by default.
     observers : iterable of callable
-        Each is called with the state at the start and after every `every` steps.
+        Each is called with the state at the start and after every `every` steps; it can keep the state, and not
+        change its arrays.
     every : int
     check_every : int, optional
         The first state, and one in so many, is certified: sigma and A v evaluated by the constraint set itself, beside
@@ -196,7 +201,7 @@ def run(
     schedule = system.schedule
     watching = tuple(observers)
     for observer in watching:
-        observer(state)
+        observer(state.shown())
     march = getattr(stepper, "march", None)
     done = 0
     while done < steps:
@@ -212,7 +217,7 @@ def run(
         schedule.made(n, check_every, state, spare=spare)
         if done % every == 0:
             for observer in watching:
-                observer(state)
+                observer(state.shown())
     return state
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -47,7 +48,7 @@ def mean(values: ArrayLike) -> Estimate:
     InputError
         Fewer than 32 values.
     """
-    series = np.asarray(values, dtype=np.float64)
+    series = numbers(values, "values")
     if series.ndim != 1 or len(series) < 2 * BLOCKS:
         raise InputError(f"{series.shape} values are too few for an error; give {2 * BLOCKS} or more", item="values")
     errors = []
@@ -67,7 +68,7 @@ def configurational_temperature(squares: ArrayLike, curvatures: ArrayLike) -> Es
     InputError
         Fewer than 32 samples, or not as many of one as of the other.
     """
-    above, below = np.asarray(squares, dtype=np.float64), np.asarray(curvatures, dtype=np.float64)
+    above, below = numbers(squares, "squares"), numbers(curvatures, "curvatures")
     if above.shape != below.shape:
         raise InputError(f"{above.shape} squares and {below.shape} curvatures do not go together", item="curvatures")
     scale = float(below.mean())

@@ -253,6 +253,15 @@ def atom_numbers(atoms: ArrayLike, n_atoms: int) -> IntArray:
     return numbers
 
 
+def refuse_friction(system: System) -> None:
+    """Raise `UnsupportedError` where the system has friction of its own, which takes out heat that no noise brings."""
+    if system.friction is not None:
+        raise UnsupportedError(
+            "a System with friction has no temperature: what it takes out, a thermostat would put back elsewhere; "
+            "leave it out of the System, and give the rate to Langevin, which brings noise with it"
+        )
+
+
 def positive(value: float, item: str) -> float:
     """`value` as a float.
 

@@ -25,6 +25,7 @@ from kcons.thermostats.freedom import (
     carried,
     freedom,
     positive,
+    refuse_friction,
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic_step import SMALLEST, IsokineticStep, Share, compiled_step, left_for, split
@@ -156,7 +157,8 @@ class Isokinetic(Splitting):
         return f"Isokinetic({', '.join(given)})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces."""
+        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
+        refuse_friction(system)
         if system.velocity_dependent:
             raise UnsupportedError(
                 "forces that depend on the velocities have no closed kick; use Langevin for friction, or leave it out"

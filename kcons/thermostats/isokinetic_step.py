@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import as_array
+from kcons.arrays import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
@@ -116,8 +116,8 @@ def compiled_step(
     """A step of order 2 in two compiled calls; None, with nothing done, where the first of them cannot do its half."""
     stages, force = share.stages, system.force
     assert stages is not None and force is not None and start.forces is not None and start.thermostat is not None
-    shape = system.n_atoms, 3
-    x, u = as_array(start.positions, shape, "positions"), as_array(start.velocities, shape, "velocities")
+    x, u, f = system.taken(start)
+    assert f is not None
     shift: FloatArray | None = None
     if start.remainder is not None:
         shift = x[system.anchor]
@@ -126,13 +126,13 @@ def compiled_step(
     time, time_remainder = start.later(dt)
     number, tables = start.step + 1, stages.tables()
     status, there, speed, first_growth = stages.before(
-        x, u, start.forces, square, twice, kicks[0] * dt, stage.fractions[0] * dt, tables
+        x, u, f, square, twice, kicks[0] * dt, stage.fractions[0] * dt, tables
     )
     if status == POSITION:
         check_finite(there, "position", number)
     if status != DONE:
         return None
-    f = system.accepted(force(there if shift is None else there + shift, time), number, True)
+    f = system.accepted(force(lent(there if shift is None else there + shift), time), number, True)
     status, after, _, square, _, growth = stages.after(there, speed, f, twice, kicks[1] * dt, tables)
     if status != DONE:
         run = IsokineticStep(system, share, start, dt)
@@ -151,7 +151,6 @@ class IsokineticStep:
     """The arrays of one step on its way: velocities v = drive + u, the drive None where targets rest."""
 
     def __init__(self, system: System, share: Share, start: State, dt: float) -> None:
-        assert start.thermostat is not None and start.forces is not None
         self.system, self.share, self.dt = system, share, dt
         self.stages = share.stages if system.force is not None else None
         self.tables: tuple[Any, ...] = () if self.stages is None else self.stages.tables()
@@ -160,19 +159,18 @@ class IsokineticStep:
         self.time, self.time_remainder = start.later(dt)
         self.now = start.time
         self.shift = None
-        shape = system.n_atoms, 3
-        x = as_array(start.positions, shape, "positions")
+        x, self.u, forces = system.taken(start)
+        assert start.thermostat is not None and forces is not None
+        self.forces: FloatArray = forces
         if start.remainder is not None:
             self.shift = x[system.anchor]
             x = (x - self.shift) + start.remainder
         self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
         self.x = x
-        self.forces = start.forces
         self.drive: FloatArray | None = None
-        self.u = as_array(start.velocities, shape, "velocities")
         self.left = self.twice
         if system.motion.plan.driven:
-            self.drive, self.u = split(system, x, start.velocities, self.now)
+            self.drive, self.u = split(system, x, self.u, self.now)
             self._settle()
 
     def through(self, kicks: tuple[float, ...], stages: list[Stage]) -> State:

@@ -12,7 +12,7 @@ from kcons.steppers import State, System
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.steppers.summation import Point
-from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
 
 
 class Langevin:
@@ -87,7 +87,8 @@ class Langevin:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces."""
+        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
+        refuse_friction(system)
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
 
@@ -116,14 +117,14 @@ class Langevin:
         middle = state.time + (0.5 * dt + state.time_remainder)
         motion = system.motion
         shift = None
-        x = start.positions
+        x, v, f = system.taken(start)
         if start.remainder is not None:
             shift = x[system.anchor]
             x = (x - shift) + start.remainder
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
             try:
-                assert start.forces is not None
-                v = start.velocities + (0.5 * dt) * (start.forces * system.inverse_masses)
+                assert f is not None
+                v = v + (0.5 * dt) * (f * system.inverse_masses)
                 x, v = self._fly(system, x, v, state.time, middle, 0.5 * dt)
                 v, heat = self._exchange(system, x, v, middle, dt, number)
                 x, v = self._fly(system, x, v, middle, time, 0.5 * dt)

@@ -13,7 +13,14 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.stepper import stays
-from kcons.thermostats.freedom import Momentum, carried, freedom, positive, warn_of_conserved_momenta
+from kcons.thermostats.freedom import (
+    Momentum,
+    carried,
+    freedom,
+    positive,
+    refuse_friction,
+    warn_of_conserved_momenta,
+)
 
 #: Suzuki's fractions of order 4 for the motion of the chain.
 _SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -87,7 +94,8 @@ class NoseHooverChain:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
 
     def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for rows whose targets demand velocities, or velocity-dependent forces."""
+        """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
+        refuse_friction(system)
         if system.velocity_dependent:
             raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use Langevin")
         if system.motion.plan.driven:

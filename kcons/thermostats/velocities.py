@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.arrays import as_array
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import System
@@ -56,7 +57,7 @@ def thermal_velocities(
         positive(kinetic_energy, "kinetic_energy")
     generator = rng if isinstance(rng, np.random.Generator) else np.random.default_rng(rng)
     motion = system.motion
-    x = np.ascontiguousarray(positions, dtype=np.float64)
+    x = as_array(positions, (system.n_atoms, 3), "positions")
     drive = motion.project_velocities(x, np.zeros_like(x), time=time)
     noise = generator.standard_normal(x.shape) * np.sqrt(thermal_energy * system.inverse_masses)
     free = motion.degrees_of_freedom

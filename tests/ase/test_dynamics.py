@@ -173,6 +173,36 @@ def boxed() -> tuple[Atoms, Constraints]:
     return atoms, held
 
 
+def test_its_state_cannot_be_changed_and_goes_on():
+    atoms, _ = rigid()
+    dynamics = ConstrainedDynamics(atoms, 1 * FS)
+    dynamics.run(3)
+    state = dynamics.state
+    for array in (state.positions, state.velocities, state.forces):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0.0
+    other, _ = rigid()
+    resumed = ConstrainedDynamics(other, 1 * FS, state=state)
+    resumed.run(3)
+    dynamics.run(3)
+    np.testing.assert_array_equal(other.positions, atoms.positions)
+    np.testing.assert_array_equal(other.get_momenta(), atoms.get_momenta())
+
+
+@pytest.mark.parametrize("rates", [0.5, [0.2, 0.5, 0.9]], ids=["one rate", "a rate for each"])
+def test_friction_brings_to_rest_on_the_constraints(rates):
+    """And a run at rest can be saved and continued."""
+    atoms, _ = water(Field(stiffness=2.0))
+    dynamics = ConstrainedDynamics(atoms, 0.25, friction=np.asarray(rates))
+    dynamics.run(2000)
+    assert np.abs(atoms.get_velocities()).max() <= 1e-13
+    left = dynamics.motion.project_forces(atoms.positions, atoms.get_forces(apply_constraint=False))
+    assert np.abs(left).max() <= 1e-11
+    again = atoms.copy()
+    again.calc = Field(stiffness=2.0)
+    ConstrainedDynamics(again, 0.25, friction=np.asarray(rates), state=dynamics.state).run(2)
+
+
 def test_periodic_box_with_wrapping():
     atoms, held = boxed()
     other, _ = boxed()

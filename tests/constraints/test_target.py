@@ -47,8 +47,8 @@ def test_an_acceleration_without_its_rate_is_refused():
         (np.zeros((2, 2)), r"target has shape \(2, 2\)"),
         ([1.0, np.nan, 2.0], "the target of row 1 is not finite"),
         (np.inf, "the target of row 0 is not finite"),
-        ("one", "no number or array of numbers"),
-        ([[1.0], [1.0, 2.0]], "no number or array of numbers"),
+        ("one", "target is no array of numbers"),
+        ([[1.0], [1.0, 2.0]], "target is no array of numbers"),
     ],
 )
 def test_bad_targets_are_named(target, message):

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraints import Distance, FixedAtoms, LinearVelocity, MovingTarget, Sphere
+from kcons.constraints import (
+    CustomVelocity,
+    Distance,
+    FixedAtoms,
+    ImplicitSurface,
+    LinearVelocity,
+    MovingTarget,
+    Sphere,
+)
 from kcons.errors import ConvergenceError
 from kcons.steppers.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
 from kcons.steppers.summation import Point
@@ -125,3 +133,64 @@ def test_great_circles_absorb_velocities_along_the_radius() -> None:
         tangent = np.array([-np.sin(4.5), np.cos(4.5), 0.0])
         assert v[0] @ tangent == pytest.approx(3.0, abs=1e-14)
         assert abs(v[0] @ at[0]) <= 1e-14
+
+
+# -- times ------------------------------------------------------------------------------------------
+
+
+def turning(rate: float = 1.3) -> ImplicitSurface:
+    """Atom 0 in a plane through the z axis that turns: the gradient depends on the time, not only the value."""
+    return ImplicitSurface(
+        0,
+        lambda r, t: r[:, 0] * np.sin(rate * t) - r[:, 1] * np.cos(rate * t),
+        lambda r, t: np.tile([np.sin(rate * t), -np.cos(rate * t), 0.0], (len(r), 1)),
+        lambda r, v, t: np.zeros_like(r),
+        time_dependent=True,
+        time_derivatives=lambda r, v, t: (
+            rate * (r[:, 0] * np.cos(rate * t) + r[:, 1] * np.sin(rate * t)),
+            2 * rate * (v[:, 0] * np.cos(rate * t) + v[:, 1] * np.sin(rate * t))
+            - rate**2 * (r[:, 0] * np.sin(rate * t) - r[:, 1] * np.cos(rate * t)),
+        ),
+        length=1.0,
+    )
+
+
+def pushed(speed) -> CustomVelocity:
+    """Atom 2 moves at a given speed in a direction that turns with the time and depends on the place."""
+    return CustomVelocity(
+        [2], lambda r, t: np.array([[np.cos(2 * t), np.sin(2 * t), r[0, 0]]]), target=speed, time_dependent=True
+    )
+
+
+def swept(*more) -> tuple:
+    x = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.8], [1.7, 0.3, 0.8]])
+    system = system_of([turning(), Distance([[0, 1], [1, 2]]), *more], x, [1.0, 0.4, 2.0])
+    v = np.array([[0.3, 0.0, 0.1], [0.2, 0.5, -0.4], [0.0, 0.3, 0.6]])
+    return system, system.initial_state(x, v, project=True)
+
+
+@pytest.mark.parametrize("h", [0.2, -0.2])
+@pytest.mark.parametrize("driven", [False, True], ids=["position rows", "with a velocity row"])
+def test_impulses_act_along_the_gradients_of_the_time_of_the_start(driven, h) -> None:
+    """u - v = M^-1 A(x0, t0)^T l: the plane has turned by the end, and pushes where it was."""
+    system, state = swept(*([pushed(np.cos)] if driven else []))
+    drift = rattle_drift(system.motion, system.inverse_masses)
+    x, u = flown(drift, system, state, h)
+    held = system.motion.constraint_set
+    assert np.abs(held.value(x, h)[held.holonomic]).max() <= 1e-14
+    np.testing.assert_allclose(x - state.positions, h * u, rtol=0, atol=1e-15)
+    along = held.jacobian(state.positions, 0.0).toarray()
+    push = (u - state.velocities).ravel() * np.repeat(system.masses, 3)
+    left = push - along.T @ np.linalg.lstsq(along.T, push, rcond=None)[0]
+    assert np.abs(push).max() > 1e-2
+    assert np.abs(left).max() <= 1e-13
+
+
+@pytest.mark.parametrize("h", [0.2, -0.2])
+def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
+    """a((x0 + x1)/2, t0 + h/2) . u = c(t0 + h/2), for coefficients and for speeds that depend on time."""
+    speed = lambda t: np.cos(3 * t + 0.4)  # noqa: E731
+    system, state = swept(pushed(speed))
+    x, u = flown(rattle_drift(system.motion, system.inverse_masses), system, state, h)
+    middle = 0.5 * (state.positions + x)[2, 0]
+    assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)

@@ -215,7 +215,7 @@ def test_wrong_forces_are_refused() -> None:
     system, state = molecules(*GROUPS)
     for wrong, message in (
         (lambda x, t: np.zeros(3), "returned shape \\(3,\\) at step 1"),
-        (lambda x, t: "none", "no array of numbers at step 1"),
+        (lambda x, t: "none", "at step 1: forces is no array of numbers"),
     ):
         start = system.with_forces(state)
         system.force = wrong

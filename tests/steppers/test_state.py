@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 from pathlib import Path
 
@@ -146,6 +147,86 @@ def test_other_arrays_are_no_state(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", positions=np.zeros((1, 3)), charges=np.zeros(1))
     with pytest.raises(InputError, match="holds no state"):
         State.load(tmp_path / "x.npz")
+
+
+def whole_state() -> State:
+    rng = np.random.default_rng(2)
+    x, v, f, low = rng.normal(size=(4, 2, 3))
+    return State(x, v, 0.1, f, 7, 1e-12 * low, 1e-18, np.array([0.3, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def saved() -> bytes:
+    file = io.BytesIO()
+    whole_state().save(file)
+    return file.getvalue()
+
+
+def assert_whole_or_refused(content: bytes) -> bool:
+    try:
+        found = State.load(io.BytesIO(content))
+    except InputError as error:
+        assert "holds no state" in str(error)
+        return False
+    assert_same(found, whole_state())
+    return True
+
+
+@pytest.mark.parametrize("bits", [0x01, 0x7F, 0xFF])
+def test_a_damaged_byte_is_noticed(saved: bytes, bits: int) -> None:
+    """Checksums are those of whole arrays, headers included: no array comes back shorter, or with other numbers."""
+    content = bytearray(saved)
+    harmless = 0
+    for i in range(len(content)):
+        content[i] ^= bits
+        harmless += assert_whole_or_refused(bytes(content))
+        content[i] ^= bits
+    assert_whole_or_refused(saved)
+    # Dates, versions and rights of the archive are not part of the state.
+    assert harmless < 0.25 * len(saved)
+
+
+def test_a_file_that_ends_early_is_refused(saved: bytes) -> None:
+    assert not any(assert_whole_or_refused(saved[:n]) for n in range(len(saved)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("positions", np.zeros((2, 3), dtype=complex)),
+        ("positions", np.zeros((2, 2))),
+        ("positions", np.zeros(())),
+        ("velocities", np.zeros((3, 3))),
+        ("forces", np.zeros((2, 3), dtype="U3")),
+        ("step", 0.5),
+        ("time", "now"),
+    ],
+)
+def test_arrays_that_no_step_can_take_are_refused(name: str, value, tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", **{**vars(whole_state()), name: value})
+    with pytest.raises(InputError, match="holds no state"):
+        State.load(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("room", [0, 1, 500, 2200])
+def test_a_full_disk_leaves_nothing_behind(room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error of the disk comes through; the older file stays, and no unfinished one."""
+
+    class Full(io.FileIO):
+        def write(self, data) -> int:
+            if self.tell() + len(data) > room:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(data)
+
+    path = tmp_path / "state.npz"
+    older = whole_state().reversed()
+    older.save(path)
+    monkeypatch.setattr(Path, "open", lambda self, mode: Full(self, mode))
+    with pytest.raises(OSError, match="No space left"):
+        whole_state().save(path)
+    monkeypatch.undo()
+    assert [file.name for file in tmp_path.iterdir()] == ["state.npz"]
+    assert_same(State.load(path), older)
 
 
 # -- time and distance ------------------------------------------------------------------------------

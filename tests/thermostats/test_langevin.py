@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
+from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import Isokinetic, Langevin, thermal_velocities
@@ -173,3 +173,17 @@ def test_steps_that_cannot_be():
         thermostat.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), state, 0.1)
     same = thermostat.step(held, state, 0.0)
     assert np.array_equal(same.positions, state.positions) and np.array_equal(same.velocities, state.velocities)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_each_substep_meets_targets_at_its_own_time(substeps):
+    """Without forces, friction and noise a step is as many steps of RATTLE, with a rod that grows and shrinks."""
+    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    length = MovingTarget(lambda t: 1 + 0.3 * math.sin(4 * t), lambda t: 1.2 * math.cos(4 * t))
+    held = system([FixedAtoms([0]), Distance([0, 1], length)], x, np.ones(2))
+    state = held.initial_state(x, [[0, 0, 0], [1.2, 0.9, 0.0]])
+    dt = 0.12
+    end = run(held, state, dt, 5, stepper=Langevin(0.5, 0.0, 3, substeps=substeps))
+    known = run(held, state, dt / (2 * substeps), 5 * 2 * substeps)
+    np.testing.assert_allclose(end.positions, known.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(end.velocities, known.velocities, rtol=0, atol=1e-12)

@@ -128,3 +128,25 @@ def test_steps_that_cannot_be():
     moving = system([Distance([[0, 1]], lambda t: 1 + 0.5 * t)], x, [1.0, 3.0], waves)
     with pytest.raises(UnsupportedError, match="targets move"):
         thermostat.step(moving, moving.initial_state(x), 0.01)
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_temperature_oscillates_with_the_period_asked_for(n):
+    """Dumbbells without forces under one link: K'' = -2 (2 pi/period)^2 (K - g kT/2) near it, whatever g is."""
+    kt, period, dt = 0.5, 2.0, 0.005
+    x = np.array([[5.0 * i, y, 0.0] for i in range(n) for y in (0.0, 1.0)])
+    held = system([Distance(np.arange(2 * n).reshape(-1, 2))], x, np.ones(2 * n))
+    v = thermal_velocities(held, x, kt, 3, kinetic_energy=1.02 * 0.5 * 5 * n * kt)
+    kinetic: list[float] = []
+    run(
+        held,
+        held.initial_state(x, v),
+        dt,
+        1200,
+        stepper=NoseHooverChain(kt, period, length=1, momentum="free"),
+        observers=[lambda s: kinetic.append(held.kinetic_energy(s.velocities))],
+    )
+    off = np.array(kinetic) / (0.5 * 5 * n * kt) - 1
+    before = np.flatnonzero(off[1:] * off[:-1] < 0)
+    times = dt * (before + off[before] / (off[before] - off[before + 1]))
+    assert 2 * np.diff(times).mean() == pytest.approx(period / math.sqrt(2), rel=2e-3)

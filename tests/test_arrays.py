@@ -1,0 +1,286 @@
+"""Arrays from outside: what is refused, wherever it comes in, and what functions of the user can do to those lent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.arrays import as_array, lent, numbers
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import (
+    Custom,
+    CustomVelocity,
+    Distance,
+    Ellipsoid,
+    FixedAtoms,
+    ImplicitSurface,
+    LinearRelation,
+    LinearVelocity,
+    Plane,
+    Sphere,
+)
+from kcons.errors import InputError
+from kcons.motion import Motion
+from kcons.steppers import (
+    BlanesMoan6,
+    BlanesMoan6a,
+    Extrapolation,
+    Geodesic,
+    ProjectedRungeKutta4,
+    ProjectedVerlet,
+    Rattle,
+    State,
+    Suzuki4,
+    System,
+    run,
+)
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+
+X = np.array([[0.9, 0.0, -0.4], [1.5, 0.0, 0.1], [2.0, 0.3, -0.2]])
+MASSES = np.array([1.0, 0.7, 2.0])
+PULL = np.outer(MASSES, [0.0, 0.0, -1.0])
+
+
+def spoilt(values) -> dict[str, object]:
+    """The same numbers as they must not come in."""
+    array = np.asarray(values, dtype=float)
+    return {
+        "complex": array + 0j,
+        "object": array.astype(object),
+        "masked": np.ma.masked_array(array, np.zeros(array.shape, dtype=bool)),
+        "masked rows": [np.ma.masked_array(row, np.zeros(row.shape, dtype=bool)) for row in np.atleast_2d(array)],
+        "text": array.astype(str),
+    }
+
+
+KINDS = list(spoilt(X))
+
+
+def held(rows=None) -> Motion:
+    rows = [Sphere(0, np.zeros(3)), Distance([[0, 1], [1, 2]])] if rows is None else rows
+    return Motion(ConstraintSet(rows, X, MASSES), X)
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return held()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_real_number_is_refused(kind: str) -> None:
+    wrong = {"complex": "has complex", "masked": "is a masked", "masked rows": "is a masked"}.get(kind, "is no array")
+    with pytest.raises(InputError, match=f"^places {wrong}") as caught:
+        numbers(spoilt(X)[kind], "places")
+    assert caught.value.item == "places"
+    with pytest.raises(InputError):
+        as_array(spoilt(X)[kind], (3, 3), "places")
+
+
+@pytest.mark.parametrize(
+    "values", [X.tolist(), X.astype(np.float32), (10 * X).astype(int), np.asfortranarray(X), X[::-1]]
+)
+def test_real_numbers_come_in_as_float64(values) -> None:
+    array = as_array(values, X.shape, "places")
+    assert array.dtype == np.float64 and array.flags.carray
+    np.testing.assert_array_equal(array, np.asarray(values))
+
+
+def test_arrays_that_kernels_can_take_are_not_copied() -> None:
+    assert as_array(X, X.shape, "places") is X and numbers(X, "places") is X
+
+
+def test_kernels_never_see_arrays_that_cannot_be_written_to() -> None:
+    """Numba would compile each of them once more."""
+    assert as_array(lent(X), X.shape, "places").flags.writeable
+
+
+WAYS = {
+    "positions of a set": lambda m, bad: ConstraintSet([Distance([0, 1])], bad, MASSES),
+    "cell": lambda m, bad: ConstraintSet([Distance([0, 1])], X, MASSES, cell=bad),
+    "value of a set": lambda m, bad: m.constraint_set.value(bad),
+    "jacobian of a set": lambda m, bad: m.constraint_set.jacobian(bad),
+    "positions of an engine": lambda m, bad: Motion(m.constraint_set, bad),
+    "project_positions": lambda m, bad: m.project_positions(bad, X),
+    "project_positions, reference": lambda m, bad: m.project_positions(X, bad),
+    "restore_positions": lambda m, bad: m.restore_positions(bad),
+    "project_velocities": lambda m, bad: m.project_velocities(X, bad),
+    "acceleration": lambda m, bad: m.acceleration(X, X, bad),
+    "project_forces": lambda m, bad: m.project_forces(X, bad),
+    "report": lambda m, bad: m.report(bad),
+    "initial_state, positions": lambda m, bad: System(m).initial_state(bad),
+    "initial_state, velocities": lambda m, bad: System(m).initial_state(X, bad, project=True),
+    "forces": lambda m, bad: Rattle().step(System(m, lambda x, t: bad), State(X, 0 * X), 0.01),
+    "forces of v": lambda m, bad: Rattle().step(
+        System(m, lambda x, v, t: bad, velocity_dependent=True), State(X, 0 * X), 0.01
+    ),
+    "thermal_velocities": lambda m, bad: thermal_velocities(System(m), bad, 1.0, 1),
+    "targets of fixed atoms": lambda m, bad: FixedAtoms([0, 1, 2], bad),
+    "a moving target": lambda m, bad: FixedAtoms([0, 1, 2], lambda t: bad).target_at(0.0),
+    "normals": lambda m, bad: Plane([0, 1, 2], bad),
+    "points": lambda m, bad: Plane([0, 1, 2], [0, 0, 1], point=bad),
+    "centres": lambda m, bad: Sphere([0, 1, 2], bad),
+    "semi-axes": lambda m, bad: Ellipsoid([0, 1, 2], np.zeros(3), bad),
+    "coefficients": lambda m, bad: LinearVelocity([0, 1, 2], bad),
+    "weights": lambda m, bad: LinearRelation([3], [0, 1, 2], bad if isinstance(bad, list) else bad[0]),
+    "a gradient": lambda m, bad: held([Custom([0, 1, 2], lambda r: 1.0, lambda r: bad)]),
+    "gradients of a surface": lambda m, bad: held([ImplicitSurface([0, 1, 2], lambda r: r[:, 0], lambda r: bad)]),
+    "coefficients by a function": lambda m, bad: held([CustomVelocity([0, 1, 2], lambda r: bad)]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_every_way_in_refuses_them(way: str, kind: str, motion: Motion) -> None:
+    with pytest.raises(InputError, match=r"complex|masked|no array of numbers"):
+        WAYS[way](motion, spoilt(X)[kind])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_masses_are_refused(kind: str) -> None:
+    with pytest.raises(InputError, match="masses"):
+        ConstraintSet([Distance([0, 1])], X, spoilt(MASSES)[kind])
+
+
+STEPPERS = [
+    Rattle(),
+    Geodesic(),
+    Suzuki4(),
+    BlanesMoan6(),
+    BlanesMoan6a(),
+    ProjectedVerlet(),
+    ProjectedRungeKutta4(project=True),
+    Langevin(0.1, 0.5, 1),
+    NoseHooverChain(0.1, 5.0),
+    Isokinetic(),
+]
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "masked rows"])
+@pytest.mark.parametrize("item", ["positions", "velocities"])
+def test_states_made_by_hand_are_refused(item: str, kind: str, stepper, motion: Motion) -> None:
+    arrays = {"positions": X, "velocities": motion.project_velocities(X, 0.5 * X[::-1])}
+    arrays[item] = spoilt(arrays[item])[kind]
+    with pytest.raises(InputError, match=r"complex|masked|no array of numbers"):
+        run(System(motion, lambda x, t: PULL), State(**arrays), 0.01, 3, stepper=stepper)
+
+
+# -- what is lent -----------------------------------------------------------------------------------
+
+
+def careless(y, *rest) -> np.ndarray:
+    force = PULL - 0.3 * y
+    y += 0.01
+    return force
+
+
+@pytest.mark.parametrize("far", [False, True], ids=["near", "far"])
+@pytest.mark.parametrize("chains", [False, True], ids=["compiled", "engine"])
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+def test_forces_cannot_move_the_atoms(stepper, chains: bool, far: bool) -> None:
+    """Every way a step takes: many at once, one, piece by piece, relative to an atom."""
+    rows = [Distance([[0, 1], [1, 2]])] if not chains or far else [Sphere(0, np.zeros(3)), Distance([[0, 1], [1, 2]])]
+    x = X + 1e6 * far
+    motion = Motion(ConstraintSet(rows, x, MASSES), x)
+    v = motion.project_velocities(x, X[::-1])
+    start = System(motion).initial_state(x, v)
+    with pytest.raises(ValueError, match="read-only"):
+        run(System(motion, careless), start, 0.001, 3, stepper=stepper)
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Suzuki4(), Geodesic(3), ProjectedVerlet()], ids=repr)
+@pytest.mark.parametrize("which", [0, 1])
+def test_forces_cannot_change_velocities(stepper, which: int, motion: Motion) -> None:
+    def force(x, v, t):
+        (x, v)[which][0] = 0.0
+        return -0.1 * v
+
+    with pytest.raises(ValueError, match="read-only"):
+        run(System(motion, force, velocity_dependent=True), State(X, 0 * X), 0.01, 3, stepper=stepper)
+
+
+def test_what_a_force_function_keeps_stays_as_it_was(motion: Motion) -> None:
+    """Rooms are never used twice, whatever a function does with what it was lent."""
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def force(x, t):
+        kept.append((x, x.copy()))
+        return PULL
+
+    system = System(held([Distance([[0, 1], [1, 2]])]), force)
+    end = run(system, State(X, 0 * X), 0.01, 300, stepper=Suzuki4())
+    assert len(kept) > 1400
+    assert all(np.array_equal(a, b) and not a.flags.writeable for a, b in kept)
+    assert not any(np.shares_memory(end.positions, a) for a, _ in kept[-3:])
+
+
+def test_a_potential_cannot_move_the_atoms(motion: Motion) -> None:
+    def potential(x, t):
+        x += 1.0
+        return 0.0
+
+    with pytest.raises(ValueError, match="read-only"):
+        System(motion, lambda x, t: PULL, potential=potential).total_energy(State(X, 0 * X))
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), BlanesMoan6a(), ProjectedVerlet(), Langevin(0.1, 0.5, 1)], ids=repr)
+@pytest.mark.parametrize("name", ["positions", "velocities", "forces", "thermostat"])
+def test_observers_cannot_change_states(name: str, stepper, motion: Motion) -> None:
+    def tampering(state: State) -> None:
+        array = getattr(state, name)
+        if array is None:
+            raise ValueError("read-only, and not there")
+        array[:] += 0.01
+
+    system = System(motion, lambda x, t: PULL - 0.3 * x)
+    with pytest.raises(ValueError, match="read-only"):
+        run(system, system.with_forces(State(X, 0 * X)), 0.01, 3, stepper=stepper, observers=[tampering])
+
+
+def test_states_between_extrapolated_steps_cannot_be_changed(motion: Motion) -> None:
+    system = System(motion, lambda x, t: PULL)
+    for state in Extrapolation(1e-6).states(system, State(X, 0 * X), 1.0):
+        with pytest.raises(ValueError, match="read-only"):
+            state.velocities[:] = 0.0
+
+
+def test_a_run_goes_on_from_what_observers_kept(motion: Motion) -> None:
+    seen: list[State] = []
+    system = System(motion, lambda x, t: PULL)
+    end = run(system, State(X, 0 * X), 0.01, 10, observers=[seen.append], every=5)
+    again = run(system, seen[1], 0.01, 5)
+    np.testing.assert_array_equal(again.positions, end.positions)
+    np.testing.assert_array_equal(again.velocities, end.velocities)
+    assert isinstance(seen[1], State) and seen[1].step == 5
+
+
+@pytest.mark.parametrize("name", ["function", "gradient", "hessian_vector", "time_derivatives"])
+@pytest.mark.parametrize("family", [Custom, ImplicitSurface])
+def test_functions_of_rows_cannot_change_what_they_see(family, name: str) -> None:
+    single = family is Custom
+    given = {
+        "function": lambda r, t: np.sum(r[..., 0] ** 2, axis=None if single else -1) if single else r[:, 0] ** 2,
+        "gradient": lambda r, t: 2 * r * [1.0, 0.0, 0.0],
+        "hessian_vector": lambda r, v, t: 2 * v * [1.0, 0.0, 0.0],
+        "time_derivatives": lambda r, v, t: (0.0, 0.0),
+    }
+
+    def tampering(*arguments):
+        result = given[name](*arguments)
+        arguments[0][:] = 0.0
+        return result
+
+    functions = {**given, name: tampering}
+    order = ("function", "gradient", "hessian_vector")
+    row = family([0], *(functions[key] for key in order), target=None, time_derivatives=functions["time_derivatives"])
+    with pytest.raises(ValueError, match="read-only"):
+        held([row]).acceleration(X, X, X)
+
+
+def test_coefficients_of_velocity_rows_cannot_change_what_they_see() -> None:
+    def tampering(r):
+        r[:] = 0.0
+        return np.ones((1, 3))
+
+    with pytest.raises(ValueError, match="read-only"):
+        held([CustomVelocity([0], tampering)])
