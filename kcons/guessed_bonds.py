@@ -18,6 +18,14 @@ RADII: dict[str, float] = {
 STRETCH = 1.25
 #: Atoms closer than this, in angstrom, are one atom twice.
 COINCIDENT = 0.3
+#: Without elements: a bond is shorter than this times the geometric mean of its atoms' distances to their nearest
+#: neighbours. Bonds to carbon with hydrogens reach 1.40 (C-C) and 1.51 (C-S), the closest atoms that are not bonded
+#: begin at 1.58 (H...H of water).
+NEAREST = 1.54
+#: An atom with more of such neighbours belongs to a fluid or a metal and not to a molecule.
+MOST_BONDS = 6
+#: Nearest neighbours further off than this times the median are at no bond length.
+_LONE = 2.5
 
 
 def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolArray | None = None) -> IntArray:
@@ -59,7 +67,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
         return np.zeros((0, 2), np.int64)
     cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
     reach = 2 * STRETCH * float(radius[able].max())
-    pairs, away = _close(x[able], cell, snapshot.pbc, reach)
+    pairs, away = close_pairs(x[able], cell, snapshot.pbc, reach)
     pairs = able[pairs]
     i, j = pairs.T
     near = away < STRETCH * (radius[i] + radius[j])
@@ -80,6 +88,39 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
 
 
+def bonds_without_elements(x: FloatArray, lattice: FloatArray | None = None) -> IntArray:
+    """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
+
+    Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
+    nearest neighbour. Atoms with more than `MOST_BONDS` such neighbours get no bonds.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_atoms, 3)
+        Finite positions in any unit.
+    lattice : ndarray, shape (2, 3, 3), optional
+        A periodic cell and its inverse, as `ConstraintSet.lattice`.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(x) < 2:
+        return np.zeros((0, 2), np.int64)
+    near = cKDTree(x).query(x, k=2)[0][:, 1]
+    if lattice is None:
+        cell, pbc = None, np.zeros(3, dtype=bool)
+    else:
+        cell, pbc = lattice[0], np.asarray(lattice[1].any(axis=0))
+    typical = float(np.median(near))
+    pairs, away = close_pairs(x, cell, pbc, NEAREST * _LONE * typical)
+    for side in (0, 1):
+        np.minimum.at(near, pairs[:, side], away)
+    near = np.minimum(near, _LONE * typical)
+    i, j = pairs.T
+    pairs = pairs[(away > 0) & (away < NEAREST * np.sqrt(near[i] * near[j]))]
+    crowded = np.bincount(pairs.ravel(), minlength=len(x)) > MOST_BONDS
+    return sorted_pairs(pairs[~crowded[pairs].any(axis=1)])
+
+
 def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:
     """Which pairs stay when every hydrogen keeps only its nearest neighbour."""
     best = np.full(len(hydrogen), np.inf)
@@ -92,8 +133,8 @@ def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray
     return keep
 
 
-def _close(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
-    """Pairs closer than `reach` in any image, shape (n, 2), and their distances."""
+def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
+    """Pairs closer than `reach` in any image, shape (n, 2), and their distances; cell vectors as rows."""
     from scipy.spatial import cKDTree
 
     if cell is None or not pbc.any():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons import diagnosis
-from kcons.arrays import as_array, check_multipliers, check_out
+from kcons.arrays import as_array, check_multipliers, check_out, check_pairs
 from kcons.certificate import certify
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
@@ -25,6 +25,7 @@ from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task
 from kcons.flat_bodies import MISFIT, FlatBody
 from kcons.plan import Plan, make_plan
+from kcons.restoring import restored
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
@@ -327,21 +328,48 @@ class Motion:
                 self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
         return self._lattice
 
-    def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
-        """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
+    def restore_positions(
+        self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None, bonds: ArrayLike | None = None
+    ) -> FloatArray:
+        """Bring positions that are off onto the constraints, with other bond lengths and angles as they were.
 
-        For initial positions, not for time steps. Damped Newton where the start is far off; then along the
-        constraints to the foot of the mass-weighted perpendicular, x - x_0 = M^-1 A(x)^T Lambda.
+        For initial positions, not for time steps. Near starts go to the nearest point in the mass metric, where
+        x - x_0 = M^-1 A(x)^T Lambda. Where that would change other bonds or angles, and for far starts, groups move
+        as rigid pieces first: see `kcons.restoring`.
+
+        Parameters
+        ----------
+        x : array_like, shape (n_atoms, 3)
+        time : float
+        out : ndarray, optional
+            Where to put the result.
+        bonds : array_like of int, shape (n, 2), optional
+            The bonds of the molecules. Without them, distances that rows hold count, and atoms that these do not
+            join are bonded where their distances suggest it. An empty list: the nearest point, whatever becomes of
+            what no row holds.
 
         Raises
         ------
         InfeasibleError
-            The residual cannot be made smaller; nothing was changed.
+            There is no way from here, or other bonds change by more than 1.25 % of their length (0.02 angstrom) or
+            other angles by more than 2 degrees; nothing was changed.
+        InputError
+            Bonds of unknown atoms.
         """
         if out is not None:
             check_out(out, self._shape)
         self.cell()
-        result = as_array(x, self._shape, "positions").copy()
+        start = as_array(x, self._shape, "positions")
+        pairs = None if bonds is None else check_pairs(bonds, self.n_atoms)
+        result = restored(self.constraint_set, self.plan, start, time, pairs, lambda y: self._nearest(y, time))
+        if out is None:
+            return result
+        np.copyto(out, result)
+        return out
+
+    def _nearest(self, x: FloatArray, time: float) -> FloatArray:
+        """The nearest point on the constraints in the mass metric; a new array."""
+        result = x.copy()
         local = result if self._atoms is None else result[self._atoms]
         targets = self._local.target(time) if self._moving else None
         if len(self.plan.pinned):
@@ -350,10 +378,7 @@ class Motion:
         start.restore(local, time)
         if self._atoms is not None:
             result[self._atoms] = local
-        if out is None:
-            return result
-        np.copyto(out, result)
-        return out
+        return result
 
     # -- velocities, accelerations, forces ------------------------------------------------------
 
