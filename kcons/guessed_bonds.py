@@ -7,7 +7,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology import BoolArray, Snapshot, sorted_pairs
+from kcons.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
 RADII: dict[str, float] = {
@@ -22,8 +22,9 @@ COINCIDENT = 0.3
 #: neighbours. Bonds to carbon with hydrogens reach 1.40 (C-C) and 1.51 (C-S), the closest atoms that are not bonded
 #: begin at 1.58 (H...H of water).
 NEAREST = 1.54
-#: An atom with more of such neighbours belongs to a fluid or a metal and not to a molecule.
-MOST_BONDS = 6
+#: What is no picture of molecules: atoms with more of such neighbours (a fluid, a metal), angles sharper than this
+#: (three-membered rings have 60 degrees), pairs that are this little further apart than bonded ones.
+MOST_BONDS, SHARPEST, GAP = 6, np.radians(50.0), 1.02
 #: Nearest neighbours further off than this times the median are at no bond length.
 _LONE = 2.5
 
@@ -88,37 +89,57 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
 
 
-def bonds_without_elements(x: FloatArray, lattice: FloatArray | None = None) -> IntArray:
+def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: IntArray, able: BoolArray) -> IntArray:
     """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
 
     Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
-    nearest neighbour. Atoms with more than `MOST_BONDS` such neighbours get no bonds.
+    nearest neighbour. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
 
     Parameters
     ----------
     x : ndarray, shape (n_atoms, 3)
-        Finite positions in any unit.
-    lattice : ndarray, shape (2, 3, 3), optional
+        In any unit; atoms that are not finite get no bonds.
+    lattice : ndarray, shape (2, 3, 3), or None
         A periodic cell and its inverse, as `ConstraintSet.lattice`.
+    atoms : ndarray of int
+        Whose molecules are looked at.
+    able : ndarray of bool, shape (n_atoms,)
+        Only these atoms form bonds.
     """
     from scipy.spatial import cKDTree
 
-    if len(x) < 2:
-        return np.zeros((0, 2), np.int64)
-    near = cKDTree(x).query(x, k=2)[0][:, 1]
-    if lattice is None:
-        cell, pbc = None, np.zeros(3, dtype=bool)
-    else:
-        cell, pbc = lattice[0], np.asarray(lattice[1].any(axis=0))
+    nothing = np.zeros((0, 2), np.int64)
+    finite = np.flatnonzero(able & np.isfinite(x).all(axis=1))
+    if len(finite) < 2:
+        return nothing
+    y = x[finite]
+    near = cKDTree(y).query(y, k=2)[0][:, 1]
+    cell, pbc = (None, np.zeros(3, dtype=bool)) if lattice is None else (lattice[0], lattice[1].any(axis=0))
     typical = float(np.median(near))
-    pairs, away = close_pairs(x, cell, pbc, NEAREST * _LONE * typical)
+    pairs, away = close_pairs(y, cell, pbc, GAP * NEAREST * _LONE * typical)
     for side in (0, 1):
         np.minimum.at(near, pairs[:, side], away)
     near = np.minimum(near, _LONE * typical)
-    i, j = pairs.T
-    pairs = pairs[(away > 0) & (away < NEAREST * np.sqrt(near[i] * near[j]))]
-    crowded = np.bincount(pairs.ravel(), minlength=len(x)) > MOST_BONDS
-    return sorted_pairs(pairs[~crowded[pairs].any(axis=1)])
+    if not np.all(away > 0):
+        return nothing
+    ratio = away / np.sqrt(near[pairs[:, 0]] * near[pairs[:, 1]])
+    bonds = sorted_pairs(pairs[ratio < NEAREST])
+    molecule, _ = connected(bonds, len(y))
+    wanted = np.zeros(len(x), dtype=bool)
+    wanted[atoms] = True
+    seen = np.isin(molecule, molecule[wanted[finite]])
+    between = pairs[(ratio >= NEAREST) & (ratio < GAP * NEAREST)]
+    torn = seen[between[:, 0]] & (molecule[between[:, 0]] == molecule[between[:, 1]])
+    crowded = np.bincount(bonds.ravel(), minlength=len(y))[seen] > MOST_BONDS
+    if torn.any() or crowded.any():
+        return nothing
+    kept = bonds[seen[bonds[:, 0]]]
+    i, j, k = bond_angles(kept, len(y)).T
+    u, w = y[i] - y[j], y[k] - y[j]
+    if lattice is not None:
+        u, w = (d - np.round(d @ lattice[1]) @ lattice[0] for d in (u, w))
+    angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
+    return nothing if np.any(angle < SHARPEST) else finite[kept]
 
 
 def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:

@@ -22,7 +22,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError, KconsError
-from kcons.far_starts import FarStart, Rescuers, Task
+from kcons.far_starts import FarStart, Rescuers, Task, Work
 from kcons.flat_bodies import MISFIT, FlatBody
 from kcons.plan import Plan, make_plan
 from kcons.restoring import restored
@@ -361,20 +361,34 @@ class Motion:
         self.cell()
         start = as_array(x, self._shape, "positions")
         pairs = None if bonds is None else check_pairs(bonds, self.n_atoms)
-        result = restored(self.constraint_set, self.plan, start, time, pairs, lambda y: self._nearest(y, time))
+        self._rescuers.work = work = Work(self.plan)
+        try:
+            result = restored(
+                self.constraint_set, self.plan, start, time, pairs, lambda y: self._nearest(y, time, work)
+            )
+        finally:
+            self._rescuers.work = None
         if out is None:
             return result
         np.copyto(out, result)
         return out
 
-    def _nearest(self, x: FloatArray, time: float) -> FloatArray:
+    def _nearest(self, x: FloatArray, time: float, work: Work) -> FloatArray:
         """The nearest point on the constraints in the mass metric; a new array."""
         result = x.copy()
         local = result if self._atoms is None else result[self._atoms]
         targets = self._local.target(time) if self._moving else None
         if len(self.plan.pinned):
             local[self.plan.pinned] = self.plan.pinned_targets(targets)
-        start = FarStart(self._local, self.plan, self._atoms, self._positions_direct, self._tangents)
+        start = FarStart(
+            self._local,
+            self.plan,
+            self._atoms,
+            self._positions_direct,
+            self._tangents,
+            work,
+            lambda: max(self._iterations, default=0),
+        )
         start.restore(local, time)
         if self._atoms is not None:
             result[self._atoms] = local

@@ -60,7 +60,9 @@ class Pieces:
         self._end: dict[int, int] = {}
         self._parent: dict[int, int] = {}
         self._bridge: set[int] = set()  # the far atom of each
-        begin, parent, low, order = self._begin, self._parent, {}, []
+        begin, parent = self._begin, self._parent
+        low: dict[int, int] = {}
+        order: list[int] = []
         self.molecules: list[IntArray] = []
         for root in kept.tolist():
             if root in begin:
@@ -126,15 +128,6 @@ class Pieces:
                 y[k] = y[j] + minimum_image(x[k] - y[j])
         return y
 
-    def angles(self) -> IntArray:
-        """Pairs of bonds with an atom in common, (i, j, k) with vertex j, shape (n, 3)."""
-        found = []
-        for j in self.atoms.tolist():
-            ends = self.neighbours(j)
-            a, b = np.triu_indices(len(ends), 1)
-            found.append(np.stack([ends[a], np.full(len(a), j), ends[b]], axis=1))
-        return np.concatenate(found or [np.zeros((0, 3), np.int64)]).astype(np.int64)
-
 
 @dataclass(frozen=True)
 class Move:
@@ -148,11 +141,14 @@ class Move:
         Origin and unit axis at given positions.
     turns : bool
         Whether it turns about the axis (right-handed), or shifts along it.
+    share : ndarray, shape (len(atoms), 1), or float
+        How far each atom shifts, in units of the parameter.
     """
 
     atoms: IntArray
     frame: Frame
     turns: bool
+    share: FloatArray | float = 1.0
 
     def field(self, x: FloatArray) -> FloatArray:
         """Displacement of `atoms` a unit of the parameter, shape (len(atoms), 3)."""
@@ -162,7 +158,7 @@ class Move:
         origin, axis = placed
         if self.turns:
             return np.cross(axis, x[self.atoms] - origin)
-        return np.broadcast_to(axis, (len(self.atoms), 3))
+        return self.share * np.broadcast_to(axis, (len(self.atoms), 3))
 
     def make(self, x: FloatArray, amount: float) -> bool:
         """Move the atoms in place; False if there is no axis here."""
@@ -171,7 +167,7 @@ class Move:
             return False
         origin, axis = placed
         if not self.turns:
-            x[self.atoms] += amount * axis
+            x[self.atoms] += amount * (self.share * axis)
             return True
         arm = x[self.atoms] - origin
         along = (arm @ axis)[:, None] * axis
@@ -207,22 +203,25 @@ def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
     return Move(atoms, frame, True)
 
 
-def stretch(atoms: IntArray, j: int, k: int, image: Callable[[FloatArray], FloatArray]) -> Move:
-    """Shift along the shortest way from j to k: with k among `atoms`, the distance grows by the amount."""
+def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callable[[FloatArray], FloatArray]) -> Move:
+    """Shift one piece along an axis and the other against it, their common centre at rest.
+
+    Parameters
+    ----------
+    atoms, others : ndarray of int
+        The pieces; one without atoms means that the other one moves alone.
+    masses : ndarray, shape (n_atoms,)
+    axis : callable
+        Points from `others` to `atoms`, any length.
+    """
+    a, b = float(masses[atoms].sum()), float(masses[others].sum())
+    part = (b / (a + b) if a + b > 0 else 0.5) if len(atoms) and len(others) else float(len(atoms) > 0)
+    share = np.concatenate([np.full(len(atoms), part), np.full(len(others), part - 1.0)])[:, None]
 
     def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        return _line(x[j], x[j] + image(x[k] - x[j]))
+        return _line(np.zeros(3), axis(x))
 
-    return Move(atoms, frame, False)
-
-
-def along(atoms: IntArray, direction: Callable[[FloatArray], FloatArray]) -> Move:
-    """Shift along a direction that depends on the positions."""
-
-    def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        return _line(np.zeros(3), direction(x))
-
-    return Move(atoms, frame, False)
+    return Move(np.concatenate([atoms, others]), frame, False, share)
 
 
 def free_motions(atoms: IntArray, pinned: IntArray) -> list[Move]:

@@ -22,13 +22,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.guessed_bonds import NEAREST, bonds_without_elements
-from kcons.pieces import Move, Pieces, along, bend, free_motions, stretch, torsion
+from kcons.pieces import Move, Pieces, bend, free_motions, stretch, torsion
 from kcons.plan import Plan
-from kcons.topology import connected, sorted_pairs
+from kcons.topology import BoolArray, bond_angles, connected, sorted_pairs
 
 #: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
 BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)
@@ -38,12 +38,16 @@ STILL = 3e-3
 FAR = 0.25
 #: What pieces may leave to the search for the nearest point, in the same unit.
 NEAR = 0.25
-#: Rounds in which every row makes its own motion, and how many of these motions there may be in all.
-SWEEPS, MOST_MOVES = 40, 20_000
+#: Rounds in which every row makes its own motion, and how many motions there may be in all.
+SWEEPS, MOST_MOVES = 40, 15_000
 #: Rows and motions beyond which no Newton steps among them are tried; steps, and starts from turned bonds.
-MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 60, 4
+MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
 #: Largest turn of one step, in radian.
 _LONGEST_TURN = 0.5
+#: Rows off by no more than this are fulfilled as far as motions are concerned.
+_OFF = 1e-9
+#: Rows that hold what bonds and angles are made of.
+_INTERNAL = ("Distance", "Angle", "Dihedral", "CenterDistance")
 #: Bonds and angles that are examined for being held by the rows.
 _MOST_EXAMINED = 200
 
@@ -76,12 +80,12 @@ def restored(
         Such positions were not found.
     """
     search = _Search(held, plan, x, time, bonds)
-    if search.far() and search.pieces.bonds.size:
-        tries = (search.moved, lambda: x)
-    else:
-        tries = (lambda: x, search.moved)
+    ways = [lambda: x, search.moved]
+    if search.far() and len(search.pieces.bonds):
+        ways.reverse()
     error: KconsError | None = None
-    for way in tries:
+    noisy: list[FloatArray] = []
+    for way in ways:
         begin = way()
         if begin is None:
             continue
@@ -90,10 +94,16 @@ def restored(
         except (ConvergenceError, SingularGeometryError) as failure:
             error = error or failure
             continue
-        wrong = search.off(found) or search.changed(found)
+        wrong = search.off(found)
         if wrong is None:
-            return found
+            wrong = search.changed(found, strict=search.turned)
+            if wrong is None:
+                return found
+            noisy.append(found)
         error = wrong
+    for found in noisy:
+        if search.changed(found, strict=False) is None:
+            return found
     assert error is not None
     raise error
 
@@ -111,7 +121,7 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
     target = np.concatenate([*lengths, np.zeros(0)])
     others = given
     if others is None:
-        others = bonds_without_elements(x, held.lattice)
+        others = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
         fragment, _ = connected(rows, held.n_atoms)
         others = others[fragment[others[:, 0]] != fragment[others[:, 1]]]
     known = np.concatenate([rows, others])
@@ -139,9 +149,7 @@ class _Own:
 class _Search:
     """One restoration: its bonds, its motions, and the checks of what was found."""
 
-    def __init__(
-        self, held: ConstraintSet, plan: Plan, x: FloatArray, time: float, bonds: IntArray | None
-    ) -> None:
+    def __init__(self, held: ConstraintSet, plan: Plan, x: FloatArray, time: float, bonds: IntArray | None) -> None:
         self.held, self.plan, self.start, self.time, self._given = held, plan, x, time, bonds
         fixed = [c for c in held.constraints if c.family == "FixedAtoms"]
         self.pinned = np.zeros(held.n_atoms, dtype=bool)
@@ -149,6 +157,7 @@ class _Search:
             self.pinned[item.atoms.ravel()] = True
         with np.errstate(all="ignore"):
             self.misfit = np.abs(held.value(x, time)) / held.scale
+        self.usable = bool(np.isfinite(x[held.touched]).all())
         self.tolerance_of_loose = np.where(plan.labels < 0, 1e-10 * held.scale, 0.0)
 
     @cached_property
@@ -157,12 +166,37 @@ class _Search:
         return Pieces(self.held.n_atoms, bonds, self.held.touched)
 
     def far(self) -> bool:
-        """Whether a row of distances, angles or centres is far off."""
-        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
-            if item.translation_invariant and item.holonomic:
-                if np.any(self.misfit[first : first + item.n_rows] > FAR):
-                    return True
+        """Whether a row of lengths or angles is far off."""
+        return self.usable and any(
+            bool(np.any(miss > FAR)) for item, miss in self._off_rows() if item.translation_invariant
+        )
+
+    def _off_rows(self) -> list[tuple[Constraint, FloatArray]]:
+        """Constraints and by how much their rows are off."""
+        held = self.held
+        return [
+            (item, self.misfit[first : first + item.n_rows])
+            for item, first in zip(held.constraints, held.starts, strict=False)
+            if item.holonomic
+        ]
+
+    @cached_property
+    def turned(self) -> bool:
+        """Whether something other than bonds is off: then angles are to be what they were, whatever the bonds are."""
+        for item, miss in self._off_rows():
+            off = item.atoms[miss > _OFF]
+            if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
+                return True
+            if item.family == "Distance" and not all(self.pieces.bonded(i, k) for i, k in off.tolist()):
+                return True
         return False
+
+    @cached_property
+    def checked(self) -> bool:
+        """Whether bonds are to be as they were; guessed ones only if rows of lengths and angles alone are off."""
+        if self._given is not None:
+            return len(self._given) > 0
+        return all(item.family in _INTERNAL or not np.any(miss > _OFF) for item, miss in self._off_rows())
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -185,15 +219,19 @@ class _Search:
             atoms=held.row_atoms(row),
         )
 
-    def changed(self, x: FloatArray) -> InfeasibleError | None:
-        """What to raise if a bond or an angle that no row holds has changed."""
+    def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:
+        """What to raise if a bond or an angle that no row holds has changed.
+
+        Unless `strict`, angles may change as much as the bonds around them that rows hold were off.
+        """
         held, start = self.held, self.start
         move = np.linalg.norm(x - start, axis=1)
-        if not np.any(move > 0) or not (self._given is None or len(self._given)):
+        if not self.checked or not np.any(move > 0):
             return None
         if float(move.max()) <= STILL * _closest(start, move > 0):
             return None
-        bonds, angles = self.pieces.bonds, self.pieces.angles()
+        bonds = self.pieces.bonds
+        angles = bond_angles(bonds, held.n_atoms)
         length, before = self._lengths(x, bonds), self._lengths(start, bonds)
         slack = BOND_KEPT * before
         held_off = self._held_lengths
@@ -204,11 +242,13 @@ class _Search:
         bent = np.abs(turn - angle_before)
         suspects = np.flatnonzero(~(bent <= ANGLE_KEPT))
         legs = self._moved_legs
+        around = np.zeros(held.n_atoms)
+        for side in (0, 1):
+            np.add.at(around, held_off[0][:, side], held_off[1])
         odd = []
         for number in suspects.tolist():
             i, j, k = angles[number].tolist()
-            # An angle is known no better than the bonds it is made of.
-            noise = 2.0 * (table.get((min(i, j), max(i, j)), 0.0) + table.get((min(j, k), max(j, k)), 0.0))
+            noise = 0.0 if strict else 2.0 * float(np.sum(around[[i, j, k]]))
             if bent[number] > max(ANGLE_KEPT, noise) and not {(j, i), (j, k)} & legs:
                 odd.append(number)
         worst: list[tuple[float, IntArray, str]] = [
@@ -319,9 +359,13 @@ class _Search:
 
     def moved(self) -> FloatArray | None:
         """The start with pieces moved as the rows ask; None if they cannot come near."""
-        held, pieces = self.held, self.pieces
+        held = self.held
+        if not self.usable:
+            return None
+        pieces = self.pieces
         if not np.isfinite(self.start[pieces.atoms]).all():
             return None
+        self._left = MOST_MOVES
         whole = pieces.whole(self.start, held.minimum_image)
         self._images = whole - self.start
         y = whole.copy()
@@ -364,8 +408,7 @@ class _Search:
 
     def _apart(self, moves: IntArray, stays: IntArray) -> IntArray | None:
         """The molecules of some atoms, if they have none of some others and no fixed atom."""
-        whole = [self.pieces.molecule(a) for a in moves.tolist()]
-        return self._piece(np.unique(np.concatenate(whole)), moves, stays)
+        return self._piece(self._molecules(moves), moves, stays)
 
     def _piece(self, atoms: IntArray, moves: IntArray, stays: IntArray) -> IntArray | None:
         inside = np.isin(np.concatenate([moves, stays]), atoms)
@@ -383,12 +426,11 @@ class _Search:
         found: list[tuple[IntArray | None, Move | None]] = []
         if family == "Distance":
             i, k = atoms.tolist()
-            for a, b in ((i, k), (k, i)):
-                piece = self._side(a, b, np.array([b]), np.array([a])) if self.pieces.bonded(a, b) else None
-                if piece is None:
-                    piece = self._apart(np.array([b]), np.array([a]))
-                found.append((piece, None if piece is None else stretch(piece, a, b, image)))
-            move = self._lightest(found)
+
+            def axis(x: FloatArray) -> FloatArray:
+                return image(x[k] - x[i])
+
+            move = self._shifted(np.array([k]), np.array([i]), axis)
             if move is not None:
                 return move, None
             for j in self._between(i, k):
@@ -434,28 +476,37 @@ class _Search:
                     found.append(_Own(row, part, atoms, move, across))
         return found
 
+    def _shifted(self, a: IntArray, b: IntArray, axis: Callable[[FloatArray], FloatArray]) -> Move | None:
+        """Shift what belongs to two groups along the way from b to a: the two sides of a bond, or molecules."""
+        sides = None
+        if len(a) == len(b) == 1 and self.pieces.bonded(int(a[0]), int(b[0])):
+            sides = self.pieces.beyond(int(b[0]), int(a[0])), self.pieces.beyond(int(a[0]), int(b[0]))
+        if sides is None or sides[0] is None or sides[1] is None:
+            sides = self._molecules(a), self._molecules(b)
+            if len(np.intersect1d(*sides)):
+                return None
+        able = [side if not self.pinned[side].any() else side[:0] for side in sides if side is not None]
+        return stretch(able[0], able[1], self.held.masses, axis) if len(able[0]) or len(able[1]) else None
+
+    def _molecules(self, atoms: IntArray) -> IntArray:
+        """All atoms of the molecules of some atoms."""
+        return np.unique(np.concatenate([self.pieces.molecule(a) for a in atoms.tolist()]))
+
     def _centres(self, atoms: IntArray, split: int, part: ConstraintSet, own: IntArray) -> Move | None:
-        """Shift the molecules of one group along the line of the two centres."""
-        a, b = atoms[:split], atoms[split:]
-        found: list[tuple[IntArray | None, Move | None]] = []
-        for moves, stays in ((a, b), (b, a)):
-            piece = self._apart(moves, stays)
-            if piece is None:
-                continue
-            mine = np.isin(own, moves)
+        """Shift the molecules of two groups along the line of their centres."""
+        mine = np.isin(own, atoms[:split])
 
-            def direction(x: FloatArray, mine: FloatArray = mine) -> FloatArray:
-                gradient = part.jacobian(x[own], self.time).toarray().reshape(-1, 3)
-                return gradient[mine].sum(axis=0)
+        def axis(x: FloatArray) -> FloatArray:
+            gradient = part.jacobian(x[own], self.time).toarray().reshape(-1, 3)
+            return np.asarray(gradient[mine].sum(axis=0))
 
-            found.append((piece, along(piece, direction)))
-        return self._lightest(found)
+        return self._shifted(atoms[:split], atoms[split:], axis)
 
     def _sweep(self, y: FloatArray) -> bool:
         """Let every row that is off make its motion, over and over, in place; whether all rows are fulfilled then."""
         held, time = self.held, self.time
         owns = self._owns()
-        done, last = 0, np.inf
+        last = np.inf
         for _ in range(SWEEPS):
             largest = 0.0
             for own in owns:
@@ -465,10 +516,10 @@ class _Search:
                     continue
                 largest = max(largest, size)
                 amount = -sigma if own.across is None else self._opening(y, own.across, -sigma)
-                done += 1
-                if not own.move.make(y, amount) or done > MOST_MOVES:
+                self._left -= 1
+                if self._left < 0 or not own.move.make(y, amount):
                     return False
-            if largest < 1e-12 or largest > 0.9 * last and largest < 1e-9:
+            if largest < 1e-12 or (largest > 0.9 * last and largest < 1e-9):
                 break
             last = min(last, largest)
         left = np.abs(held.value(y - self._images, time)) / held.scale
@@ -512,7 +563,7 @@ class _Search:
 
     def _newton(self, y: FloatArray) -> None:
         """Damped Newton steps in the parameters of all motions, from the present place and from turned ones."""
-        held, time = self.held, self.time
+        held = self.held
         if held.n_rows > MOST_ROWS:
             return
         moves = self._motions()
@@ -532,7 +583,7 @@ class _Search:
             error = self._descend(here, moves, heavy)
             if error < best[0]:
                 best = error, here
-            if best[0] < 1e-12:
+            if best[0] < 1e-12 or self._left < 0:
                 break
         y[:] = best[1]
 
@@ -549,7 +600,8 @@ class _Search:
         rows = np.flatnonzero(held.holonomic)
         error, damping = self._error(y), 1e-4
         for _ in range(STEPS):
-            if error < 1e-24 or not np.isfinite(error):
+            self._left -= len(moves)
+            if error < 1e-24 or not np.isfinite(error) or self._left < 0:
                 break
             x = y - self._images
             sigma = (held.value(x, time) / held.scale)[rows]
@@ -573,6 +625,7 @@ class _Search:
                 if longest > _LONGEST_TURN:
                     amounts *= _LONGEST_TURN / longest
                 trial = y.copy()
+                self._left -= len(moves)
                 for amount, move in zip(amounts, moves, strict=True):
                     if amount:
                         move.make(trial, float(amount))
@@ -605,11 +658,12 @@ def _turn_of_line(a: FloatArray, b: FloatArray) -> FloatArray:
     return (np.eye(3) + cross + cross @ cross / (1 + cosine)).T
 
 
-def _closest(x: FloatArray, chosen: FloatArray) -> float:
+def _closest(x: FloatArray, chosen: BoolArray) -> float:
     """The least distance of some atoms to their nearest neighbours."""
     from scipy.spatial import cKDTree
 
     if len(x) < 2:
         return np.inf
     good = np.isfinite(x).all(axis=1)
-    return float(cKDTree(x[good]).query(x[chosen & good], k=2)[0][:, 1].min(initial=np.inf))
+    asked = x[np.logical_and(chosen, good)]
+    return float(cKDTree(x[good]).query(asked, k=2)[0][:, 1].min(initial=np.inf))
