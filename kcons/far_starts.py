@@ -25,6 +25,8 @@ NEAREST_ROUNDS = 200
 #: Newton iterations that one restoration may take in all. Dense algebra takes fewer for clusters of more than so many
 #: rows, by the square of their number. A projection that fails counts as this many, and so many may be rescued.
 MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
+#: Rounds towards the constraints that must gain a tenth, or damping does better.
+STALLED = 10
 #: Halvings of one step of it.
 MAX_HALVINGS = 30
 
@@ -207,7 +209,8 @@ class FarStart:
             raise error
         if not self._gauss_newton(x, time):
             np.copyto(x, start)
-            general = self._plan.general_for_all(RESCUE_ROWS)
+            # Any point does: masses of many orders of magnitude would only spoil the condition.
+            general = self._plan.general_for_all(RESCUE_ROWS, equal=True)
             outcome = general.restore(x, time=time)
             if not outcome.converged:
                 raise diagnosis.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
@@ -312,7 +315,12 @@ class FarStart:
         with np.errstate(all="ignore"):
             sigma = local.value(x, time)
             error = misfit(sigma)
-            for _ in range(NEAREST_ROUNDS):
+            before = np.inf
+            for number in range(NEAREST_ROUNDS):
+                if number % STALLED == STALLED - 1:
+                    if float(error.sum()) > 0.9 * before:
+                        return False
+                    before = float(error.sum())
                 if np.all(np.abs(sigma[member]) <= local.tolerance(x, time)[member]):
                     return True
                 step = np.zeros_like(x)

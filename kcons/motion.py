@@ -7,7 +7,7 @@ that names the row, with nothing changed, where there is no solution.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Literal
 
@@ -24,6 +24,7 @@ from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task, Work
 from kcons.flat_bodies import MISFIT, FlatBody
+from kcons.kept_geometry import Bonds
 from kcons.plan import Plan, make_plan
 from kcons.restoring import restored
 
@@ -329,7 +330,12 @@ class Motion:
         return self._lattice
 
     def restore_positions(
-        self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None, bonds: ArrayLike | None = None
+        self,
+        x: ArrayLike,
+        *,
+        time: float = 0.0,
+        out: FloatArray | None = None,
+        bonds: ArrayLike | Callable[[], IntArray] | None = None,
     ) -> FloatArray:
         """Bring positions that are off onto the constraints, with other bond lengths and angles as they were.
 
@@ -343,10 +349,10 @@ class Motion:
         time : float
         out : ndarray, optional
             Where to put the result.
-        bonds : array_like of int, shape (n, 2), optional
-            The bonds of the molecules. Without them, distances that rows hold count, and atoms that these do not
-            join are bonded where their distances suggest it. An empty list: the nearest point, whatever becomes of
-            what no row holds.
+        bonds : array_like of int, shape (n, 2), or callable that gives them, optional
+            The bonds of the molecules; a callable is asked only where they are needed. Without them, distances that
+            rows hold count, and atoms that these do not join are bonded where their distances suggest it. An empty
+            list: the nearest point, whatever becomes of what no row holds.
 
         Raises
         ------
@@ -360,7 +366,15 @@ class Motion:
             check_out(out, self._shape)
         self.cell()
         start = as_array(x, self._shape, "positions")
-        pairs = None if bonds is None else check_pairs(bonds, self.n_atoms)
+        pairs: Bonds | None = None
+        if callable(bonds):
+            pairs = bonds
+        elif bonds is not None:
+            table = check_pairs(bonds, self.n_atoms)
+
+            def pairs() -> IntArray:
+                return table
+
         self._rescuers.work = work = Work(self.plan)
         try:
             result = restored(

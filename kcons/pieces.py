@@ -9,6 +9,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
 from kcons.topology import connected, sorted_pairs
 
 #: Origin and unit axis of a motion at given positions; None where they are undefined.
@@ -157,7 +158,7 @@ class Move:
             return np.zeros((len(self.atoms), 3))
         origin, axis = placed
         if self.turns:
-            return np.cross(axis, x[self.atoms] - origin)
+            return cross(axis, x[self.atoms] - origin)
         return self.share * np.broadcast_to(axis, (len(self.atoms), 3))
 
     def make(self, x: FloatArray, amount: float) -> bool:
@@ -173,7 +174,7 @@ class Move:
         along = (arm @ axis)[:, None] * axis
         across = arm - along
         # In this form small turns lose nothing: 1 - cos is taken from the half angle.
-        x[self.atoms] += np.sin(amount) * np.cross(axis, arm) - 2 * np.sin(amount / 2) ** 2 * across
+        x[self.atoms] += np.sin(amount) * cross(axis, arm) - 2 * np.sin(amount / 2) ** 2 * across
         return True
 
 
@@ -191,12 +192,12 @@ def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
 
     def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         u, w = x[i] - x[j], x[k] - x[j]
-        normal = np.cross(u, w)
+        normal = cross(u, w)
         size = float(np.linalg.norm(normal))
         if size > 1e-9 * float(np.linalg.norm(u) * np.linalg.norm(w)):
             return x[j], normal / size
         # Straight: any plane does.
-        normal = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
+        normal = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
         size = float(np.linalg.norm(normal))
         return (x[j], normal / size) if size > 0 else None
 

@@ -16,26 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
 from kcons.constraint_set import ConstraintSet
-from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, InfeasibleError, KconsError, SingularGeometryError
-from kcons.guessed_bonds import NEAREST, bonds_without_elements
-from kcons.pieces import Move, Pieces, bend, free_motions, stretch, torsion
+from kcons.kept_geometry import OFF, Bonds, Geometry
+from kcons.pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan import Plan
-from kcons.topology import BoolArray, bond_angles, connected, sorted_pairs
 
-#: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
-BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)
-#: Displacements below this part of the distance to the nearest neighbour leave bonds and angles as they are.
-STILL = 3e-3
-#: Rows off by more than this (radian, or part of the length) are far: pieces move first.
-FAR = 0.25
 #: What pieces may leave to the search for the nearest point, in the same unit.
 NEAR = 0.25
 #: Rounds in which every row makes its own motion, and how many motions there may be in all.
@@ -44,12 +37,6 @@ SWEEPS, MOST_MOVES = 40, 15_000
 MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
 #: Largest turn of one step, in radian.
 _LONGEST_TURN = 0.5
-#: Rows off by no more than this are fulfilled as far as motions are concerned.
-_OFF = 1e-9
-#: Rows that hold what bonds and angles are made of.
-_INTERNAL = ("Distance", "Angle", "Dihedral", "CenterDistance")
-#: Bonds and angles that are examined for being held by the rows.
-_MOST_EXAMINED = 200
 
 
 def restored(
@@ -57,7 +44,7 @@ def restored(
     plan: Plan,
     x: FloatArray,
     time: float,
-    bonds: IntArray | None,
+    bonds: Bonds | None,
     nearest: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
     """Positions on all rows with other bond lengths and angles as in `x`; a new array.
@@ -69,8 +56,9 @@ def restored(
         That of `held`, or of its rows on the atoms they touch.
     x : ndarray, shape (n_atoms, 3)
     time : float
-    bonds : ndarray of int, shape (n, 2), or None
-        None: see `bonds_of`. An empty array: no bonds but those that rows hold.
+    bonds : callable or None
+        Gives the bonds, shape (n, 2). None: see `kcons.kept_geometry.bonds_of`. Where it gives none, other lengths and
+        angles may change.
     nearest : callable
         Gives the nearest point on the rows, or raises.
 
@@ -79,9 +67,9 @@ def restored(
     InfeasibleError
         Such positions were not found.
     """
-    search = _Search(held, plan, x, time, bonds)
-    ways = [lambda: x, search.moved]
-    if search.far() and len(search.pieces.bonds):
+    geometry = Geometry(held, plan.labels, x, time, bonds)
+    ways: list[Callable[[], FloatArray | None]] = [lambda: x, lambda: moved(geometry)]
+    if geometry.far() and len(geometry.pieces.bonds):
         ways.reverse()
     error: KconsError | None = None
     noisy: list[FloatArray] = []
@@ -94,44 +82,45 @@ def restored(
         except (ConvergenceError, SingularGeometryError) as failure:
             error = error or failure
             continue
-        wrong = search.off(found)
+        wrong = _off(held, plan, found, time)
         if wrong is None:
-            wrong = search.changed(found, strict=search.turned)
+            wrong = geometry.changed(found, strict=geometry.turned)
             if wrong is None:
                 return found
             noisy.append(found)
         error = wrong
     for found in noisy:
-        if search.changed(found, strict=False) is None:
+        if geometry.changed(found, strict=False) is None:
             return found
     assert error is not None
     raise error
 
 
-def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | None) -> IntArray:
-    """What counts as a bond, shape (n, 2).
+def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> ConvergenceError | None:
+    """What to raise if `x` is off a row by the set's own measure, the one that reports use."""
+    with np.errstate(all="ignore"):
+        miss = np.abs(held.value(x, time))
+        # Rows between fixed atoms are as good as the places given.
+        allowed = np.maximum(held.tolerance(x, time), np.where(plan.labels < 0, 1e-10 * held.scale, 0.0))
+    bad = ~(miss <= allowed)
+    if not bad.any():
+        return None
+    row = int(np.argmax(np.where(np.isfinite(miss), np.where(bad, miss / allowed, 0.0), np.inf)))
+    return InfeasibleError(
+        f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against its "
+        "neighbours', or start nearer to a solution",
+        residual=float(miss[row] / held.scale[row]),
+        tolerance=float(allowed[row] / held.scale[row]),
+        row=row,
+        atoms=held.row_atoms(row),
+    )
 
-    Those that are given and the distances that rows hold, unless they are longer than atoms in one molecule are bonded
-    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what the distances suggest
-    between atoms that held distances do not join.
-    """
-    pairs = [item.atoms for item in held.constraints if item.family == "Distance"]
-    lengths = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
-    rows = np.concatenate([*pairs, np.zeros((0, 2), np.int64)])
-    target = np.concatenate([*lengths, np.zeros(0)])
-    others = given
-    if others is None:
-        others = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
-        fragment, _ = connected(rows, held.n_atoms)
-        others = others[fragment[others[:, 0]] != fragment[others[:, 1]]]
-    known = np.concatenate([rows, others])
-    away = held.minimum_image(x[others[:, 0]] - x[others[:, 1]])
-    length = np.concatenate([target, np.linalg.norm(away, axis=1)])
-    shortest = np.full(held.n_atoms, np.inf)
-    for side in (0, 1):
-        np.minimum.at(shortest, known[:, side], length)
-    bonded = length < NEAREST * np.sqrt(shortest[known[:, 0]] * shortest[known[:, 1]])
-    return sorted_pairs(known[bonded])
+
+def moved(geometry: Geometry) -> FloatArray | None:
+    """The start with pieces moved as the rows ask; None if they cannot come near."""
+    if not geometry.usable or not np.isfinite(geometry.start[geometry.pieces.atoms]).all():
+        return None
+    return _Motions(geometry).moved()
 
 
 @dataclass(frozen=True)
@@ -146,229 +135,19 @@ class _Own:
     across: tuple[int, int, int] | None = None
 
 
-class _Search:
-    """One restoration: its bonds, its motions, and the checks of what was found."""
+class _Motions:
+    """The motions of one restoration, made on positions with every molecule in one piece."""
 
-    def __init__(self, held: ConstraintSet, plan: Plan, x: FloatArray, time: float, bonds: IntArray | None) -> None:
-        self.held, self.plan, self.start, self.time, self._given = held, plan, x, time, bonds
-        fixed = [c for c in held.constraints if c.family == "FixedAtoms"]
-        self.pinned = np.zeros(held.n_atoms, dtype=bool)
-        for item in fixed:
-            self.pinned[item.atoms.ravel()] = True
-        with np.errstate(all="ignore"):
-            self.misfit = np.abs(held.value(x, time)) / held.scale
-        self.usable = bool(np.isfinite(x[held.touched]).all())
-        self.tolerance_of_loose = np.where(plan.labels < 0, 1e-10 * held.scale, 0.0)
-
-    @cached_property
-    def pieces(self) -> Pieces:
-        bonds = bonds_of(self.held, self.start, self.time, self._given)
-        return Pieces(self.held.n_atoms, bonds, self.held.touched)
-
-    def far(self) -> bool:
-        """Whether a row of lengths or angles is far off."""
-        return self.usable and any(
-            bool(np.any(miss > FAR)) for item, miss in self._off_rows() if item.translation_invariant
-        )
-
-    def _off_rows(self) -> list[tuple[Constraint, FloatArray]]:
-        """Constraints and by how much their rows are off."""
-        held = self.held
-        return [
-            (item, self.misfit[first : first + item.n_rows])
-            for item, first in zip(held.constraints, held.starts, strict=False)
-            if item.holonomic
-        ]
-
-    @cached_property
-    def turned(self) -> bool:
-        """Whether something other than bonds is off: then angles are to be what they were, whatever the bonds are."""
-        for item, miss in self._off_rows():
-            off = item.atoms[miss > _OFF]
-            if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
-                return True
-            if item.family == "Distance" and not all(self.pieces.bonded(i, k) for i, k in off.tolist()):
-                return True
-        return False
-
-    @cached_property
-    def checked(self) -> bool:
-        """Whether bonds are to be as they were; guessed ones only if rows of lengths and angles alone are off."""
-        if self._given is not None:
-            return len(self._given) > 0
-        return all(item.family in _INTERNAL or not np.any(miss > _OFF) for item, miss in self._off_rows())
-
-    # -- checks ---------------------------------------------------------------------------------
-
-    def off(self, x: FloatArray) -> ConvergenceError | None:
-        """What to raise if `x` is off a row by the set's own measure."""
-        held = self.held
-        with np.errstate(all="ignore"):
-            miss = np.abs(held.value(x, self.time))
-            allowed = np.maximum(held.tolerance(x, self.time), self.tolerance_of_loose)
-        bad = ~(miss <= allowed)
-        if not bad.any():
-            return None
-        row = int(np.argmax(np.where(np.isfinite(miss), np.where(bad, miss / allowed, 0.0), np.inf)))
-        return InfeasibleError(
-            f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against "
-            "its neighbours', or start nearer to a solution",
-            residual=float(miss[row] / held.scale[row]),
-            tolerance=float(allowed[row] / held.scale[row]),
-            row=row,
-            atoms=held.row_atoms(row),
-        )
-
-    def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:
-        """What to raise if a bond or an angle that no row holds has changed.
-
-        Unless `strict`, angles may change as much as the bonds around them that rows hold were off.
-        """
-        held, start = self.held, self.start
-        move = np.linalg.norm(x - start, axis=1)
-        if not self.checked or not np.any(move > 0):
-            return None
-        if float(move.max()) <= STILL * _closest(start, move > 0):
-            return None
-        bonds = self.pieces.bonds
-        angles = bond_angles(bonds, held.n_atoms)
-        length, before = self._lengths(x, bonds), self._lengths(start, bonds)
-        slack = BOND_KEPT * before
-        held_off = self._held_lengths
-        table = {pair: miss for pair, miss in zip(map(tuple, held_off[0].tolist()), held_off[1].tolist(), strict=True)}
-        free = np.array([tuple(pair) not in table for pair in bonds.tolist()], dtype=bool)
-        wrong = free & ~(np.abs(length - before) <= slack)
-        turn, angle_before = self._angles(x, angles), self._angles(start, angles)
-        bent = np.abs(turn - angle_before)
-        suspects = np.flatnonzero(~(bent <= ANGLE_KEPT))
-        legs = self._moved_legs
-        around = np.zeros(held.n_atoms)
-        for side in (0, 1):
-            np.add.at(around, held_off[0][:, side], held_off[1])
-        odd = []
-        for number in suspects.tolist():
-            i, j, k = angles[number].tolist()
-            noise = 0.0 if strict else 2.0 * float(np.sum(around[[i, j, k]]))
-            if bent[number] > max(ANGLE_KEPT, noise) and not {(j, i), (j, k)} & legs:
-                odd.append(number)
-        worst: list[tuple[float, IntArray, str]] = [
-            (abs(length[n] - before[n]) / slack[n], bonds[n], f"from {before[n]:.4g} to {length[n]:.4g}")
-            for n in np.flatnonzero(wrong).tolist()
-        ] + [
-            (
-                bent[n] / ANGLE_KEPT,
-                angles[n],
-                f"from {np.degrees(angle_before[n]):.4g} to {np.degrees(turn[n]):.4g} degrees",
-            )
-            for n in odd
-        ]
-        worst.sort(key=lambda entry: -entry[0])
-        if len(worst) <= _MOST_EXAMINED:
-            worst = [entry for entry in worst if not self._follows(x, entry[1])]
-        if not worst:
-            return None
-        _, atoms, words = worst[0]
-        row = int(np.argmax(np.where(np.isfinite(self.misfit), self.misfit, np.inf)))
-        what = ("the bond " if len(atoms) == 2 else "the angle ") + "-".join(str(a) for a in atoms)
-        return InfeasibleError(
-            f"row {held.row_name(row)} was reached only with {what} changed {words}, which no row asks for. Start "
-            "nearer to the target, check the bonds, or hold what may change; with bonds=[] nothing but the rows is "
-            "looked at",
-            residual=float(self.misfit[row]),
-            row=row,
-            atoms=held.row_atoms(row),
-        )
-
-    @cached_property
-    def _held_lengths(self) -> tuple[IntArray, FloatArray]:
-        """Pairs whose distance a row holds, i < j, and by which part of it they were off."""
-        pairs, miss = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
-        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
-            if item.family == "Distance":
-                pairs.append(np.sort(item.atoms, axis=1))
-                miss.append(self.misfit[first : first + item.n_rows])
-        return np.concatenate(pairs), np.concatenate(miss)
-
-    @cached_property
-    def _moved_legs(self) -> set[tuple[int, int]]:
-        """(vertex, end) of the legs of angles that were off: other angles with such a leg change with them."""
-        legs: set[tuple[int, int]] = set()
-        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
-            off = np.flatnonzero(self.misfit[first : first + item.n_rows] > 1e-6)
-            if item.family == "Angle":
-                for i, j, k in item.atoms[off].tolist():
-                    legs |= {(j, i), (j, k)}
-            elif item.family == "Distance":
-                for i, k in item.atoms[off].tolist():
-                    for j in self._between(i, k):
-                        legs |= {(j, i), (j, k)}
-        return legs
-
-    def _between(self, i: int, k: int) -> list[int]:
-        """Atoms bonded to both of two that are not bonded to each other."""
-        if self.pieces.bonded(i, k):
-            return []
-        return np.intersect1d(self.pieces.neighbours(i), self.pieces.neighbours(k)).tolist()
-
-    def _lengths(self, x: FloatArray, pairs: IntArray) -> FloatArray:
-        return np.linalg.norm(self.held.minimum_image(x[pairs[:, 1]] - x[pairs[:, 0]]), axis=1)
-
-    def _angles(self, x: FloatArray, triples: IntArray) -> FloatArray:
-        u = self.held.minimum_image(x[triples[:, 0]] - x[triples[:, 1]])
-        w = self.held.minimum_image(x[triples[:, 2]] - x[triples[:, 1]])
-        return np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
-
-    def _follows(self, x: FloatArray, atoms: IntArray) -> bool:
-        """Whether the rows hold a bond or an angle: its gradient lies in the span of theirs."""
-        from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
-
-        centre = x[atoms[1]]
-        arms = {int(a): self.held.minimum_image(x[a] - centre) for a in atoms if a != atoms[1]}
-        gradient = np.zeros(x.shape)
-        if len(atoms) == 2:
-            gradient[atoms[0]] = arms[int(atoms[0])]
-        else:
-            u, w = (arms[int(a)] for a in atoms[[0, 2]])
-            # That of the cosine: the angle's own is undefined where it is straight.
-            lu, lw = np.linalg.norm(u), np.linalg.norm(w)
-            cosine = u @ w / (lu * lw)
-            gradient[atoms[0]] = (w / lw - cosine * u / lu) / lu
-            gradient[atoms[2]] = (u / lu - cosine * w / lw) / lw
-        gradient[atoms[1]] = -gradient.sum(axis=0)
-        target = gradient.ravel()
-        size = np.linalg.norm(target)
-        if size == 0:
-            return False
-        rows, columns = self._gradients(x)
-        if not len(columns):
-            return False
-        left = target[columns] / size
-        if np.linalg.norm(left) < 1 - 1e-6:
-            return False
-        answer = lsqr(rows.T, left, atol=1e-12, btol=1e-12, iter_lim=4 * sum(rows.shape))[0]
-        return bool(np.linalg.norm(left - rows.T @ answer) < 1e-5)
-
-    def _gradients(self, x: FloatArray) -> tuple[sp.csr_array, IntArray]:
-        """Unit gradients of all rows on the atoms they touch, and which coordinates these are."""
-        columns = (3 * self.held.touched[:, None] + np.arange(3)).ravel()
-        rows = sp.csr_array(self.held.jacobian(x, self.time))[:, columns]
-        size = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())
-        return sp.csr_array(sp.diags_array(1.0 / np.where(size > 0, size, 1.0)) @ rows), columns
-
-    # -- motions --------------------------------------------------------------------------------
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry, self.held, self.pieces = geometry, geometry.held, geometry.pieces
+        self.time, self.pinned = geometry.time, geometry.pinned
+        self._whole = self.pieces.whole(geometry.start, self.held.minimum_image)
+        self._images = self._whole - geometry.start
+        self._left = MOST_MOVES
 
     def moved(self) -> FloatArray | None:
-        """The start with pieces moved as the rows ask; None if they cannot come near."""
-        held = self.held
-        if not self.usable:
-            return None
-        pieces = self.pieces
-        if not np.isfinite(self.start[pieces.atoms]).all():
-            return None
-        self._left = MOST_MOVES
-        whole = pieces.whole(self.start, held.minimum_image)
-        self._images = whole - self.start
-        y = whole.copy()
+        """See the function of this name."""
+        held, y = self.held, self._whole.copy()
         self._follow_fixed(y)
         with np.errstate(all="ignore"):
             if not self._sweep(y):
@@ -433,7 +212,7 @@ class _Search:
             move = self._shifted(np.array([k]), np.array([i]), axis)
             if move is not None:
                 return move, None
-            for j in self._between(i, k):
+            for j in self.geometry.between(i, k):
                 move, _ = self._own("Angle", np.array([i, j, k]))
                 if move is not None:
                     return move, (i, j, k)
@@ -460,7 +239,7 @@ class _Search:
     def _owns(self) -> list[_Own]:
         """Motions of the rows that are off."""
         held = self.held
-        off = self.misfit > 1e-12
+        off = self.geometry.misfit > OFF * 1e-3
         found: list[_Own] = []
         for item, first in zip(held.constraints, held.starts, strict=False):
             if item.family not in ("Distance", "Angle", "Dihedral", "CenterDistance"):
@@ -530,7 +309,7 @@ class _Search:
         i, j, k = across
         u, w = y[i] - y[j], y[k] - y[j]
         a, b = float(np.linalg.norm(u)), float(np.linalg.norm(w))
-        now = float(np.arctan2(np.linalg.norm(np.cross(u, w)), u @ w))
+        now = float(np.arctan2(np.linalg.norm(cross(u, w)), u @ w))
         goal = float(np.linalg.norm(y[k] - y[i])) + change
         cosine = (a * a + b * b - goal * goal) / (2 * a * b)
         return float(np.arccos(np.clip(cosine, -1.0, 1.0))) - now
@@ -649,21 +428,10 @@ def _turn_of_line(a: FloatArray, b: FloatArray) -> FloatArray:
     if lu == 0 or lw == 0:
         return np.eye(3)
     u, w = u / lu, w / lw
-    axis, cosine = np.cross(u, w), float(u @ w)
+    axis, cosine = cross(u, w), float(u @ w)
     if cosine < -1 + 1e-12:
-        axis = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
+        axis = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
         axis /= np.linalg.norm(axis)
         return 2 * np.outer(axis, axis) - np.eye(3)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return (np.eye(3) + cross + cross @ cross / (1 + cosine)).T
-
-
-def _closest(x: FloatArray, chosen: BoolArray) -> float:
-    """The least distance of some atoms to their nearest neighbours."""
-    from scipy.spatial import cKDTree
-
-    if len(x) < 2:
-        return np.inf
-    good = np.isfinite(x).all(axis=1)
-    asked = x[np.logical_and(chosen, good)]
-    return float(cKDTree(x[good]).query(asked, k=2)[0][:, 1].min(initial=np.inf))
+    matrix = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return (np.eye(3) + matrix + matrix @ matrix / (1 + cosine)).T
