@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
@@ -197,6 +198,27 @@ class Geometry:
             row=row,
             atoms=held.row_atoms(row),
         )
+
+    def ties(self) -> tuple[ConstraintSet, FloatArray]:
+        """Lengths of bonds and distances across angles as at the start, and weights in which 1 is what may change."""
+        bonds, angles = self.pieces.bonds, bond_angles(self.pieces.bonds, self.held.n_atoms)
+        legs = self._moved_legs
+        kept = [not {(j, i), (j, k)} & legs for i, j, k in angles.tolist()]
+        ends = sorted_pairs(angles[np.array(kept, dtype=bool)][:, [0, 2]])
+        lengths, across = self._lengths(self.start, bonds), self._lengths(self.start, ends)
+        held = {tuple(pair) for pair in self._held_lengths[0].tolist()}
+        weights = np.concatenate([1.0 / (BOND_KEPT * lengths), 1.0 / (ANGLE_KEPT * across)])
+        weights[[tuple(pair) in held for pair in [*bonds.tolist(), *ends.tolist()]]] = 0.0
+        rows = [Distance(bonds, lengths), Distance(ends, across)]
+        return self.held.replaced(rows, self.start, self.time), weights
+
+    def placed(self) -> FloatArray:
+        """The start with fixed atoms in their places; a new array."""
+        x = self.start.copy()
+        for item in self.held.constraints:
+            if item.family == "FixedAtoms":
+                x[item.atoms[::3, 0]] = item.target_at(self.time).reshape(-1, 3)
+        return x
 
     @cached_property
     def _held_lengths(self) -> tuple[IntArray, FloatArray]:

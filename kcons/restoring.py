@@ -7,7 +7,9 @@ target wrecks the bonds around them. So where rows are far off, or the nearest p
    beyond one of its legs, a bond shifts what lies beyond it, a distance between molecules shifts one of them;
 2. rows that are still off are reached by turns about all bonds between their atoms and by motions of whole molecules,
    with damped Newton steps;
-3. what is left, rounding or small misfits in rings, is done by the search for the nearest point.
+3. where this does not do, in rings and between fixed atoms, all atoms of the molecules give way together, by least
+   squares of what changes in bonds and angles;
+4. what is left, mostly rounding, is done by the search for the nearest point.
 
 Of the two sides of a bond the lighter one moves, or the one without fixed atoms.
 """
@@ -35,6 +37,9 @@ NEAR = 0.25
 SWEEPS, MOST_MOVES = 40, 15_000
 #: Rows and motions beyond which no Newton steps among them are tried; steps, and starts from turned bonds.
 MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
+#: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and atoms up to
+#: which this is tried.
+EASING, HEAVY, MOST_EASED = 60, 1e4, 2000
 #: Largest turn of one step, in radian.
 _LONGEST_TURN = 0.5
 
@@ -69,8 +74,10 @@ def restored(
     """
     geometry = Geometry(held, plan.labels, x, time, bonds)
     ways: list[Callable[[], FloatArray | None]] = [lambda: x, lambda: moved(geometry)]
+
     if geometry.far() and len(geometry.pieces.bonds):
         ways.reverse()
+    ways.append(lambda: eased(geometry))
     error: KconsError | None = None
     noisy: list[FloatArray] = []
     for way in ways:
@@ -121,6 +128,48 @@ def moved(geometry: Geometry) -> FloatArray | None:
     if not geometry.usable or not np.isfinite(geometry.start[geometry.pieces.atoms]).all():
         return None
     return _Motions(geometry).moved()
+
+
+def eased(geometry: Geometry) -> FloatArray | None:
+    """The start with all atoms of its molecules moved, bonds and angles as near to theirs as the rows allow, or None.
+
+    Gauss-Newton steps on the rows, weighed heavily, and on changes of bonds and of the ends of angles, in units of
+    what may change.
+    """
+    held, time, start = geometry.held, geometry.time, geometry.start
+    if not geometry.checked or not geometry.usable or held.n_rows > MOST_ROWS:
+        return None
+    ties, weights = geometry.ties()
+    atoms = geometry.pieces.atoms
+    if not len(weights) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
+        return None
+    atoms = atoms[~geometry.pinned[atoms]]
+    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    heavy = np.where(held.holonomic, HEAVY / held.scale, 0.0)
+    x = geometry.placed()
+    reach = 0.3 * float(ties.scale.min())
+    with np.errstate(all="ignore"):
+        for _ in range(EASING):
+            off = np.concatenate([heavy * held.value(x, time), weights * ties.value(x)])
+            rows = [sp.diags_array(heavy) @ held.jacobian(x, time), sp.diags_array(weights) @ ties.jacobian(x)]
+            table = sp.csr_array(sp.vstack(rows))[:, columns]
+            if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
+                return None
+            # Free motions cost nothing: they stay out by a weight far below that of any tie.
+            normal = sp.csc_array(table.T @ table + 1e-3 * float(weights.min()) ** 2 * sp.eye_array(len(columns)))
+            step = -_solve(normal, table.T @ off)
+            longest = float(np.abs(step).max())
+            x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
+            if not longest > 1e-9 * reach:
+                break
+        left = np.abs(held.value(x, time)) / held.scale
+    return x if np.all(left[held.holonomic] <= NEAR) else None
+
+
+def _solve(normal: sp.csc_array, right: FloatArray) -> FloatArray:
+    from scipy.sparse.linalg import splu  # slow to import, rarely needed
+
+    return np.asarray(splu(normal).solve(right))
 
 
 @dataclass(frozen=True)
