@@ -141,10 +141,12 @@ def eased(geometry: Geometry) -> FloatArray | None:
         return None
     ties, weights = geometry.ties()
     atoms = geometry.pieces.atoms
-    if not len(weights) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
+    if not np.any(weights > 0) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
         return None
     atoms = atoms[~geometry.pinned[atoms]]
     columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    # Free motions cost nothing: they stay out by a weight far below that of any tie.
+    least = 1e-3 * float(weights[weights > 0].min()) ** 2
     heavy = np.where(held.holonomic, HEAVY / held.scale, 0.0)
     x = geometry.placed()
     reach = 0.3 * float(ties.scale.min())
@@ -155,8 +157,7 @@ def eased(geometry: Geometry) -> FloatArray | None:
             table = sp.csr_array(sp.vstack(rows))[:, columns]
             if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
                 return None
-            # Free motions cost nothing: they stay out by a weight far below that of any tie.
-            normal = sp.csc_array(table.T @ table + 1e-3 * float(weights.min()) ** 2 * sp.eye_array(len(columns)))
+            normal = sp.csc_array(table.T @ table + least * sp.eye_array(len(columns)))
             step = -_solve(normal, table.T @ off)
             longest = float(np.abs(step).max())
             x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
