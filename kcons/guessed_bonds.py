@@ -19,12 +19,13 @@ STRETCH = 1.25
 #: Atoms closer than this, in angstrom, are one atom twice.
 COINCIDENT = 0.3
 #: Without elements: a bond is shorter than this times the geometric mean of its atoms' distances to their nearest
-#: neighbours. Bonds to carbon with hydrogens reach 1.40 (C-C) and 1.51 (C-S), the closest atoms that are not bonded
-#: begin at 1.58 (H...H of water).
-NEAREST = 1.54
+#: neighbours. C-C beside C-H has 1.40, C-S 1.51, Si-Si 1.59; hydrogen bonds begin at 1.7.
+NEAREST = 1.62
+#: A pair this much longer than both distances to a third atom is bonded to that one, not to each other.
+ACROSS = 1.2
 #: What is no picture of molecules: atoms with more of such neighbours (a fluid, a metal), angles sharper than this
-#: (three-membered rings have 60 degrees), pairs that are this little further apart than bonded ones.
-MOST_BONDS, SHARPEST, GAP = 6, np.radians(50.0), 1.02
+#: (three-membered rings have 48 to 75 degrees), pairs that are this little further apart than bonded ones.
+MOST_BONDS, SHARPEST, GAP = 6, np.radians(47.0), 1.02
 #: Nearest neighbours further off than this times the median are at no bond length.
 _LONE = 2.5
 
@@ -123,12 +124,15 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if not np.all(away > 0):
         return nothing
     ratio = away / np.sqrt(near[pairs[:, 0]] * near[pairs[:, 1]])
+    close = np.flatnonzero(ratio < GAP * NEAREST)
+    close = close[~across(pairs[close], away[close])]
+    pairs, ratio = pairs[close], ratio[close]
     bonds = sorted_pairs(pairs[ratio < NEAREST])
     molecule, _ = connected(bonds, len(y))
     wanted = np.zeros(len(x), dtype=bool)
     wanted[atoms] = True
     seen = np.isin(molecule, molecule[wanted[finite]])
-    between = pairs[(ratio >= NEAREST) & (ratio < GAP * NEAREST)]
+    between = pairs[ratio >= NEAREST]
     torn = seen[between[:, 0]] & (molecule[between[:, 0]] == molecule[between[:, 1]])
     crowded = np.bincount(bonds.ravel(), minlength=len(y))[seen] > MOST_BONDS
     if torn.any() or crowded.any():
@@ -140,6 +144,27 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
         u, w = (d - np.round(d @ lattice[1]) @ lattice[0] for d in (u, w))
     angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
     return nothing if np.any(angle < SHARPEST) else finite[kept]
+
+
+def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:
+    """Which pairs are the long sides of triangles of pairs, as H-H in water; pairs with i < j, each once."""
+    if not len(pairs):
+        return np.zeros(0, dtype=bool)
+    n = int(pairs.max()) + 1
+    order = np.argsort(pairs[:, 0] * n + pairs[:, 1])
+    code, length = (pairs[:, 0] * n + pairs[:, 1])[order], lengths[order]
+
+    def number(a: IntArray, b: IntArray) -> IntArray:
+        return np.searchsorted(code, np.minimum(a, b) * n + np.maximum(a, b)).clip(0, len(code) - 1)
+
+    i, j, k = bond_angles(pairs, n).T
+    side = number(i, k)
+    closed = code[side] == np.minimum(i, k) * n + np.maximum(i, k)
+    side = side[closed]
+    legs = np.maximum(length[number(i, j)], length[number(j, k)])[closed]
+    found = np.zeros(len(pairs), dtype=bool)
+    found[order[side[length[side] > ACROSS * legs]]] = True
+    return found
 
 
 def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:

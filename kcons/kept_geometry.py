@@ -14,7 +14,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.guessed_bonds import NEAREST, bonds_without_elements
+from kcons.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.pieces import Pieces
 from kcons.topology import BoolArray, bond_angles, connected, sorted_pairs
 
@@ -38,26 +38,33 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
     """What counts as a bond, shape (n, 2).
 
     Those that are given and the distances that rows hold, unless they are longer than atoms in one molecule are bonded
-    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what the distances suggest
-    between atoms that held distances do not join.
+    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what angles and dihedrals name
+    and what the distances suggest, between atoms that held distances do not join.
     """
-    pairs = [item.atoms for item in held.constraints if item.family == "Distance"]
-    lengths = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
-    rows = np.concatenate([*pairs, np.zeros((0, 2), np.int64)])
-    target = np.concatenate([*lengths, np.zeros(0)])
-    others = given
-    if others is None:
-        others = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
+    tables = [item.atoms for item in held.constraints if item.family == "Distance"]
+    rows = np.sort(np.concatenate([*tables, np.zeros((0, 2), np.int64)]), axis=1)
+    targets = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
+    claimed, sure = rows, given
+    if sure is None:
+        chains = [item.atoms for item in held.constraints if item.family in ("Angle", "Dihedral")]
+        claimed = np.concatenate(
+            [rows, *(np.sort(c[:, k : k + 2], axis=1) for c in chains for k in range(c.shape[1] - 1))]
+        )
+        sure = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
         fragment, _ = connected(rows, held.n_atoms)
-        others = others[fragment[others[:, 0]] != fragment[others[:, 1]]]
-    known = np.concatenate([rows, others])
-    away = held.minimum_image(x[others[:, 0]] - x[others[:, 1]])
-    length = np.concatenate([target, np.linalg.norm(away, axis=1)])
+        sure = sure[fragment[sure[:, 0]] != fragment[sure[:, 1]]]
+    pairs, first = np.unique(np.concatenate([np.sort(sure, axis=1), claimed]), axis=0, return_index=True)
+    length = np.linalg.norm(held.minimum_image(x[pairs[:, 0]] - x[pairs[:, 1]]), axis=1)
+    # What is to become longer was a bond, and what is to become shorter will be one.
+    order = {tuple(pair): n for n, pair in enumerate(pairs.tolist())}
+    place = np.array([order[tuple(pair)] for pair in rows.tolist()], dtype=np.int64)
+    np.minimum.at(length, place, np.concatenate([*targets, np.zeros(0)]))
+    kept = ~across(pairs, length)
     shortest = np.full(held.n_atoms, np.inf)
     for side in (0, 1):
-        np.minimum.at(shortest, known[:, side], length)
-    bonded = length < NEAREST * np.sqrt(shortest[known[:, 0]] * shortest[known[:, 1]])
-    return sorted_pairs(known[bonded])
+        np.minimum.at(shortest, pairs[kept, side], length[kept])
+    kept &= (first < len(sure)) | (length < NEAREST * np.sqrt(shortest[pairs[:, 0]] * shortest[pairs[:, 1]]))
+    return pairs[kept]
 
 
 class Geometry:
@@ -122,7 +129,9 @@ class Geometry:
 
     @cached_property
     def turned(self) -> bool:
-        """Whether something other than bonds is off: then angles are to be what they were, whatever the bonds are."""
+        """Whether bonds are given, or something else than bonds is off: then all angles are to be what they were."""
+        if self._given is not None:
+            return True
         for item, miss in self._off_rows():
             off = item.atoms[miss > OFF]
             if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
@@ -141,7 +150,7 @@ class Geometry:
     def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:
         """What to raise if a bond or an angle that no row holds has changed.
 
-        Unless `strict`, angles may change as much as the bonds around them that rows hold were off.
+        Unless `strict`, angles between bonds that rows hold may change as much as the bonds around them were off.
         """
         held, start = self.held, self.start
         self._spans.clear()
@@ -168,7 +177,8 @@ class Geometry:
         odd = []
         for number in suspects.tolist():
             i, j, k = angles[number].tolist()
-            noise = 0.0 if strict else 2.0 * float(np.sum(around[[i, j, k]]))
+            loose = not strict and (min(i, j), max(i, j)) in table and (min(j, k), max(j, k)) in table
+            noise = 2.0 * float(np.sum(around[[i, j, k]])) if loose else 0.0
             if bent[number] > max(ANGLE_KEPT, noise) and not {(j, i), (j, k)} & legs:
                 odd.append(number)
         worst: list[tuple[float, IntArray, str]] = [

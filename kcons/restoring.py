@@ -79,7 +79,6 @@ def restored(
         ways.reverse()
     ways.append(lambda: eased(geometry))
     error: KconsError | None = None
-    noisy: list[FloatArray] = []
     for way in ways:
         begin = way()
         if begin is None:
@@ -94,11 +93,7 @@ def restored(
             wrong = geometry.changed(found, strict=geometry.turned)
             if wrong is None:
                 return found
-            noisy.append(found)
         error = wrong
-    for found in noisy:
-        if geometry.changed(found, strict=False) is None:
-            return found
     assert error is not None
     raise error
 
