@@ -38,22 +38,18 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
     """What counts as a bond, shape (n, 2).
 
     Those that are given and the distances that rows hold, unless they are longer than atoms in one molecule are bonded
-    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what angles and dihedrals name
-    and what the distances suggest, between atoms that held distances do not join.
+    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what the distances suggest
+    between atoms that held distances do not join.
     """
     tables = [item.atoms for item in held.constraints if item.family == "Distance"]
     rows = np.sort(np.concatenate([*tables, np.zeros((0, 2), np.int64)]), axis=1)
     targets = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
-    claimed, sure = rows, given
+    sure = given
     if sure is None:
-        chains = [item.atoms for item in held.constraints if item.family in ("Angle", "Dihedral")]
-        claimed = np.concatenate(
-            [rows, *(np.sort(c[:, k : k + 2], axis=1) for c in chains for k in range(c.shape[1] - 1))]
-        )
         sure = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
         fragment, _ = connected(rows, held.n_atoms)
         sure = sure[fragment[sure[:, 0]] != fragment[sure[:, 1]]]
-    pairs, first = np.unique(np.concatenate([np.sort(sure, axis=1), claimed]), axis=0, return_index=True)
+    pairs, first = np.unique(np.concatenate([np.sort(sure, axis=1), rows]), axis=0, return_index=True)
     length = np.linalg.norm(held.minimum_image(x[pairs[:, 0]] - x[pairs[:, 1]]), axis=1)
     # What is to become longer was a bond, and what is to become shorter will be one.
     order = {tuple(pair): n for n, pair in enumerate(pairs.tolist())}
