@@ -138,9 +138,16 @@ class Geometry:
 
     @cached_property
     def checked(self) -> bool:
-        """Whether bonds are to be as they were; guessed ones only if rows of lengths and angles alone are off."""
+        """Whether bonds and angles are to be as they were.
+
+        Those that are not given only where the start is a structure: no rows but those of lengths and angles are off,
+        and of several distances that are held not most are far off.
+        """
         if self._given is not None:
             return len(self._given) > 0
+        lengths = self._held_lengths[1]
+        if len(lengths) > 1 and np.sum(lengths > FAR) > 0.5 * len(lengths):
+            return False
         return all(item.family in _INTERNAL or not np.any(miss > OFF) for item, miss in self._off_rows())
 
     def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:

@@ -351,8 +351,9 @@ class Motion:
             Where to put the result.
         bonds : array_like of int, shape (n, 2), or callable that gives them, optional
             The bonds of the molecules; a callable is asked only where they are needed. Without them, distances that
-            rows hold count, and atoms that these do not join are bonded where their distances suggest it. An empty
-            list: the nearest point, whatever becomes of what no row holds.
+            rows hold count, and atoms that these do not join are bonded where their distances suggest it; where most
+            held distances are off by more than a quarter the start is no structure to be kept. An empty list: the
+            nearest point, whatever becomes of what no row holds.
 
         Raises
         ------
