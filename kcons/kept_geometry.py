@@ -90,7 +90,8 @@ class Geometry:
         self, held: ConstraintSet, labels: IntArray, start: FloatArray, time: float, bonds: Bonds | None
     ) -> None:
         self.held, self.labels, self.start, self.time, self._bonds = held, labels, start, time, bonds
-        self.pinned = np.zeros(held.n_atoms, dtype=bool)
+        # Particles without mass are sites or walls: whoever places them does so, not a bond.
+        self.pinned = np.equal(held.masses, 0.0)
         for item in held.constraints:
             if item.family == "FixedAtoms":
                 self.pinned[item.atoms.ravel()] = True
