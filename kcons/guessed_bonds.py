@@ -7,6 +7,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.images import minimum_image
 from kcons.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
@@ -141,7 +142,7 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     i, j, k = bond_angles(kept, len(y)).T
     u, w = y[i] - y[j], y[k] - y[j]
     if lattice is not None:
-        u, w = (d - np.round(d @ lattice[1]) @ lattice[0] for d in (u, w))
+        u, w = minimum_image(u, lattice), minimum_image(w, lattice)
     angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
     return nothing if np.any(angle < SHARPEST) else finite[kept]
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,8 +27,8 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
-from kcons.errors import ConvergenceError, InfeasibleError, KconsError, SingularGeometryError
-from kcons.kept_geometry import OFF, Bonds, Geometry
+from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
+from kcons.kept_geometry import OFF, Bonds, Geometry, shortest_image
 from kcons.pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan import Plan
 
@@ -85,7 +86,7 @@ def restored(
             continue
         try:
             found = nearest(begin)
-        except (ConvergenceError, SingularGeometryError) as failure:
+        except (ConvergenceError, ImageError, SingularGeometryError) as failure:
             error = error or failure
             continue
         wrong = _off(held, plan, found, time)
@@ -186,7 +187,7 @@ class _Motions:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry, self.held, self.pieces = geometry, geometry.held, geometry.pieces
         self.time, self.pinned = geometry.time, geometry.pinned
-        self._whole = self.pieces.whole(geometry.start, self.held.minimum_image)
+        self._whole = self.pieces.whole(geometry.start, partial(shortest_image, self.held))
         self._images = self._whole - geometry.start
         self._left = MOST_MOVES
 
@@ -246,7 +247,7 @@ class _Motions:
 
     def _own(self, family: str, atoms: IntArray) -> tuple[Move | None, tuple[int, int, int] | None]:
         """The motion that changes one row and, if possible, no other bond or angle."""
-        image = self.held.minimum_image
+        image = partial(shortest_image, self.held)
         found: list[tuple[IntArray | None, Move | None]] = []
         if family == "Distance":
             i, k = atoms.tolist()
