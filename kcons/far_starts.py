@@ -22,6 +22,11 @@ RESCUE_ROWS = 400
 MAX_RESCUES = 20
 #: Rounds of the search for the nearest point on the constraints.
 NEAREST_ROUNDS = 200
+#: Newton iterations that one restoration may take in all. Dense algebra takes fewer for clusters of more than so many
+#: rows, by the square of their number. A projection that fails counts as this many, and so many may be rescued.
+MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
+#: Rounds towards the constraints that must gain a tenth, or damping does better.
+STALLED = 10
 #: Halvings of one step of it.
 MAX_HALVINGS = 30
 
@@ -50,6 +55,24 @@ class Task(NamedTuple):
             multipliers += more
 
 
+class Work:
+    """What is left of the Newton iterations and rescues that one restoration may take.
+
+    Parameters
+    ----------
+    plan : Plan
+        Its largest clusters say what an iteration costs.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        def share(rows: IntArray) -> float:
+            return 1.0 / max(1.0, int(np.bincount(plan.labels[rows]).max(initial=1)) / SMALL_CLUSTER) ** 2
+
+        dense = [share(solver.rows) for solver in plan.solvers if isinstance(solver, GeneralClusters)]
+        self.iterations = max(int(MOST_ITERATIONS * min(dense, default=1.0)), 2 * FAILED)
+        self.rescues = max(int(RESCUED * share(np.flatnonzero(plan.labels >= 0))), 1)
+
+
 class Rescuers:
     """Solvers with step control for single clusters whose own solver has none; made when first needed.
 
@@ -64,6 +87,8 @@ class Rescuers:
     def __init__(self, local: ConstraintSet, plan: Plan, numbers: IntArray | None) -> None:
         self._local, self._plan, self._numbers = local, plan, numbers
         self._made: dict[int, ClusterSolver] = {}
+        #: Set during restorations, which try many projections and may do without some of them.
+        self.work: Work | None = None
 
     def rescue(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
         """Do a task that `solver` failed at, or raise what says why there is no way.
@@ -76,7 +101,9 @@ class Rescuers:
         x, velocities = task.x_new, task.velocities
         saved = x.copy(), None if velocities is None else velocities.copy()
         error = diagnosis.unusable(self._local, self._numbers, {"x_new": x, "x_ref": task.x_ref}, outcome, solver)
-        if error is None:
+        if self.work is not None:
+            self.work.rescues -= 1
+        if error is None and (self.work is None or self.work.rescues >= 0):
             outcome = self._damped(solver, outcome, task, multipliers)
             if outcome.converged:
                 return outcome
@@ -136,6 +163,10 @@ class FarStart:
         Global numbers of the local atoms, for messages.
     positions, tangents : callable
         The position and velocity projections of the plan, in place on local arrays.
+    work : Work
+        What the search may cost. A point on the constraints is returned as it is when this is used up.
+    iterations : callable
+        How many the last projection took.
     """
 
     def __init__(
@@ -145,16 +176,25 @@ class FarStart:
         numbers: IntArray | None,
         positions: Callable[..., Any],
         tangents: Callable[..., Any],
+        work: Work,
+        iterations: Callable[[], int],
     ) -> None:
         self._local, self._plan, self._numbers = local, plan, numbers
-        self._positions, self._tangents = positions, tangents
+        self._solve, self._tangents = positions, tangents
+        self._work, self._iterations = work, iterations
+
+    def _positions(self, x: FloatArray, reference: FloatArray, time: float) -> None:
+        """Project in place along the gradients at `reference`."""
+        self._work.iterations -= FAILED
+        self._solve(x, reference, time, time, None, 0.0, None)
+        self._work.iterations += FAILED - self._iterations()
 
     def restore(self, x: FloatArray, time: float) -> None:
         """Bring `x` onto the constraints in place, or raise `InfeasibleError`."""
         start = x.copy()
         here = x.copy()
         try:
-            self._positions(here, start, time, time, None, 0.0, None)
+            self._positions(here, start, time)
         except ConvergenceError:
             self._reach(here, time)
         if not self._settle(start, here, time):
@@ -169,7 +209,8 @@ class FarStart:
             raise error
         if not self._gauss_newton(x, time):
             np.copyto(x, start)
-            general = self._plan.general_for_all(RESCUE_ROWS)
+            # Any point does: masses of many orders of magnitude would only spoil the condition.
+            general = self._plan.general_for_all(RESCUE_ROWS, equal=True)
             outcome = general.restore(x, time=time)
             if not outcome.converged:
                 raise diagnosis.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
@@ -182,9 +223,11 @@ class FarStart:
         """
         here, last = x, np.inf
         for _ in range(NEAREST_ROUNDS):
+            if self._work.iterations <= 0:
+                return False
             ahead = start.copy()
             try:
-                self._positions(ahead, here, time, time, None, 0.0, None)
+                self._positions(ahead, here, time)
             except ConvergenceError:
                 return False
             move = float(np.max(np.abs(ahead - here), initial=0.0))
@@ -229,9 +272,11 @@ class FarStart:
                     return
             last = slope
             for _ in range(MAX_HALVINGS):
+                if self._work.iterations <= 0:
+                    return
                 ahead = x + np.where(inside, factor[atom_label], 0.0)[:, None] * step
                 try:
-                    self._positions(ahead, x, time, time, None, 0.0, None)
+                    self._positions(ahead, x, time)
                 except ConvergenceError as error:
                     factor[error.cluster if error.cluster >= 0 else slice(None)] *= 0.5
                     continue
@@ -270,7 +315,12 @@ class FarStart:
         with np.errstate(all="ignore"):
             sigma = local.value(x, time)
             error = misfit(sigma)
-            for _ in range(NEAREST_ROUNDS):
+            before = np.inf
+            for number in range(NEAREST_ROUNDS):
+                if number % STALLED == STALLED - 1:
+                    if float(error.sum()) > 0.9 * before:
+                        return False
+                    before = float(error.sum())
                 if np.all(np.abs(sigma[member]) <= local.tolerance(x, time)[member]):
                     return True
                 step = np.zeros_like(x)

@@ -7,7 +7,8 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology import BoolArray, Snapshot, sorted_pairs
+from kcons.images import minimum_image
+from kcons.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
 RADII: dict[str, float] = {
@@ -18,6 +19,16 @@ RADII: dict[str, float] = {
 STRETCH = 1.25
 #: Atoms closer than this, in angstrom, are one atom twice.
 COINCIDENT = 0.3
+#: Without elements: a bond is shorter than this times the geometric mean of its atoms' distances to their nearest
+#: neighbours. C-C beside C-H has 1.40, C-S 1.51, Si-Si 1.59; hydrogen bonds begin at 1.7.
+NEAREST = 1.62
+#: A pair this much longer than both distances to a third atom is bonded to that one, not to each other.
+ACROSS = 1.2
+#: What is no picture of molecules: atoms with more of such neighbours (a fluid, a metal), angles sharper than this
+#: (three-membered rings have 48 to 75 degrees), pairs that are this little further apart than bonded ones.
+MOST_BONDS, SHARPEST, GAP = 6, np.radians(47.0), 1.02
+#: Nearest neighbours further off than this times the median are at no bond length.
+_LONE = 2.5
 
 
 def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolArray | None = None) -> IntArray:
@@ -59,7 +70,7 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
         return np.zeros((0, 2), np.int64)
     cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
     reach = 2 * STRETCH * float(radius[able].max())
-    pairs, away = _close(x[able], cell, snapshot.pbc, reach)
+    pairs, away = close_pairs(x[able], cell, snapshot.pbc, reach)
     pairs = able[pairs]
     i, j = pairs.T
     near = away < STRETCH * (radius[i] + radius[j])
@@ -80,6 +91,83 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
     return sorted_pairs(pairs[_nearest_of_hydrogens(pairs, away, hydrogen)])
 
 
+def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: IntArray, able: BoolArray) -> IntArray:
+    """Bonds that the distances alone suggest, where neither elements nor the unit of length are known, shape (n, 2).
+
+    Two atoms are bonded if they are closer than `NEAREST` times the geometric mean of the distances of each to its
+    nearest neighbour. Nothing is guessed where the molecules of `atoms` then do not look like molecules.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_atoms, 3)
+        In any unit; atoms that are not finite get no bonds.
+    lattice : ndarray, shape (2, 3, 3), or None
+        A periodic cell and its inverse, as `ConstraintSet.lattice`.
+    atoms : ndarray of int
+        Whose molecules are looked at.
+    able : ndarray of bool, shape (n_atoms,)
+        Only these atoms form bonds.
+    """
+    from scipy.spatial import cKDTree
+
+    nothing = np.zeros((0, 2), np.int64)
+    finite = np.flatnonzero(able & np.isfinite(x).all(axis=1))
+    if len(finite) < 2:
+        return nothing
+    y = x[finite]
+    near = cKDTree(y).query(y, k=2)[0][:, 1]
+    cell, pbc = (None, np.zeros(3, dtype=bool)) if lattice is None else (lattice[0], lattice[1].any(axis=0))
+    typical = float(np.median(near))
+    pairs, away = close_pairs(y, cell, pbc, GAP * NEAREST * _LONE * typical)
+    for side in (0, 1):
+        np.minimum.at(near, pairs[:, side], away)
+    near = np.minimum(near, _LONE * typical)
+    if not np.all(away > 0):
+        return nothing
+    ratio = away / np.sqrt(near[pairs[:, 0]] * near[pairs[:, 1]])
+    close = np.flatnonzero(ratio < GAP * NEAREST)
+    close = close[~across(pairs[close], away[close])]
+    pairs, ratio = pairs[close], ratio[close]
+    bonds = sorted_pairs(pairs[ratio < NEAREST])
+    molecule, _ = connected(bonds, len(y))
+    wanted = np.zeros(len(x), dtype=bool)
+    wanted[atoms] = True
+    seen = np.isin(molecule, molecule[wanted[finite]])
+    between = pairs[ratio >= NEAREST]
+    torn = seen[between[:, 0]] & (molecule[between[:, 0]] == molecule[between[:, 1]])
+    crowded = np.bincount(bonds.ravel(), minlength=len(y))[seen] > MOST_BONDS
+    if torn.any() or crowded.any():
+        return nothing
+    kept = bonds[seen[bonds[:, 0]]]
+    i, j, k = bond_angles(kept, len(y)).T
+    u, w = y[i] - y[j], y[k] - y[j]
+    if lattice is not None:
+        u, w = minimum_image(u, lattice), minimum_image(w, lattice)
+    angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
+    return nothing if np.any(angle < SHARPEST) else finite[kept]
+
+
+def across(pairs: IntArray, lengths: FloatArray) -> BoolArray:
+    """Which pairs are the long sides of triangles of pairs, as H-H in water; pairs with i < j, each once."""
+    if not len(pairs):
+        return np.zeros(0, dtype=bool)
+    n = int(pairs.max()) + 1
+    order = np.argsort(pairs[:, 0] * n + pairs[:, 1])
+    code, length = (pairs[:, 0] * n + pairs[:, 1])[order], lengths[order]
+
+    def number(a: IntArray, b: IntArray) -> IntArray:
+        return np.searchsorted(code, np.minimum(a, b) * n + np.maximum(a, b)).clip(0, len(code) - 1)
+
+    i, j, k = bond_angles(pairs, n).T
+    side = number(i, k)
+    closed = code[side] == np.minimum(i, k) * n + np.maximum(i, k)
+    side = side[closed]
+    legs = np.maximum(length[number(i, j)], length[number(j, k)])[closed]
+    found = np.zeros(len(pairs), dtype=bool)
+    found[order[side[length[side] > ACROSS * legs]]] = True
+    return found
+
+
 def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray) -> BoolArray:
     """Which pairs stay when every hydrogen keeps only its nearest neighbour."""
     best = np.full(len(hydrogen), np.inf)
@@ -92,8 +180,8 @@ def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray
     return keep
 
 
-def _close(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
-    """Pairs closer than `reach` in any image, shape (n, 2), and their distances."""
+def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
+    """Pairs closer than `reach` in any image, shape (n, 2), and their distances; cell vectors as rows."""
     from scipy.spatial import cKDTree
 
     if cell is None or not pbc.any():

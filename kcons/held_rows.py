@@ -29,7 +29,7 @@ from kcons.rigid_groups import (
     listed_bodies,
     residue_bodies,
 )
-from kcons.topology import BoolArray, Snapshot, Topology, near_misses, sorted_pairs
+from kcons.topology import BoolArray, Snapshot, Topology, bond_angles, near_misses, sorted_pairs
 from kcons.virtual_sites import VirtualSites
 from kcons.whole import minimum_image
 
@@ -354,25 +354,6 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
     degree = np.bincount(bonds.ravel(), minlength=len(hydrogen))
     closing: BoolArray = both & np.all(degree[bonds] > 1, axis=1)
     return closing
-
-
-def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
-    """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
-    both = np.concatenate([bonds, bonds[:, ::-1]])
-    both = both[np.lexsort((both[:, 1], both[:, 0]))]
-    degree = np.bincount(both[:, 0], minlength=n_atoms)
-    starts = np.cumsum(degree) - degree
-    found = []
-    for d in np.unique(degree[degree > 1]).tolist():
-        vertex = np.flatnonzero(degree == d)
-        neighbours = both[starts[vertex][:, None] + np.arange(d), 1]
-        a, b = np.triu_indices(d, 1)
-        centre = np.repeat(vertex, len(a))
-        found.append(np.stack([neighbours[:, a].ravel(), centre, neighbours[:, b].ravel()], axis=1))
-    if not found:
-        return np.zeros((0, 3), np.int64)
-    triples = np.concatenate(found)
-    return triples[np.lexsort((triples[:, 2], triples[:, 0], triples[:, 1]))].astype(np.int64)
 
 
 # -- checks ---------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ that names the row, with nothing changed, where there is no solution.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Literal
 
@@ -15,16 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons import diagnosis
-from kcons.arrays import as_array, check_multipliers, check_out
+from kcons.arrays import as_array, check_multipliers, check_out, check_pairs
 from kcons.certificate import certify
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError, KconsError
-from kcons.far_starts import FarStart, Rescuers, Task
+from kcons.far_starts import FarStart, Rescuers, Task, Work
 from kcons.flat_bodies import MISFIT, FlatBody
+from kcons.kept_geometry import Bonds
 from kcons.plan import Plan, make_plan
+from kcons.restoring import restored
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
@@ -327,33 +329,85 @@ class Motion:
                 self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
         return self._lattice
 
-    def restore_positions(self, x: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None) -> FloatArray:
-        """Bring positions that are far off onto the constraints: the nearest point in the mass metric.
+    def restore_positions(
+        self,
+        x: ArrayLike,
+        *,
+        time: float = 0.0,
+        out: FloatArray | None = None,
+        bonds: ArrayLike | Callable[[], IntArray] | None = None,
+    ) -> FloatArray:
+        """Bring positions that are off onto the constraints, with other bond lengths and angles as they were.
 
-        For initial positions, not for time steps. Damped Newton where the start is far off; then along the
-        constraints to the foot of the mass-weighted perpendicular, x - x_0 = M^-1 A(x)^T Lambda.
+        For initial positions, not for time steps. Near starts go to the nearest point in the mass metric, where
+        x - x_0 = M^-1 A(x)^T Lambda. Where that would change other bonds or angles, and for far starts, groups move
+        as rigid pieces first: see `kcons.restoring`.
+
+        Parameters
+        ----------
+        x : array_like, shape (n_atoms, 3)
+        time : float
+        out : ndarray, optional
+            Where to put the result.
+        bonds : array_like of int, shape (n, 2), or callable that gives them, optional
+            The bonds of the molecules; a callable is asked only where they are needed. Without them, distances that
+            rows hold count, and atoms that these do not join are bonded where their distances suggest it; where most
+            held distances are off by more than a quarter the start is no structure to be kept. An empty list: the
+            nearest point, whatever becomes of what no row holds.
 
         Raises
         ------
         InfeasibleError
-            The residual cannot be made smaller; nothing was changed.
+            There is no way from here, or other bonds change by more than 1.25 % of their length (0.02 angstrom) or
+            other angles by more than 2 degrees; nothing was changed.
+        InputError
+            Bonds of unknown atoms.
         """
         if out is not None:
             check_out(out, self._shape)
         self.cell()
-        result = as_array(x, self._shape, "positions").copy()
-        local = result if self._atoms is None else result[self._atoms]
-        targets = self._local.target(time) if self._moving else None
-        if len(self.plan.pinned):
-            local[self.plan.pinned] = self.plan.pinned_targets(targets)
-        start = FarStart(self._local, self.plan, self._atoms, self._positions_direct, self._tangents)
-        start.restore(local, time)
-        if self._atoms is not None:
-            result[self._atoms] = local
+        start = as_array(x, self._shape, "positions")
+        pairs: Bonds | None = None
+        if callable(bonds):
+            pairs = bonds
+        elif bonds is not None:
+            table = check_pairs(bonds, self.n_atoms)
+
+            def pairs() -> IntArray:
+                return table
+
+        self._rescuers.work = work = Work(self.plan)
+        try:
+            result = restored(
+                self.constraint_set, self.plan, start, time, pairs, lambda y: self._nearest(y, time, work)
+            )
+        finally:
+            self._rescuers.work = None
         if out is None:
             return result
         np.copyto(out, result)
         return out
+
+    def _nearest(self, x: FloatArray, time: float, work: Work) -> FloatArray:
+        """The nearest point on the constraints in the mass metric; a new array."""
+        result = x.copy()
+        local = result if self._atoms is None else result[self._atoms]
+        targets = self._local.target(time) if self._moving else None
+        if len(self.plan.pinned):
+            local[self.plan.pinned] = self.plan.pinned_targets(targets)
+        start = FarStart(
+            self._local,
+            self.plan,
+            self._atoms,
+            self._positions_direct,
+            self._tangents,
+            work,
+            lambda: max(self._iterations, default=0),
+        )
+        start.restore(local, time)
+        if self._atoms is not None:
+            result[self._atoms] = local
+        return result
 
     # -- velocities, accelerations, forces ------------------------------------------------------
 

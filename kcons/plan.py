@@ -190,8 +190,8 @@ class Plan:
                 atoms=self.named.row_atoms(row),
             )
 
-    def general_for_all(self, limit: int) -> GeneralClusters:
-        """The damped solver for every cluster, for positions that are far off.
+    def general_for_all(self, limit: int, *, equal: bool = False) -> GeneralClusters:
+        """The damped solver for every cluster, for positions that are far off; with equal masses if that is enough.
 
         Raises
         ------
@@ -206,7 +206,8 @@ class Plan:
                 f"these positions are too far off for the cluster of {sizes.max()} rows around {name}: start nearer "
                 "to the constraints (minimise with harmonic bonds first), or hold fewer rows"
             )
-        return GeneralClusters(self.constraint_set, rows, self.labels[rows], self.inverse_masses)
+        inverse_masses = (self.inverse_masses > 0).astype(np.float64) if equal else self.inverse_masses
+        return GeneralClusters(self.constraint_set, rows, self.labels[rows], inverse_masses)
 
     def least_norm(self, x: FloatArray, lam: FloatArray, time: float) -> FloatArray:
         """Multipliers of least norm with the same constraint force, where rows depend on each other."""

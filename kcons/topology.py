@@ -230,6 +230,25 @@ def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
     return order[number].astype(np.int64), int(count)
 
 
+def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
+    """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
+    both = np.concatenate([bonds, bonds[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    degree = np.bincount(both[:, 0], minlength=n_atoms)
+    starts = np.cumsum(degree) - degree
+    found = []
+    for d in np.unique(degree[degree > 1]).tolist():
+        vertex = np.flatnonzero(degree == d)
+        neighbours = both[starts[vertex][:, None] + np.arange(d), 1]
+        a, b = np.triu_indices(d, 1)
+        centre = np.repeat(vertex, len(a))
+        found.append(np.stack([neighbours[:, a].ravel(), centre, neighbours[:, b].ravel()], axis=1))
+    if not found:
+        return np.zeros((0, 3), np.int64)
+    triples = np.concatenate(found)
+    return triples[np.lexsort((triples[:, 2], triples[:, 0], triples[:, 1]))].astype(np.int64)
+
+
 def split_residues(
     names: StrArray, residue_names: StrArray, residue_ids: Sequence[Any] | NDArray[Any], chains: StrArray | None = None
 ) -> tuple[IntArray, IntArray]:

@@ -15,6 +15,7 @@ import kcons.constraints as families
 from kcons.arrays import numbers
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.host import Watch, require_on_surface
+from kcons.ase.topology import bonds_of
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.certificate import CHECK_EVERY
 from kcons.constraint_set import ConstraintSet
@@ -378,15 +379,19 @@ class Constraints(FixConstraint):
     def restore(self, atoms: Atoms) -> None:
         """Move atoms that are off the constraints onto them, and project their momenta if they have any.
 
-        The nearest point in the mass metric; for starts and edited structures, not for time steps.
+        Near starts go to the nearest point in the mass metric. Where that would change other bonds or angles, and for
+        far targets, groups move as rigid pieces: see `Motion.restore_positions`. Bonds are those in
+        ``atoms.info['bonds']``, otherwise they are guessed from covalent radii. For starts and edited structures, not
+        for time steps.
 
         Raises
         ------
         InfeasibleError
-            If there is no way to fulfil the constraints from here; nothing is changed.
+            If there is no way to fulfil the constraints from here with other bonds and angles as they are; nothing is
+            changed.
         """
         bound = self._bound(atoms)
-        x = bound.motion.restore_positions(atoms.arrays["positions"])
+        x = bound.motion.restore_positions(atoms.arrays["positions"], bonds=lambda: bonds_of(atoms))
         momenta = None
         if "momenta" in atoms.arrays:
             momenta = bound.motion.project_forces(x, atoms.arrays["momenta"])
@@ -418,8 +423,8 @@ def constrain(
     constraints : sequence of Constraint
         Targets left open are taken from the positions.
     project : bool
-        Whether to move atoms that are off their explicit targets onto them (the nearest point in the mass
-        metric) instead of raising.
+        Whether to move atoms that are off their explicit targets onto them instead of raising; see
+        `Constraints.restore`.
     degenerate : {'convert', 'raise'}
         See `Constraints`.
 

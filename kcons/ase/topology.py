@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
+from kcons.guessed_bonds import guess_bonds
 from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
 from kcons.topology import (
     MASSES,
@@ -25,7 +26,7 @@ from kcons.topology import (
     split_residues,
 )
 
-__all__ = ["atoms_of", "constraints_of", "mend_elements", "snapshot_of"]
+__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "snapshot_of"]
 
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
@@ -123,9 +124,7 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
         residue_names, ids, chains = np.array([""] * min(n, 1)), np.array(["1"] * min(n, 1)), np.array([""] * min(n, 1))
     if known and "atomtypes" in arrays:
         elements, masses = _mended(elements, masses, names, residues, residue_names, "masses" in arrays)
-    bonds = np.asarray(atoms.info.get(BONDS, np.zeros((0, 2))), dtype=np.int64).reshape(-1, 2)
-    if bonds.size and (bonds.min() < 0 or bonds.max() >= n):
-        raise InputError(f"atoms.info['bonds'] names atoms beyond 0 to {n - 1}", item="bonds")
+    bonds = _given_bonds(atoms)
     charges = atoms.get_initial_charges() if "initial_charges" in arrays else None
     topology = Topology(
         names,
@@ -142,6 +141,35 @@ def snapshot_of(atoms: Atoms) -> Snapshot:
     cell = atoms.cell.array.copy() if atoms.pbc.any() else None
     velocities = atoms.get_velocities() * PS if "momenta" in arrays else None
     return Snapshot(topology, atoms.positions.copy(), 1.0, cell, atoms.pbc.copy(), velocities, "Atoms object")
+
+
+def bonds_of(atoms: Atoms) -> IntArray:
+    """Bonds of `atoms`: the pairs in ``atoms.info['bonds']``, otherwise guessed, shape (n, 2).
+
+    Atoms of elements that form no covalent bonds, and those whose position is not finite, have none.
+
+    Raises
+    ------
+    InputError
+        Bonds that name atoms which do not exist; two atoms on top of each other.
+    """
+    given = _given_bonds(atoms)
+    if len(given):
+        return given
+    if not atoms.numbers.any():
+        return given
+    finite = np.flatnonzero(np.isfinite(atoms.positions).all(axis=1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        snapshot = snapshot_of(atoms)
+    return finite[guess_bonds(snapshot.subset(finite))]
+
+
+def _given_bonds(atoms: Atoms) -> IntArray:
+    bonds = np.asarray(atoms.info.get(BONDS, np.zeros((0, 2))), dtype=np.int64).reshape(-1, 2)
+    if bonds.size and (bonds.min() < 0 or bonds.max() >= len(atoms)):
+        raise InputError(f"atoms.info['bonds'] names atoms beyond 0 to {len(atoms) - 1}", item="bonds")
+    return bonds
 
 
 def mend_elements(atoms: Atoms) -> int:

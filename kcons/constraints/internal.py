@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import dot, first_true, norm
+from kcons.constraints.vectors import cross, dot, first_true, norm
 from kcons.errors import InputError, SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
@@ -60,7 +60,7 @@ class Distance(Constraint):
         w = v[:, 0] - v[:, 1]
         q = norm(d)
         # |u x w|^2 has no cancellation, unlike |w|^2 - (u.w)^2.
-        across = np.cross(d / q[:, None], w)
+        across = cross(d / q[:, None], w)
         return dot(across, across) / q
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
@@ -119,12 +119,12 @@ class Angle(Constraint):
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-        return np.arctan2(norm(np.cross(u, w)), dot(u, w))
+        return np.arctan2(norm(cross(u, w)), dot(u, w))
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         u, w, normal, _ = _arms(r)
-        first = np.cross(u, normal) / dot(u, u)[:, None]
-        last = np.cross(normal, w) / dot(w, w)[:, None]
+        first = cross(u, normal) / dot(u, u)[:, None]
+        last = cross(normal, w) / dot(w, w)[:, None]
         return np.stack([first, -first - last, last], axis=1)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
@@ -132,7 +132,7 @@ class Angle(Constraint):
         uu, ww = dot(u, u), dot(w, w)
         lu, lw = np.sqrt(uu), np.sqrt(ww)
         du, dw = v[:, 0] - v[:, 1], v[:, 2] - v[:, 1]
-        a, b = dot(np.cross(u, n), du) / uu, dot(np.cross(n, w), dw) / ww
+        a, b = dot(cross(u, n), du) / uu, dot(cross(n, w), dw) / ww
         alpha, beta = dot(n, du) / lu, dot(n, dw) / lw
         cosine = dot(u, w) / (lu * lw)
         in_plane = -2 * (a * dot(u, du) / uu + b * dot(w, dw) / ww)
@@ -213,12 +213,12 @@ class Dihedral(Constraint):
 
     def measure(self, r: FloatArray, time: float) -> FloatArray:
         F, G, H = _legs(r)
-        P, Q = np.cross(F, G), np.cross(H, G)
-        return np.arctan2(dot(np.cross(Q, P), G) / norm(G), dot(P, Q))
+        P, Q = cross(F, G), cross(H, G)
+        return np.arctan2(dot(cross(Q, P), G) / norm(G), dot(P, Q))
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         F, G, H = _legs(r)
-        P, Q = np.cross(F, G), np.cross(H, G)
+        P, Q = cross(F, G), cross(H, G)
         g = norm(G)
         p, s = P / dot(P, P)[:, None], Q / dot(Q, Q)[:, None]
         along_f = -g[:, None] * p
@@ -229,8 +229,8 @@ class Dihedral(Constraint):
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         F, G, H = _legs(r)
         dF, dG, dH = _legs(v)
-        P, Q = np.cross(F, G), np.cross(H, G)
-        dP, dQ = np.cross(dF, G) + np.cross(F, dG), np.cross(dH, G) + np.cross(H, dG)
+        P, Q = cross(F, G), cross(H, G)
+        dP, dQ = cross(dF, G) + cross(F, dG), cross(dH, G) + cross(H, dG)
         g = norm(G)
         dg = dot(G, dG) / g
         p, dp = _over_square(P, dP)
@@ -251,7 +251,7 @@ class Dihedral(Constraint):
         _refuse_coincident(self, r, first_row)
         F, G, H = _legs(r)
         for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
-            k = first_true(norm(np.cross(first, second)) < COLLINEAR * norm(first) * norm(second))
+            k = first_true(norm(cross(first, second)) < COLLINEAR * norm(first) * norm(second))
             if k is not None:
                 i, j, m = self.atoms[k, three]
                 raise SingularGeometryError(
@@ -265,7 +265,7 @@ class Dihedral(Constraint):
 def _arms(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Arms of an angle, unit normal of their plane, and the sine of the angle."""
     u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
-    normal = np.cross(u, w)
+    normal = cross(u, w)
     area = norm(normal)
     return u, w, normal / area[:, None], area / (norm(u) * norm(w))
 

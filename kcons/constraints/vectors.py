@@ -18,6 +18,13 @@ def norm(a: FloatArray) -> FloatArray:
     return np.sqrt(dot(a, a))
 
 
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The same numbers as `numpy.cross`, several times faster for few vectors."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def first_true(bad: NDArray[np.bool_]) -> int | None:
     """First True entry, or None."""
     return int(np.argmax(bad)) if bad.any() else None

@@ -32,6 +32,7 @@ from kcons.openmm.callbacks import (
 )
 from kcons.openmm.program import Program
 from kcons.openmm.requirements import (
+    bonds_of,
     free_groups,
     masses_of,
     nanometers,
@@ -301,7 +302,9 @@ class CarriedConstraints:
             )
 
     def apply_positions(self, context: openmm.Context) -> None:
-        """Bring positions onto the rows: the nearest point in the mass metric. Velocities stay as they are.
+        """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
+
+        Bonds are those of the System's forces and constraints; see `Motion.restore_positions`.
 
         Raises
         ------
@@ -309,7 +312,8 @@ class CarriedConstraints:
             As `Motion.restore_positions`; nothing was changed.
         """
         x, _, time = self._state(context)
-        context.setPositions(self.motion.restore_positions(x, time=time))
+        bonds = bonds_of(context.getSystem())
+        context.setPositions(self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None))
         context.computeVirtualSites()
 
     def apply_velocities(self, context: openmm.Context) -> None:

@@ -115,3 +115,12 @@ def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
         if apart.any():
             return int(start + np.argmax(apart))
     return None
+
+
+def bonds_of(system: openmm.System) -> IntArray:
+    """Pairs of particles that harmonic bonds or constraints of the System join, shape (n, 2)."""
+    pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
+    for force in system.getForces():
+        if isinstance(force, openmm.HarmonicBondForce):
+            pairs += [force.getBondParameters(k)[:2] for k in range(force.getNumBonds())]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

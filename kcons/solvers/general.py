@@ -23,6 +23,8 @@ MAX_ITERATIONS = 50
 #: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
 SPEED_TOLERANCE = 1e-11
 _HALVINGS = 30
+#: So many steps towards the least squares without gain are their end.
+_STALLED = 10
 _EPS = float(np.finfo(float).eps)
 
 
@@ -247,6 +249,7 @@ class GeneralClusters:
         sigma = self._sigma(batch, state, time) * held
         error = _rms(sigma)
         damping = np.zeros(len(batch.rows))
+        before = np.full(len(batch.rows), np.inf)
         for iteration in range(1, 4 * MAX_ITERATIONS + 1):
             data = self._data(state, time)
             b = self._weighted(batch, data)
@@ -277,6 +280,11 @@ class GeneralClusters:
             damping = np.where(active, 0.1 * damping, damping)
             damping[damping < 1e-8] = 0.0
             sigma, error = trial, trial_error
+            if iteration % _STALLED == 0:
+                stalled = active & (error > (1 - 1e-8) * before)
+                if stalled.any():
+                    return _failed(batch, held & stalled[:, None], iteration, relative)
+                before = error
         return _failed(batch, held & ~settled[:, None], 4 * MAX_ITERATIONS, np.abs(sigma) / scale)
 
     # -- tangents -------------------------------------------------------------------------------

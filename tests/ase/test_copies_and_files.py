@@ -54,7 +54,7 @@ def sample() -> Atoms:
     rows = [
         Distance([[0, 1], [1, 2]], [1.5, 1.4]),
         Angle([0, 1, 2], 1.9),
-        Dihedral([3, 0, 1, 2], 1.1),
+        Dihedral([3, 2, 1, 0], 1.1),
         LinearCombination([4, 5], [[0, 0, 1], [0, 0, -1]]),
         FixedAtoms([8]),
     ]

@@ -1,0 +1,333 @@
+"""Bond lengths and angles of a structure, and whether they are still what they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints import Distance
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
+from kcons.errors import InfeasibleError
+from kcons.guessed_bonds import NEAREST, across, bonds_without_elements
+from kcons.images import minimum_image
+from kcons.pieces import Pieces
+from kcons.topology import BoolArray, bond_angles, connected, sorted_pairs
+
+#: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
+BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)
+#: Displacements below this part of the distance to the nearest neighbour leave bonds and angles as they are.
+STILL = 3e-3
+#: Rows off by more than this (radian, or part of the length) are far.
+FAR = 0.25
+#: Rows off by no more than this are fulfilled as far as motions are concerned.
+OFF = 1e-9
+#: Rows that hold what bonds and angles are made of.
+_INTERNAL = ("Distance", "Angle", "Dihedral", "CenterDistance")
+#: Gives the bonds of a system, shape (n, 2).
+Bonds = Callable[[], IntArray]
+#: Bonds and angles that are examined for being held by the rows, and rows of a cluster up to which they are.
+_MOST_EXAMINED, _MOST_ROWS = 200, 600
+
+
+def shortest_image(held: ConstraintSet, d: FloatArray) -> FloatArray:
+    """Vectors of bonds, which are short: their shortest images."""
+    return d if held.lattice is None else minimum_image(d, held.lattice)
+
+
+def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | None) -> IntArray:
+    """What counts as a bond, shape (n, 2).
+
+    Those that are given and the distances that rows hold, unless they are longer than atoms in one molecule are bonded
+    (the third side of a rigid triangle, the ends of a chain). Without given ones, also what the distances suggest
+    between atoms that held distances do not join.
+    """
+    tables = [item.atoms for item in held.constraints if item.family == "Distance"]
+    rows = np.sort(np.concatenate([*tables, np.zeros((0, 2), np.int64)]), axis=1)
+    targets = [item.target_at(time) for item in held.constraints if item.family == "Distance"]
+    sure = given
+    if sure is None:
+        sure = bonds_without_elements(x, held.lattice, held.touched, held.masses > 0)
+        fragment, _ = connected(rows, held.n_atoms)
+        sure = sure[fragment[sure[:, 0]] != fragment[sure[:, 1]]]
+    pairs, first = np.unique(np.concatenate([np.sort(sure, axis=1), rows]), axis=0, return_index=True)
+    length = np.linalg.norm(shortest_image(held, x[pairs[:, 0]] - x[pairs[:, 1]]), axis=1)
+    # What is to become longer was a bond, and what is to become shorter will be one.
+    order = {tuple(pair): n for n, pair in enumerate(pairs.tolist())}
+    place = np.array([order[tuple(pair)] for pair in rows.tolist()], dtype=np.int64)
+    np.minimum.at(length, place, np.concatenate([*targets, np.zeros(0)]))
+    kept = ~across(pairs, length)
+    shortest = np.full(held.n_atoms, np.inf)
+    for side in (0, 1):
+        np.minimum.at(shortest, pairs[kept, side], length[kept])
+    kept &= (first < len(sure)) | (length < NEAREST * np.sqrt(shortest[pairs[:, 0]] * shortest[pairs[:, 1]]))
+    return pairs[kept]
+
+
+class Geometry:
+    """The start of a restoration: its bonds and angles, how far its rows are off, and what may not change.
+
+    Parameters
+    ----------
+    held : ConstraintSet
+    labels : ndarray of int, shape (n_rows,)
+        Cluster of each row, -1 where it has none.
+    start : ndarray, shape (n_atoms, 3)
+    time : float
+    bonds : callable or None
+        Gives pairs of atoms, shape (n, 2); asked only where they are needed. See `bonds_of`.
+
+    Attributes
+    ----------
+    misfit : ndarray, shape (n_rows,)
+        |sigma| at the start, in units of the scale of each row.
+    usable : bool
+        Whether the atoms that rows touch have finite positions.
+    pinned : ndarray of bool, shape (n_atoms,)
+        Fixed atoms.
+    """
+
+    def __init__(
+        self, held: ConstraintSet, labels: IntArray, start: FloatArray, time: float, bonds: Bonds | None
+    ) -> None:
+        self.held, self.labels, self.start, self.time, self._bonds = held, labels, start, time, bonds
+        # Particles without mass are sites or walls: whoever places them does so, not a bond.
+        self.pinned = np.equal(held.masses, 0.0)
+        for item in held.constraints:
+            if item.family == "FixedAtoms":
+                self.pinned[item.atoms.ravel()] = True
+        with np.errstate(all="ignore"):
+            self.misfit = np.abs(held.value(start, time)) / held.scale
+        self.usable = bool(np.isfinite(start[held.touched]).all())
+        self._spans: dict[tuple[int, ...], tuple[FloatArray, dict[int, int]]] = {}
+
+    @cached_property
+    def _given(self) -> IntArray | None:
+        return None if self._bonds is None else self._bonds()
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        bonds = bonds_of(self.held, self.start, self.time, self._given)
+        return Pieces(self.held.n_atoms, bonds, self.held.touched)
+
+    def far(self) -> bool:
+        """Whether a row of lengths or angles is far off."""
+        return self.usable and any(
+            bool(np.any(miss > FAR)) for item, miss in self._off_rows() if item.translation_invariant
+        )
+
+    def _off_rows(self) -> list[tuple[Constraint, FloatArray]]:
+        """Constraints and by how much their rows are off."""
+        held = self.held
+        return [
+            (item, self.misfit[first : first + item.n_rows])
+            for item, first in zip(held.constraints, held.starts, strict=False)
+            if item.holonomic
+        ]
+
+    @cached_property
+    def turned(self) -> bool:
+        """Whether bonds are given, or something else than bonds is off: then all angles are to be what they were."""
+        if self._given is not None:
+            return True
+        for item, miss in self._off_rows():
+            off = item.atoms[miss > OFF]
+            if item.family in ("Angle", "Dihedral", "CenterDistance") and len(off):
+                return True
+            if item.family == "Distance" and not all(self.pieces.bonded(i, k) for i, k in off.tolist()):
+                return True
+        return False
+
+    @cached_property
+    def checked(self) -> bool:
+        """Whether bonds and angles are to be as they were.
+
+        Those that are not given only where the start is a structure: no rows but those of lengths and angles are off,
+        and of several distances that are held not most are far off.
+        """
+        if self._given is not None:
+            return len(self._given) > 0
+        lengths = self._held_lengths[1]
+        if len(lengths) > 1 and np.sum(lengths > FAR) > 0.5 * len(lengths):
+            return False
+        return all(item.family in _INTERNAL or not np.any(miss > OFF) for item, miss in self._off_rows())
+
+    def changed(self, x: FloatArray, *, strict: bool) -> InfeasibleError | None:
+        """What to raise if a bond or an angle that no row holds has changed.
+
+        Unless `strict`, angles between bonds that rows hold may change as much as the bonds around them were off.
+        """
+        held, start = self.held, self.start
+        self._spans.clear()
+        move = np.linalg.norm(x - start, axis=1)
+        if not np.any(move > 0) or not np.isfinite(start[move > 0]).all():
+            return None
+        if float(move.max()) <= STILL * _closest(start, move > 0) or not self.checked:
+            return None
+        bonds = self.pieces.bonds
+        angles = bond_angles(bonds, held.n_atoms)
+        length, before = self._lengths(x, bonds), self._lengths(start, bonds)
+        slack = BOND_KEPT * before
+        held_off = self._held_lengths
+        table = {pair: miss for pair, miss in zip(map(tuple, held_off[0].tolist()), held_off[1].tolist(), strict=True)}
+        free = np.array([tuple(pair) not in table for pair in bonds.tolist()], dtype=bool)
+        wrong = free & ~(np.abs(length - before) <= slack)
+        turn, angle_before = self._angles(x, angles), self._angles(start, angles)
+        bent = np.abs(turn - angle_before)
+        suspects = np.flatnonzero(~(bent <= ANGLE_KEPT))
+        legs = self._moved_legs
+        around = np.zeros(held.n_atoms)
+        for side in (0, 1):
+            np.add.at(around, held_off[0][:, side], held_off[1])
+        odd = []
+        for number in suspects.tolist():
+            i, j, k = angles[number].tolist()
+            loose = not strict and (min(i, j), max(i, j)) in table and (min(j, k), max(j, k)) in table
+            noise = 2.0 * float(np.sum(around[[i, j, k]])) if loose else 0.0
+            if bent[number] > max(ANGLE_KEPT, noise) and not {(j, i), (j, k)} & legs:
+                odd.append(number)
+        worst: list[tuple[float, IntArray, str]] = [
+            (abs(length[n] - before[n]) / slack[n], bonds[n], f"from {before[n]:.4g} to {length[n]:.4g}")
+            for n in np.flatnonzero(wrong).tolist()
+        ] + [
+            (
+                bent[n] / ANGLE_KEPT,
+                angles[n],
+                f"from {np.degrees(angle_before[n]):.4g} to {np.degrees(turn[n]):.4g} degrees",
+            )
+            for n in odd
+        ]
+        worst.sort(key=lambda entry: -entry[0])
+        if len(worst) <= _MOST_EXAMINED:
+            worst = [entry for entry in worst if not self._follows(x, entry[1])]
+        if not worst:
+            return None
+        _, atoms, words = worst[0]
+        row = int(np.argmax(np.where(np.isfinite(self.misfit), self.misfit, np.inf)))
+        what = ("the bond " if len(atoms) == 2 else "the angle ") + "-".join(str(a) for a in atoms)
+        return InfeasibleError(
+            f"row {held.row_name(row)} was reached only with {what} changed {words}, which no row asks for. Start "
+            "nearer to the target, check the bonds, or hold what may change; with bonds=[] nothing but the rows is "
+            "looked at",
+            residual=float(self.misfit[row]),
+            row=row,
+            atoms=held.row_atoms(row),
+        )
+
+    def ties(self) -> tuple[ConstraintSet, FloatArray]:
+        """Lengths of bonds and distances across angles as at the start, and weights in which 1 is what may change."""
+        bonds, angles = self.pieces.bonds, bond_angles(self.pieces.bonds, self.held.n_atoms)
+        legs = self._moved_legs
+        kept = [not {(j, i), (j, k)} & legs for i, j, k in angles.tolist()]
+        ends = sorted_pairs(angles[np.array(kept, dtype=bool)][:, [0, 2]])
+        lengths, across = self._lengths(self.start, bonds), self._lengths(self.start, ends)
+        held = {tuple(pair) for pair in self._held_lengths[0].tolist()}
+        weights = np.concatenate([1.0 / (BOND_KEPT * lengths), 1.0 / (ANGLE_KEPT * across)])
+        weights[[tuple(pair) in held for pair in [*bonds.tolist(), *ends.tolist()]]] = 0.0
+        rows = [Distance(bonds, lengths), Distance(ends, across)]
+        return self.held.replaced(rows, self.start, self.time), weights
+
+    def placed(self) -> FloatArray:
+        """The start with fixed atoms in their places; a new array."""
+        x = self.start.copy()
+        for item in self.held.constraints:
+            if item.family == "FixedAtoms":
+                x[item.atoms[::3, 0]] = item.target_at(self.time).reshape(-1, 3)
+        return x
+
+    @cached_property
+    def _held_lengths(self) -> tuple[IntArray, FloatArray]:
+        """Pairs whose distance a row holds, i < j, and by which part of it they were off."""
+        pairs, miss = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
+            if item.family == "Distance":
+                pairs.append(np.sort(item.atoms, axis=1))
+                miss.append(self.misfit[first : first + item.n_rows])
+        return np.concatenate(pairs), np.concatenate(miss)
+
+    @cached_property
+    def _moved_legs(self) -> set[tuple[int, int]]:
+        """(vertex, end) of the legs of angles that were off: other angles with such a leg change with them."""
+        legs: set[tuple[int, int]] = set()
+        for item, first in zip(self.held.constraints, self.held.starts, strict=False):
+            off = np.flatnonzero(self.misfit[first : first + item.n_rows] > 1e-6)
+            if item.family == "Angle":
+                for i, j, k in item.atoms[off].tolist():
+                    legs |= {(j, i), (j, k)}
+            elif item.family == "Distance":
+                for i, k in item.atoms[off].tolist():
+                    for j in self.between(i, k):
+                        legs |= {(j, i), (j, k)}
+        return legs
+
+    def between(self, i: int, k: int) -> list[int]:
+        """Atoms bonded to both of two that are not bonded to each other."""
+        if self.pieces.bonded(i, k):
+            return []
+        return np.intersect1d(self.pieces.neighbours(i), self.pieces.neighbours(k)).tolist()
+
+    def _lengths(self, x: FloatArray, pairs: IntArray) -> FloatArray:
+        return np.linalg.norm(shortest_image(self.held, x[pairs[:, 1]] - x[pairs[:, 0]]), axis=1)
+
+    def _angles(self, x: FloatArray, triples: IntArray) -> FloatArray:
+        u = shortest_image(self.held, x[triples[:, 0]] - x[triples[:, 1]])
+        w = shortest_image(self.held, x[triples[:, 2]] - x[triples[:, 1]])
+        return np.arctan2(np.linalg.norm(cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
+
+    def _follows(self, x: FloatArray, atoms: IntArray) -> bool:
+        """Whether the rows hold a bond or an angle: its gradient lies in the span of theirs."""
+        centre = x[atoms[1]]
+        arms = [shortest_image(self.held, x[a] - centre) for a in atoms[[0, -1]]]
+        gradient = np.zeros((len(atoms), 3))
+        if len(atoms) == 2:
+            gradient[0] = arms[0]
+        else:
+            # That of the cosine: the angle's own is undefined where it is straight.
+            u, w = arms
+            lu, lw = np.linalg.norm(u), np.linalg.norm(w)
+            cosine = u @ w / (lu * lw)
+            gradient[0], gradient[2] = (w / lw - cosine * u / lu) / lu, (u / lu - cosine * w / lw) / lw
+        gradient[1] = -gradient.sum(axis=0)
+        size = float(np.linalg.norm(gradient))
+        basis, place = self._span(x, atoms)
+        if not size > 0 or any(int(a) not in place for a in atoms):
+            return False
+        target = np.zeros((basis.shape[1] // 3, 3))
+        target[[place[int(a)] for a in atoms]] = gradient / size
+        flat = target.ravel()
+        return bool(np.linalg.norm(flat - basis.T @ (basis @ flat)) < 1e-6)
+
+    def _span(self, x: FloatArray, atoms: IntArray) -> tuple[FloatArray, dict[int, int]]:
+        """An orthonormal basis of the gradients of the rows around some atoms, and where their atoms stand in it."""
+        incidence, labels = self.held.incidence, self.labels
+        touching = np.unique(incidence.T.tocsr()[atoms].indices)
+        clusters = np.unique(labels[touching])
+        key = tuple(clusters.tolist())
+        if key not in self._spans:
+            rows = np.union1d(touching[labels[touching] < 0], np.flatnonzero(np.isin(labels, clusters[clusters >= 0])))
+            used = np.unique(incidence[rows].indices)
+            columns = (3 * used[:, None] + np.arange(3)).ravel()
+            basis = np.zeros((0, len(columns)))
+            if 0 < len(rows) <= _MOST_ROWS:
+                table = sp.csr_array(self.held.jacobian(x, self.time))[rows][:, columns].toarray()
+                size = np.linalg.norm(table, axis=1, keepdims=True)
+                _, weight, basis = np.linalg.svd(table / np.where(size > 0, size, 1.0), full_matrices=False)
+                basis = basis[weight > 1e-8 * weight.max()]
+            self._spans[key] = basis, {int(a): n for n, a in enumerate(used.tolist())}
+        return self._spans[key]
+
+
+def _closest(x: FloatArray, chosen: BoolArray) -> float:
+    """The least distance of some atoms to their nearest neighbours."""
+    from scipy.spatial import cKDTree
+
+    if len(x) < 2:
+        return np.inf
+    good = np.isfinite(x).all(axis=1)
+    asked = x[np.logical_and(chosen, good)]
+    return float(cKDTree(x[good]).query(asked, k=2)[0][:, 1].min(initial=np.inf))

@@ -1,0 +1,247 @@
+"""Molecules as rigid pieces: what turns about a bond, or shifts along it, as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
+from kcons.topology import connected, sorted_pairs
+
+#: Origin and unit axis of a motion at given positions; None where they are undefined.
+Frame = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
+
+
+class Pieces:
+    """The bonds of the molecules to which some atoms belong, and what is left where one of them is cut.
+
+    Parameters
+    ----------
+    n_atoms : int
+    bonds : ndarray of int, shape (n, 2)
+    atoms : ndarray of int
+        Molecules with none of these are left out.
+
+    Attributes
+    ----------
+    bonds : ndarray of int, shape (n, 2)
+        Those of the molecules that are kept; i < j, sorted.
+    atoms : ndarray of int
+        All atoms of these molecules, molecule by molecule, each depth first: what lies beyond a bond is a stretch.
+    molecules : list of ndarray of int
+    """
+
+    def __init__(self, n_atoms: int, bonds: IntArray, atoms: IntArray) -> None:
+        pairs = sorted_pairs(bonds)
+        label, _ = connected(pairs, n_atoms)
+        chosen = np.zeros(n_atoms, dtype=bool)
+        chosen[atoms] = True
+        kept = np.zeros(n_atoms, dtype=bool)
+        kept[np.isin(label, label[atoms])] = True
+        self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
+        both = np.concatenate([self.bonds, self.bonds[:, ::-1]])
+        both = both[np.lexsort((both[:, 1], both[:, 0]))]
+        degree = np.bincount(both[:, 0], minlength=n_atoms)
+        self._ends, self._starts = both[:, 1], np.concatenate([[0], np.cumsum(degree)])
+        self.label = label
+        self._walk(np.flatnonzero(kept))
+
+    def neighbours(self, atom: int) -> IntArray:
+        """Atoms bonded to one."""
+        return self._ends[self._starts[atom] : self._starts[atom + 1]]
+
+    def _walk(self, kept: IntArray) -> None:
+        """Depth first through every molecule; a bond is a bridge if nothing beyond it leads back past it."""
+        ends, starts = self._ends.tolist(), self._starts.tolist()
+        self._begin: dict[int, int] = {}
+        self._end: dict[int, int] = {}
+        self._parent: dict[int, int] = {}
+        self._bridge: set[int] = set()  # the far atom of each
+        begin, parent = self._begin, self._parent
+        low: dict[int, int] = {}
+        order: list[int] = []
+        self.molecules: list[IntArray] = []
+        for root in kept.tolist():
+            if root in begin:
+                continue
+            first = len(order)
+            begin[root] = low[root] = first
+            parent[root] = -1
+            order.append(root)
+            stack = [(root, starts[root])]
+            while stack:
+                here, slot = stack[-1]
+                if slot < starts[here + 1]:
+                    stack[-1] = (here, slot + 1)
+                    there = ends[slot]
+                    if there not in begin:
+                        begin[there] = low[there] = len(order)
+                        parent[there] = here
+                        order.append(there)
+                        stack.append((there, starts[there]))
+                    elif there != parent[here]:
+                        low[here] = min(low[here], begin[there])
+                else:
+                    stack.pop()
+                    self._end[here] = len(order)
+                    above = parent[here]
+                    if above >= 0:
+                        low[above] = min(low[above], low[here])
+                        if low[here] > begin[above]:
+                            self._bridge.add(here)
+            self.molecules.append(np.array(order[first:], dtype=np.int64))
+        self.atoms = np.array(order, dtype=np.int64)
+
+    def molecule(self, atom: int) -> IntArray:
+        """All atoms of the molecule of one of `atoms`."""
+        root = atom
+        while self._parent[root] >= 0:
+            root = self._parent[root]
+        return self.atoms[self._begin[root] : self._end[root]]
+
+    def bridges(self) -> list[tuple[int, int]]:
+        """Bonds that are in no ring."""
+        return [(self._parent[k], k) for k in self.atoms.tolist() if k in self._bridge]
+
+    def bonded(self, j: int, k: int) -> bool:
+        """Whether two atoms are."""
+        return bool(np.any(self.neighbours(j) == k))
+
+    def beyond(self, j: int, k: int) -> IntArray | None:
+        """Atoms on the side of k when the bond j-k is cut; None if there is no bond, or one in a ring."""
+        if self._parent[k] == j and k in self._bridge:
+            return self.atoms[self._begin[k] : self._end[k]]
+        if self._parent[j] == k and j in self._bridge:
+            whole = self.molecule(j)
+            return np.setdiff1d(whole, self.atoms[self._begin[j] : self._end[j]], assume_unique=True)
+        return None
+
+    def whole(self, x: FloatArray, minimum_image: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Positions with every molecule in one piece: each atom in the image next to the one it was reached from."""
+        y = x.copy()
+        for k in self.atoms.tolist():
+            j = self._parent[k]
+            if j >= 0:
+                y[k] = y[j] + minimum_image(x[k] - y[j])
+        return y
+
+
+@dataclass(frozen=True)
+class Move:
+    """A rigid motion of some atoms with one parameter.
+
+    Attributes
+    ----------
+    atoms : ndarray of int
+        What moves.
+    frame : callable
+        Origin and unit axis at given positions.
+    turns : bool
+        Whether it turns about the axis (right-handed), or shifts along it.
+    share : ndarray, shape (len(atoms), 1), or float
+        How far each atom shifts, in units of the parameter.
+    """
+
+    atoms: IntArray
+    frame: Frame
+    turns: bool
+    share: FloatArray | float = 1.0
+
+    def field(self, x: FloatArray) -> FloatArray:
+        """Displacement of `atoms` a unit of the parameter, shape (len(atoms), 3)."""
+        placed = self.frame(x)
+        if placed is None:
+            return np.zeros((len(self.atoms), 3))
+        origin, axis = placed
+        if self.turns:
+            return cross(axis, x[self.atoms] - origin)
+        return self.share * np.broadcast_to(axis, (len(self.atoms), 3))
+
+    def make(self, x: FloatArray, amount: float) -> bool:
+        """Move the atoms in place; False if there is no axis here."""
+        placed = self.frame(x)
+        if placed is None:
+            return False
+        origin, axis = placed
+        if not self.turns:
+            x[self.atoms] += amount * (self.share * axis)
+            return True
+        arm = x[self.atoms] - origin
+        along = (arm @ axis)[:, None] * axis
+        across = arm - along
+        # In this form small turns lose nothing: 1 - cos is taken from the half angle.
+        x[self.atoms] += np.sin(amount) * cross(axis, arm) - 2 * np.sin(amount / 2) ** 2 * across
+        return True
+
+
+def torsion(atoms: IntArray, j: int, k: int) -> Move:
+    """Turn about the line from j to k: with the last atom of a dihedral among `atoms`, it grows by the amount."""
+
+    def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        return _line(x[j], x[k])
+
+    return Move(atoms, frame, True)
+
+
+def bend(atoms: IntArray, i: int, j: int, k: int) -> Move:
+    """Turn about j in the plane of i, j, k: with k among `atoms`, the angle i-j-k grows by the amount."""
+
+    def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        u, w = x[i] - x[j], x[k] - x[j]
+        normal = cross(u, w)
+        size = float(np.linalg.norm(normal))
+        if size > 1e-9 * float(np.linalg.norm(u) * np.linalg.norm(w)):
+            return x[j], normal / size
+        # Straight: any plane does.
+        normal = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
+        size = float(np.linalg.norm(normal))
+        return (x[j], normal / size) if size > 0 else None
+
+    return Move(atoms, frame, True)
+
+
+def stretch(atoms: IntArray, others: IntArray, masses: FloatArray, axis: Callable[[FloatArray], FloatArray]) -> Move:
+    """Shift one piece along an axis and the other against it, their common centre at rest.
+
+    Parameters
+    ----------
+    atoms, others : ndarray of int
+        The pieces; one without atoms means that the other one moves alone.
+    masses : ndarray, shape (n_atoms,)
+    axis : callable
+        Points from `others` to `atoms`, any length.
+    """
+    a, b = float(masses[atoms].sum()), float(masses[others].sum())
+    part = (b / (a + b) if a + b > 0 else 0.5) if len(atoms) and len(others) else float(len(atoms) > 0)
+    share = np.concatenate([np.full(len(atoms), part), np.full(len(others), part - 1.0)])[:, None]
+
+    def frame(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        return _line(np.zeros(3), axis(x))
+
+    return Move(np.concatenate([atoms, others]), frame, False, share)
+
+
+def free_motions(atoms: IntArray, pinned: IntArray) -> list[Move]:
+    """Shifts and turns of a whole molecule; about its fixed atom if it has one, none if it has more."""
+    if len(pinned) > 1:
+        return []
+    moves = []
+    for axis in np.eye(3):
+
+        def frame(x: FloatArray, axis: FloatArray = axis) -> tuple[FloatArray, FloatArray]:
+            return (x[pinned[0]] if len(pinned) else x[atoms].mean(axis=0)), axis
+
+        if len(atoms) > 1:
+            moves.append(Move(atoms, frame, True))
+        if not len(pinned):
+            moves.append(Move(atoms, frame, False))
+    return moves
+
+
+def _line(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    size = float(np.linalg.norm(b - a))
+    return (a, (b - a) / size) if size > 0 else None

@@ -1,0 +1,483 @@
+"""Structures brought to a target: groups turn and shift as rigid pieces, bond lengths and angles stay as they were.
+
+The point on the constraints that is nearest in the mass metric moves only the atoms that rows name, and for a far
+target wrecks the bonds around them. So where rows are far off, or the nearest point changes other bonds or angles,
+
+1. every row with a motion of its own makes it: a dihedral turns what lies beyond its bond, an angle turns what lies
+   beyond one of its legs, a bond shifts what lies beyond it, a distance between molecules shifts one of them;
+2. rows that are still off are reached by turns about all bonds between their atoms and by motions of whole molecules,
+   with damped Newton steps;
+3. where this does not do, in rings and between fixed atoms, all atoms of the molecules give way together, by least
+   squares of what changes in bonds and angles;
+4. what is left, mostly rounding, is done by the search for the nearest point.
+
+Of the two sides of a bond the lighter one moves, or the one without fixed atoms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import scipy.sparse as sp
+
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.constraints.vectors import cross
+from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
+from kcons.kept_geometry import OFF, Bonds, Geometry, shortest_image
+from kcons.pieces import Move, bend, free_motions, stretch, torsion
+from kcons.plan import Plan
+
+#: What pieces may leave to the search for the nearest point, in the same unit.
+NEAR = 0.25
+#: Rounds in which every row makes its own motion, and how many motions there may be in all.
+SWEEPS, MOST_MOVES = 40, 15_000
+#: Rows and motions beyond which no Newton steps among them are tried; steps, and starts from turned bonds.
+MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
+#: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and atoms up to
+#: which this is tried.
+EASING, HEAVY, MOST_EASED = 60, 1e4, 2000
+#: Largest turn of one step, in radian.
+_LONGEST_TURN = 0.5
+
+
+def restored(
+    held: ConstraintSet,
+    plan: Plan,
+    x: FloatArray,
+    time: float,
+    bonds: Bonds | None,
+    nearest: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Positions on all rows with other bond lengths and angles as in `x`; a new array.
+
+    Parameters
+    ----------
+    held : ConstraintSet
+    plan : Plan
+        That of `held`, or of its rows on the atoms they touch.
+    x : ndarray, shape (n_atoms, 3)
+    time : float
+    bonds : callable or None
+        Gives the bonds, shape (n, 2). None: see `kcons.kept_geometry.bonds_of`. Where it gives none, other lengths and
+        angles may change.
+    nearest : callable
+        Gives the nearest point on the rows, or raises.
+
+    Raises
+    ------
+    InfeasibleError
+        Such positions were not found.
+    """
+    geometry = Geometry(held, plan.labels, x, time, bonds)
+    ways: list[Callable[[], FloatArray | None]] = [lambda: x, lambda: moved(geometry)]
+
+    if geometry.far() and len(geometry.pieces.bonds):
+        ways.reverse()
+    ways.append(lambda: eased(geometry))
+    error: KconsError | None = None
+    for way in ways:
+        begin = way()
+        if begin is None:
+            continue
+        try:
+            found = nearest(begin)
+        except (ConvergenceError, ImageError, SingularGeometryError) as failure:
+            error = error or failure
+            continue
+        wrong = _off(held, plan, found, time)
+        if wrong is None:
+            wrong = geometry.changed(found, strict=geometry.turned)
+            if wrong is None:
+                return found
+        error = wrong
+    assert error is not None
+    raise error
+
+
+def _off(held: ConstraintSet, plan: Plan, x: FloatArray, time: float) -> ConvergenceError | None:
+    """What to raise if `x` is off a row by the set's own measure, the one that reports use."""
+    with np.errstate(all="ignore"):
+        miss = np.abs(held.value(x, time))
+        # Rows between fixed atoms are as good as the places given.
+        allowed = np.maximum(held.tolerance(x, time), np.where(plan.labels < 0, 1e-10 * held.scale, 0.0))
+    bad = ~(miss <= allowed)
+    if not bad.any():
+        return None
+    row = int(np.argmax(np.where(np.isfinite(miss), np.where(bad, miss / allowed, 0.0), np.inf)))
+    return InfeasibleError(
+        f"the positions that were found miss row {held.row_name(row)} by {miss[row]:.6g}; check its target against its "
+        "neighbours', or start nearer to a solution",
+        residual=float(miss[row] / held.scale[row]),
+        tolerance=float(allowed[row] / held.scale[row]),
+        row=row,
+        atoms=held.row_atoms(row),
+    )
+
+
+def moved(geometry: Geometry) -> FloatArray | None:
+    """The start with pieces moved as the rows ask; None if they cannot come near."""
+    if not geometry.usable or not np.isfinite(geometry.start[geometry.pieces.atoms]).all():
+        return None
+    return _Motions(geometry).moved()
+
+
+def eased(geometry: Geometry) -> FloatArray | None:
+    """The start with all atoms of its molecules moved, bonds and angles as near to theirs as the rows allow, or None.
+
+    Gauss-Newton steps on the rows, weighed heavily, and on changes of bonds and of the ends of angles, in units of
+    what may change.
+    """
+    held, time, start = geometry.held, geometry.time, geometry.start
+    if not geometry.checked or not geometry.usable or held.n_rows > MOST_ROWS:
+        return None
+    ties, weights = geometry.ties()
+    atoms = geometry.pieces.atoms
+    if not np.any(weights > 0) or len(atoms) > MOST_EASED or not np.isfinite(start[atoms]).all():
+        return None
+    atoms = atoms[~geometry.pinned[atoms]]
+    columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+    # Free motions cost nothing: they stay out by a weight far below that of any tie.
+    least = 1e-3 * float(weights[weights > 0].min()) ** 2
+    heavy = np.where(held.holonomic, HEAVY / held.scale, 0.0)
+    x = geometry.placed()
+    reach = 0.3 * float(ties.scale.min())
+    with np.errstate(all="ignore"):
+        for _ in range(EASING):
+            off = np.concatenate([heavy * held.value(x, time), weights * ties.value(x)])
+            rows = [sp.diags_array(heavy) @ held.jacobian(x, time), sp.diags_array(weights) @ ties.jacobian(x)]
+            table = sp.csr_array(sp.vstack(rows))[:, columns]
+            if not (np.isfinite(off).all() and np.isfinite(table.data).all()):
+                return None
+            normal = sp.csc_array(table.T @ table + least * sp.eye_array(len(columns)))
+            step = -_solve(normal, table.T @ off)
+            longest = float(np.abs(step).max())
+            x.reshape(-1)[columns] += step * min(1.0, reach / longest) if longest > 0 else 0.0
+            if not longest > 1e-9 * reach:
+                break
+        left = np.abs(held.value(x, time)) / held.scale
+    return x if np.all(left[held.holonomic] <= NEAR) else None
+
+
+def _solve(normal: sp.csc_array, right: FloatArray) -> FloatArray:
+    from scipy.sparse.linalg import splu  # slow to import, rarely needed
+
+    return np.asarray(splu(normal).solve(right))
+
+
+@dataclass(frozen=True)
+class _Own:
+    """A row with a motion of its own."""
+
+    row: int
+    part: ConstraintSet
+    atoms: IntArray
+    move: Move
+    #: (i, j, k) of a distance that is changed by the angle at j.
+    across: tuple[int, int, int] | None = None
+
+
+class _Motions:
+    """The motions of one restoration, made on positions with every molecule in one piece."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry, self.held, self.pieces = geometry, geometry.held, geometry.pieces
+        self.time, self.pinned = geometry.time, geometry.pinned
+        self._whole = self.pieces.whole(geometry.start, partial(shortest_image, self.held))
+        self._images = self._whole - geometry.start
+        self._left = MOST_MOVES
+
+    def moved(self) -> FloatArray | None:
+        """See the function of this name."""
+        held, y = self.held, self._whole.copy()
+        self._follow_fixed(y)
+        with np.errstate(all="ignore"):
+            if not self._sweep(y):
+                self._newton(y)
+            left = np.abs(held.value(y - self._images, self.time)) / held.scale
+        if not np.all(left[held.holonomic] <= NEAR):
+            return None
+        return y - self._images
+
+    def _follow_fixed(self, y: FloatArray) -> None:
+        """Molecules with fixed atoms that are placed elsewhere go along, in place."""
+        places = {
+            int(a): item.target_at(self.time)[3 * n : 3 * n + 3]
+            for item in self.held.constraints
+            if item.family == "FixedAtoms"
+            for n, a in enumerate(item.atoms[::3, 0])
+        }
+        for molecule in self.pieces.molecules:
+            fixed = molecule[self.pinned[molecule]]
+            if not len(fixed):
+                continue
+            target = np.array([places[int(a)] for a in fixed]) + self._images[fixed]
+            if np.array_equal(y[fixed], target):
+                continue
+            here, there = y[fixed].mean(axis=0), target.mean(axis=0)
+            u, _, vt = np.linalg.svd((y[fixed] - here).T @ (target - there))
+            turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+            if len(fixed) < 3:
+                turn = _turn_of_line(y[fixed] - here, target - there)
+            y[molecule] = (y[molecule] - here) @ turn + there
+            y[fixed] = target
+
+    def _side(self, j: int, k: int, moves: IntArray, stays: IntArray) -> IntArray | None:
+        """What lies beyond the bond j-k, if that contains all of one group, none of another, and no fixed atom."""
+        side = self.pieces.beyond(j, k)
+        return self._piece(side, moves, stays) if side is not None else None
+
+    def _apart(self, moves: IntArray, stays: IntArray) -> IntArray | None:
+        """The molecules of some atoms, if they have none of some others and no fixed atom."""
+        return self._piece(self._molecules(moves), moves, stays)
+
+    def _piece(self, atoms: IntArray, moves: IntArray, stays: IntArray) -> IntArray | None:
+        inside = np.isin(np.concatenate([moves, stays]), atoms)
+        wanted = np.arange(len(inside)) < len(moves)
+        return atoms if np.array_equal(inside, wanted) and not self.pinned[atoms].any() else None
+
+    def _lightest(self, found: list[tuple[IntArray | None, Move | None]]) -> Move | None:
+        """Of the motions that are possible, that of the least mass."""
+        able = [(float(self.held.masses[atoms].sum()), move) for atoms, move in found if atoms is not None and move]
+        return min(able, key=lambda entry: entry[0])[1] if able else None
+
+    def _own(self, family: str, atoms: IntArray) -> tuple[Move | None, tuple[int, int, int] | None]:
+        """The motion that changes one row and, if possible, no other bond or angle."""
+        image = partial(shortest_image, self.held)
+        found: list[tuple[IntArray | None, Move | None]] = []
+        if family == "Distance":
+            i, k = atoms.tolist()
+
+            def axis(x: FloatArray) -> FloatArray:
+                return image(x[k] - x[i])
+
+            move = self._shifted(np.array([k]), np.array([i]), axis)
+            if move is not None:
+                return move, None
+            for j in self.geometry.between(i, k):
+                move, _ = self._own("Angle", np.array([i, j, k]))
+                if move is not None:
+                    return move, (i, j, k)
+            return None, None
+        if family == "Angle":
+            for i, j, k in (atoms.tolist(), atoms[::-1].tolist()):
+                moves, stays = np.array([k]), np.array([i, j])
+                piece = self._side(j, k, moves, stays) if self.pieces.bonded(j, k) else None
+                if piece is None:
+                    piece = self._apart(moves, stays)
+                found.append((piece, None if piece is None else bend(piece, i, j, k)))
+        elif family == "Dihedral":
+            for i, j, k, l in (atoms.tolist(), atoms[::-1].tolist()):
+                piece = None
+                if self.pieces.bonded(j, k):
+                    piece = self._side(j, k, np.array([k, l]), np.array([i, j]))
+                if piece is None:
+                    piece = self._apart(np.array([l]), np.array([i, j, k]))
+                if piece is None:
+                    piece = self._apart(np.array([k, l]), np.array([i, j]))
+                found.append((piece, None if piece is None else torsion(piece, j, k)))
+        return self._lightest(found), None
+
+    def _owns(self) -> list[_Own]:
+        """Motions of the rows that are off."""
+        held = self.held
+        off = self.geometry.misfit > OFF * 1e-3
+        found: list[_Own] = []
+        for item, first in zip(held.constraints, held.starts, strict=False):
+            if item.family not in ("Distance", "Angle", "Dihedral", "CenterDistance"):
+                continue
+            for n in np.flatnonzero(off[first : first + item.n_rows]).tolist():
+                row = int(first) + n
+                part, atoms = held.subset(np.array([row]))
+                if item.family == "CenterDistance":
+                    move, across = self._centres(item.atoms[n], getattr(item, "split"), part, atoms), None  # noqa: B009
+                else:
+                    move, across = self._own(item.family, item.atoms[n])
+                if move is not None:
+                    found.append(_Own(row, part, atoms, move, across))
+        return found
+
+    def _shifted(self, a: IntArray, b: IntArray, axis: Callable[[FloatArray], FloatArray]) -> Move | None:
+        """Shift what belongs to two groups along the way from b to a: the two sides of a bond, or molecules."""
+        sides = None
+        if len(a) == len(b) == 1 and self.pieces.bonded(int(a[0]), int(b[0])):
+            sides = self.pieces.beyond(int(b[0]), int(a[0])), self.pieces.beyond(int(a[0]), int(b[0]))
+        if sides is None or sides[0] is None or sides[1] is None:
+            sides = self._molecules(a), self._molecules(b)
+            if len(np.intersect1d(*sides)):
+                return None
+        able = [side if not self.pinned[side].any() else side[:0] for side in sides if side is not None]
+        return stretch(able[0], able[1], self.held.masses, axis) if len(able[0]) or len(able[1]) else None
+
+    def _molecules(self, atoms: IntArray) -> IntArray:
+        """All atoms of the molecules of some atoms."""
+        return np.unique(np.concatenate([self.pieces.molecule(a) for a in atoms.tolist()]))
+
+    def _centres(self, atoms: IntArray, split: int, part: ConstraintSet, own: IntArray) -> Move | None:
+        """Shift the molecules of two groups along the line of their centres."""
+        mine = np.isin(own, atoms[:split])
+
+        def axis(x: FloatArray) -> FloatArray:
+            gradient = part.jacobian(x[own], self.time).toarray().reshape(-1, 3)
+            return np.asarray(gradient[mine].sum(axis=0))
+
+        return self._shifted(atoms[:split], atoms[split:], axis)
+
+    def _sweep(self, y: FloatArray) -> bool:
+        """Let every row that is off make its motion, over and over, in place; whether all rows are fulfilled then."""
+        held, time = self.held, self.time
+        owns = self._owns()
+        last = np.inf
+        for _ in range(SWEEPS):
+            largest = 0.0
+            for own in owns:
+                sigma = float(own.part.value(y[own.atoms], time)[0])
+                size = abs(sigma) / float(held.scale[own.row])
+                if not size > 1e-13:
+                    continue
+                largest = max(largest, size)
+                amount = -sigma if own.across is None else self._opening(y, own.across, -sigma)
+                self._left -= 1
+                if self._left < 0 or not own.move.make(y, amount):
+                    return False
+            if largest < 1e-12 or (largest > 0.9 * last and largest < 1e-9):
+                break
+            last = min(last, largest)
+        left = np.abs(held.value(y - self._images, time)) / held.scale
+        return bool(np.all(left[held.holonomic] < 1e-8))
+
+    def _opening(self, y: FloatArray, across: tuple[int, int, int], change: float) -> float:
+        """By how much the angle i-j-k must grow for the distance i-k to grow by `change`."""
+        i, j, k = across
+        u, w = y[i] - y[j], y[k] - y[j]
+        a, b = float(np.linalg.norm(u)), float(np.linalg.norm(w))
+        now = float(np.arctan2(np.linalg.norm(cross(u, w)), u @ w))
+        goal = float(np.linalg.norm(y[k] - y[i])) + change
+        cosine = (a * a + b * b - goal * goal) / (2 * a * b)
+        return float(np.arccos(np.clip(cosine, -1.0, 1.0))) - now
+
+    # -- Newton steps ---------------------------------------------------------------------------
+
+    def _motions(self) -> list[Move]:
+        """Turns about bonds that some row sees, and motions of whole molecules that rows hold."""
+        held, pieces = self.held, self.pieces
+        indptr, indices = held.incidence.indptr, held.incidence.indices
+        width = np.diff(indptr)
+        moves: list[Move] = []
+        mark = np.zeros(held.n_atoms, dtype=bool)
+        for j, k in pieces.bridges():
+            side, rest = pieces.beyond(j, k), pieces.beyond(k, j)
+            assert side is not None and rest is not None
+            options = [(atoms, a, b) for atoms, a, b in ((side, j, k), (rest, k, j)) if not self.pinned[atoms].any()]
+            if not options or min(len(side), len(rest)) < 2:
+                continue
+            atoms, a, b = min(options, key=lambda option: float(held.masses[option[0]].sum()))
+            mark[:] = False
+            mark[atoms] = True
+            mark[b] = False
+            inside = np.add.reduceat(mark[indices].astype(np.int64), indptr[:-1]) if len(indices) else np.zeros(0)
+            if np.any((inside > 0) & (inside < width)):
+                moves.append(torsion(atoms, a, b))
+        for molecule in pieces.molecules:
+            moves += free_motions(molecule, molecule[self.pinned[molecule]])
+        return moves + [own.move for own in self._owns()]
+
+    def _newton(self, y: FloatArray) -> None:
+        """Damped Newton steps in the parameters of all motions, from the present place and from turned ones."""
+        held = self.held
+        if held.n_rows > MOST_ROWS:
+            return
+        moves = self._motions()
+        if not moves or len(moves) > MOST_MOTIONS:
+            return
+        masses = held.masses[self.pieces.atoms]
+        usual = float(np.median(masses[masses > 0])) if np.any(masses > 0) else 1.0
+        heavy = np.clip(held.masses / usual, 1e-3, 1e3)
+        begin, best = y.copy(), (self._error(y), y.copy())
+        rng = np.random.default_rng(0)
+        for kick in range(KICKS + 1):
+            here = begin.copy()
+            if kick:
+                for move in moves:
+                    if move.turns:
+                        move.make(here, float(rng.uniform(-0.3, 0.3)) * kick)
+            error = self._descend(here, moves, heavy)
+            if error < best[0]:
+                best = error, here
+            if best[0] < 1e-12 or self._left < 0:
+                break
+        y[:] = best[1]
+
+    def _error(self, y: FloatArray) -> float:
+        value = self.held.value(y - self._images, self.time) / self.held.scale
+        return float(value @ value) if np.isfinite(value).all() else np.inf
+
+    def _descend(self, y: FloatArray, moves: list[Move], heavy: FloatArray) -> float:
+        """Levenberg-Marquardt steps in place; the sum of squares of the misfits where they end."""
+        held, time, atoms = self.held, self.time, self.pieces.atoms
+        place = np.full(held.n_atoms, -1)
+        place[atoms] = np.arange(len(atoms))
+        columns = (3 * atoms[:, None] + np.arange(3)).ravel()
+        rows = np.flatnonzero(held.holonomic)
+        error, damping = self._error(y), 1e-4
+        for _ in range(STEPS):
+            self._left -= len(moves)
+            if error < 1e-24 or not np.isfinite(error) or self._left < 0:
+                break
+            x = y - self._images
+            sigma = (held.value(x, time) / held.scale)[rows]
+            fields = np.zeros((len(atoms), 3, len(moves)))
+            size = np.empty(len(moves))
+            for n, move in enumerate(moves):
+                field = move.field(y)
+                fields[place[move.atoms], :, n] = field
+                size[n] = np.sqrt(np.sum(heavy[move.atoms, None] * field**2))
+            weight = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
+            jacobian = sp.csr_array(held.jacobian(x, time))[rows][:, columns]
+            slope = (jacobian @ fields.reshape(-1, len(moves))) * weight / held.scale[rows, None]
+            gram = slope @ slope.T
+            trace = float(np.trace(gram))
+            if not np.isfinite(trace) or trace == 0:
+                break
+            for _ in range(8):
+                step = np.linalg.solve(gram + (damping * trace / len(rows) + 1e-300) * np.eye(len(rows)), sigma)
+                amounts = -weight * (slope.T @ step)
+                longest = max((abs(a) for a, move in zip(amounts, moves, strict=True) if move.turns), default=0.0)
+                if longest > _LONGEST_TURN:
+                    amounts *= _LONGEST_TURN / longest
+                trial = y.copy()
+                self._left -= len(moves)
+                for amount, move in zip(amounts, moves, strict=True):
+                    if amount:
+                        move.make(trial, float(amount))
+                new = self._error(trial)
+                if new < error:
+                    break
+                damping *= 8
+            else:
+                break
+            slow = new > 0.999 * error
+            y[:], error, damping = trial, new, max(damping / 10, 1e-12)
+            if slow and error > 1e-20:
+                break
+        return error
+
+
+def _turn_of_line(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The least turn, as a matrix for rows from the left, that takes the line of one or two points to another."""
+    u, w = a[0], b[0]
+    lu, lw = float(np.linalg.norm(u)), float(np.linalg.norm(w))
+    if lu == 0 or lw == 0:
+        return np.eye(3)
+    u, w = u / lu, w / lw
+    axis, cosine = cross(u, w), float(u @ w)
+    if cosine < -1 + 1e-12:
+        axis = cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    matrix = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return (np.eye(3) + matrix + matrix @ matrix / (1 + cosine)).T

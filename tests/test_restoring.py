@@ -1,0 +1,350 @@
+"""Structures brought to a target: what is held is there to rounding, and no other bond or angle has changed.
+
+Bonds and angles are measured here from the molecules' own tables, apart from the search that is tested.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from itertools import combinations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import molecule
+from ase.neighborlist import natural_cutoffs, neighbor_list
+
+from kcons import constraints as held
+from kcons.constraint_set import ConstraintSet
+from kcons.errors import InfeasibleError, InputError, KconsError
+from kcons.guessed_bonds import bonds_without_elements
+from kcons.kept_geometry import bonds_of
+from kcons.motion import Motion
+from kcons.pieces import Pieces
+
+#: What may change: angstrom, degrees.
+BOND, ANGLE = 0.02, 2.0
+
+
+def bond_table(atoms: Atoms) -> list[tuple[int, int]]:
+    """Bonds by ASE's own neighbour list."""
+    i, j = neighbor_list("ij", atoms, natural_cutoffs(atoms, mult=1.2))
+    return [(int(a), int(b)) for a, b in zip(i, j, strict=True) if a < b]
+
+
+def torsions(atoms: Atoms) -> list[tuple[int, int, int, int]]:
+    """One torsion for each bond in no ring with neighbours on both sides, none of them straight."""
+    bonds = bond_table(atoms)
+    near = {a: [y for b in bonds for y in b if a in b and y != a] for a in range(len(atoms))}
+    found = []
+    for j, k in bonds:
+        seen, front = {j, k}, [a for a in near[j] if a != k]
+        while front:
+            seen.update(front)
+            front = [b for a in front for b in near[a] if b not in seen and not (a == j and b == k)]
+        if seen & set(near[k]) - {j}:
+            continue
+        for i in near[j]:
+            for l in near[k]:
+                bend = (atoms.get_angle(i, j, k, mic=True), atoms.get_angle(j, k, l, mic=True))
+                if i != k and l != j and min(bend) > 5 and max(bend) < 175:
+                    found.append((i, j, k, l))
+                    break
+            if found and found[-1][1:3] == (j, k):
+                break
+    return found
+
+
+def shape(atoms: Atoms, x: np.ndarray, free: tuple[tuple[int, ...], ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths of all bonds and all angles in degrees, without those among `free` that a row changes."""
+    bonds = bond_table(atoms)
+    copy = atoms.copy()
+    copy.positions = x
+    near = {a: [y for b in bonds for y in b if a in b and y != a] for a in range(len(atoms))}
+    angles = [(i, j, k) for j in near for i, k in combinations(near[j], 2)]
+    lengths = [copy.get_distance(*b, mic=True) for b in bonds if b not in free and b[::-1] not in free]
+    moved = {(t[1], end) for t in free if len(t) == 3 for end in (t[0], t[2])}
+    bent = [copy.get_angle(*t, mic=True) for t in angles if not {(t[1], t[0]), (t[1], t[2])} & moved]
+    return np.array(lengths), np.array(bent)
+
+
+def kept(atoms: Atoms, x: np.ndarray, free: tuple[tuple[int, ...], ...] = ()) -> None:
+    """No other bond, no other angle than those in `free` has changed."""
+    before, after = shape(atoms, atoms.positions, free), shape(atoms, x, free)
+    assert np.abs(after[0] - before[0]).max(initial=0.0) <= BOND
+    assert np.abs(after[1] - before[1]).max(initial=0.0) <= ANGLE
+
+
+def engine(atoms: Atoms, rows: list[held.Constraint], masses: np.ndarray | None = None) -> Motion:
+    masses = atoms.get_masses() if masses is None else masses
+    cell = atoms.cell.array if atoms.pbc.any() else None
+    return Motion(ConstraintSet(rows, atoms.positions, masses, cell=cell), atoms.positions)
+
+
+def fulfilled(motion: Motion, x: np.ndarray, time: float = 0.0) -> None:
+    whole = motion.constraint_set
+    assert np.all(np.abs(whole.value(x, time)) <= whole.tolerance(x, time))
+
+
+# -- torsions ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "trans-butane", "CH3CONH2", "CH3CH2NH2", "C2H6", "HCOOCH3", "Si2H6"])
+@pytest.mark.parametrize("given", [True, False], ids=["bonds", "no bonds"])
+def test_a_torsion_from_anywhere_to_anywhere(name: str, given: bool) -> None:
+    """Also where it is straight through a cis arrangement, and with bonds that distances alone suggest."""
+    atoms = molecule(name)
+    bonds = bond_table(atoms) if given else None
+    for quad in torsions(atoms):
+        for degrees in range(-180, 181, 15):
+            motion = engine(atoms, [held.Dihedral([quad], np.radians(degrees))])
+            x = motion.restore_positions(atoms.positions, bonds=bonds)
+            fulfilled(motion, x)
+            kept(atoms, x)
+
+
+def test_the_lighter_piece_turns_and_the_other_stays() -> None:
+    atoms = molecule("CH3CH2OH")
+    for masses, moves in ((atoms.get_masses(), {3}), (np.array([1, 1, 50, 50, 1, 1, 1, 1, 1.0]), {0, 4, 5, 6, 7, 8})):
+        x = engine(atoms, [held.Dihedral([[3, 2, 1, 0]], 1.0)], masses).restore_positions(atoms.positions)
+        away = np.linalg.norm(x - atoms.positions, axis=1)
+        assert set(np.flatnonzero(away > 1e-9).tolist()) <= moves and away.max() > 0.5
+
+
+def test_the_piece_without_fixed_atoms_turns() -> None:
+    atoms = molecule("trans-butane")
+    quad = next(q for q in torsions(atoms) if {atoms.numbers[k] for k in q} == {6})
+    for fixed in (quad[0], quad[3]):
+        motion = engine(atoms, [held.FixedAtoms([fixed]), held.Dihedral([quad], 1.0)])
+        x = motion.restore_positions(atoms.positions)
+        fulfilled(motion, x)
+        kept(atoms, x)
+        np.testing.assert_array_equal(x[fixed], atoms.positions[fixed])
+    ends = np.flatnonzero(atoms.numbers == 1)[atoms.get_distances(quad[0], np.flatnonzero(atoms.numbers == 1)) < 1.3]
+    others = np.flatnonzero(atoms.numbers == 1)[atoms.get_distances(quad[3], np.flatnonzero(atoms.numbers == 1)) < 1.3]
+    motion = engine(atoms, [held.FixedAtoms(np.r_[ends, others]), held.Dihedral([quad], 1.0)])
+    start = atoms.positions.copy()
+    with pytest.raises(InfeasibleError, match="Dihedral"):
+        motion.restore_positions(start)
+    np.testing.assert_array_equal(start, atoms.positions)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_masses_of_many_orders_do_not_matter(seed: int) -> None:
+    atoms = molecule("trans-butane")
+    rng = np.random.default_rng(seed)
+    masses = 10 ** rng.uniform(np.log10(2e-3), 7, len(atoms))
+    quads = torsions(atoms)
+    motion = engine(atoms, [held.Dihedral(quads, rng.uniform(-np.pi, np.pi, len(quads)))], masses)
+    x = motion.restore_positions(atoms.positions)
+    fulfilled(motion, x)
+    kept(atoms, x)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_wrapped_into_a_small_cell(seed: int) -> None:
+    """Atoms may be stored in any image and stay in theirs."""
+    rng = np.random.default_rng(seed)
+    atoms = molecule("CH3CH2OH")
+    atoms.set_cell([[9.0, 0, 0], [2.0, 10, 0], [-1.0, 1.5, 8.5]])
+    atoms.pbc = True
+    atoms.positions += rng.uniform(0, 10, 3)
+    atoms.wrap()
+    motion = engine(atoms, [held.Dihedral([[3, 2, 1, 0]], rng.uniform(-3, 3))])
+    x = motion.restore_positions(atoms.positions, bonds=bond_table(atoms) if seed % 2 else None)
+    fulfilled(motion, x)
+    kept(atoms, x)
+    assert np.abs(x - atoms.positions).max() < 3.0
+
+
+def test_bonds_that_are_held_count() -> None:
+    """All bonds held, a dihedral far off: the bonds that lead the turn are the rows themselves."""
+    atoms = molecule("CH3CH2OH")
+    masses = np.linspace(1.0, 2.0, len(atoms))  # no elements
+    rows = [held.Distance(bond_table(atoms)), held.Dihedral([[3, 2, 1, 0]], 0.4)]
+    motion = engine(atoms, rows, masses)
+    x = motion.restore_positions(atoms.positions)
+    fulfilled(motion, x)
+    kept(atoms, x)
+
+
+def test_at_a_time() -> None:
+    atoms = molecule("CH3CH2OH")
+    motion = engine(atoms, [held.Dihedral([[3, 2, 1, 0]], lambda t: np.pi + t)])
+    for time in (0.1, 1.0, 2.9):
+        x = motion.restore_positions(atoms.positions, time=time)
+        fulfilled(motion, x, time)
+        kept(atoms, x)
+
+
+# -- angles, bonds, distances between groups --------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [50, 80, 130, 165])
+def test_an_angle_far_off(degrees: float) -> None:
+    atoms = molecule("CH3CH2OH")
+    for triple in ((3, 2, 1), (2, 1, 0)):
+        motion = engine(atoms, [held.Angle([triple], np.radians(degrees))])
+        x = motion.restore_positions(atoms.positions)
+        fulfilled(motion, x)
+        kept(atoms, x, (triple,))
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4, 2.0])
+def test_a_bond_takes_what_hangs_on_it_along(factor: float) -> None:
+    atoms = molecule("CH3CH2OH")
+    motion = engine(atoms, [held.Distance([[1, 2]], factor * atoms.get_distance(1, 2))])
+    x = motion.restore_positions(atoms.positions)
+    fulfilled(motion, x)
+    kept(atoms, x, ((1, 2),))
+    np.testing.assert_allclose(motion.masses @ x, motion.masses @ atoms.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize("length", [3.0, 7.0, 20.0])
+def test_a_distance_between_molecules_shifts_them_whole(length: float) -> None:
+    pair = molecule("C6H6") + molecule("H2O")
+    pair.positions[12:] += [0.4, 0.2, 4.0]
+    motion = engine(pair, [held.CenterDistance(range(12), range(12, 15), length)])
+    x = motion.restore_positions(pair.positions)
+    fulfilled(motion, x)
+    kept(pair, x)
+    for part in (slice(0, 12), slice(12, 15)):
+        move = (x - pair.positions)[part]
+        np.testing.assert_allclose(move - move[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(motion.masses @ x, motion.masses @ pair.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize("length", [2.7, 3.0, 3.4])
+def test_a_distance_within_a_molecule_turns_the_bonds_between(length: float) -> None:
+    """From the extended chain, where the distance is at its largest and its slope along every torsion is 0."""
+    atoms = molecule("trans-butane")
+    carbons = np.flatnonzero(atoms.numbers == 6)
+    ends = max(combinations(carbons.tolist(), 2), key=lambda pair: atoms.get_distance(*pair))
+    motion = engine(atoms, [held.Distance([ends], length)])
+    x = motion.restore_positions(atoms.positions)
+    fulfilled(motion, x)
+    kept(atoms, x)
+
+
+# -- rings, and what cannot be -----------------------------------------------------------------------
+
+
+def test_a_ring_gives_way_as_far_as_it_may() -> None:
+    """A torsion of benzene by 20 degrees bends its angles by less than one; by 90 it cannot be."""
+    ring = molecule("C6H6")
+    motion = engine(ring, [held.Dihedral([[0, 1, 2, 3]], np.radians(20))])
+    x = motion.restore_positions(ring.positions)
+    fulfilled(motion, x)
+    kept(ring, x)
+    motion = engine(ring, [held.Dihedral([[0, 1, 2, 3]], np.radians(90))])
+    out = np.full_like(x, 5.0)
+    with pytest.raises(InfeasibleError, match=r"row #0 Dihedral\(0, 1, 2, 3\).*changed from.*no row asks for"):
+        motion.restore_positions(ring.positions, out=out)
+    assert (out == 5.0).all()
+
+
+def test_without_bonds_the_nearest_point_as_asked() -> None:
+    """An empty list means that what no row holds is of no concern."""
+    ring = molecule("C6H6")
+    motion = engine(ring, [held.Distance([[0, 1]], 2.0)])
+    with pytest.raises(InfeasibleError, match="bonds="):
+        motion.restore_positions(ring.positions)
+    x = motion.restore_positions(ring.positions, bonds=[])
+    fulfilled(motion, x)
+    away = np.linalg.norm(x - ring.positions, axis=1)
+    assert set(np.flatnonzero(away > 1e-12).tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize(
+    "bonds",
+    [[[0, 9]], [[0, 0]], [[-1, 2]], [[0.5, 1]], [[0, 1, 2]]],
+    ids=["beyond", "self", "negative", "half", "three"],
+)
+def test_bad_bonds_are_refused(bonds: list[list[float]]) -> None:
+    atoms = molecule("CH3CH2OH")
+    with pytest.raises(InputError, match="bonds"):
+        engine(atoms, [held.Distance([[0, 1]])]).restore_positions(atoms.positions, bonds=bonds)
+
+
+# -- bounds -------------------------------------------------------------------------------------------
+
+
+def tangled(seed: int) -> tuple[Motion, np.ndarray] | None:
+    """A random set on up to 12 atoms of masses 2e-3 to 1e7, and a start up to 7 off; None where it cannot be set up."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(4, 13))
+    x = np.cumsum(rng.normal(size=(n, 3)), axis=0)
+    pairs = np.array(list(combinations(range(n), 2)))
+    rows = [held.Distance(rng.permutation(pairs)[: rng.integers(1, 12)])]
+    rows += [held.Angle([rng.permutation(n)[:3]]) for _ in range(rng.integers(0, 4))]
+    rows += [held.Dihedral([rng.permutation(n)[:4]]) for _ in range(rng.integers(0, 4))]
+    try:
+        motion = Motion(ConstraintSet(rows, x, 10 ** rng.uniform(np.log10(2e-3), 7, n)), x)
+    except KconsError:
+        return None
+    return motion, x + rng.uniform(0.01, 7.0) * rng.normal(size=x.shape)
+
+
+def test_tangled_starts_end_soon_and_never_silently_off() -> None:
+    """Solved or refused; the slowest takes seconds here, whatever the load of the machine, and not minutes."""
+    solved, slowest = 0, 0.0
+    cases = [case for case in map(tangled, range(16)) if case is not None]
+    for motion, start in cases:
+        kept_start, began = start.copy(), clock.process_time()
+        try:
+            x = motion.restore_positions(start)
+        except KconsError:
+            np.testing.assert_array_equal(start, kept_start)
+        else:
+            fulfilled(motion, x)
+            solved += 1
+        slowest = max(slowest, clock.process_time() - began)
+    assert len(cases) > 12 and solved >= 0.7 * len(cases)
+    assert slowest < 5.0
+
+
+# -- pieces and bonds -----------------------------------------------------------------------------------
+
+
+def test_pieces_of_a_ring_with_tails() -> None:
+    """0-1-2-3 is a ring, 3-4-5 a tail, 6-7 another molecule, 8 alone and not asked for."""
+    bonds = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (3, 4), (4, 5), (6, 7)])
+    pieces = Pieces(9, bonds, np.array([0, 6]))
+    assert {frozenset(b) for b in pieces.bridges()} == {frozenset(b) for b in [(3, 4), (4, 5), (6, 7)]}
+    for j, k, beyond in [(3, 4, {4, 5}), (4, 3, {0, 1, 2, 3}), (4, 5, {5}), (5, 4, {0, 1, 2, 3, 4}), (7, 6, {6})]:
+        found = pieces.beyond(j, k)
+        assert found is not None and set(found.tolist()) == beyond
+    assert pieces.beyond(0, 1) is None and pieces.beyond(0, 5) is None
+    assert set(pieces.molecule(5).tolist()) == {0, 1, 2, 3, 4, 5}
+    assert set(pieces.atoms.tolist()) == set(range(8))
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "C6H6", "PH3", "NF3", "CH2SCH2", "Si2H6", "CH3SH", "C2Cl4", "H2CCO"])
+@pytest.mark.parametrize("unit", [1.0, 0.1, 1.8897])
+def test_bonds_by_distances_alone_are_those_by_elements(name: str, unit: float) -> None:
+    atoms = molecule(name)
+    every = np.arange(len(atoms))
+    found = bonds_without_elements(unit * atoms.positions, None, every, every >= 0)
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(atoms))
+
+
+def test_no_bonds_are_guessed_where_there_are_no_molecules() -> None:
+    every = np.arange(60)
+    scattered = np.random.default_rng(0).uniform(0, 4, (60, 3))
+    cubic = np.stack(np.meshgrid(*3 * [np.arange(5.0)]), axis=-1).reshape(-1, 3)
+    faces = cubic[cubic.sum(axis=1) % 2 == 0][:60]
+    for x in (scattered, 3.8 * faces):
+        assert len(bonds_without_elements(x, None, every, every >= 0)) == 0
+
+
+def test_held_distances_that_are_no_bonds() -> None:
+    """The third side of water, and the ends of a chain."""
+    atoms = molecule("H2O")
+    motion = engine(atoms, [held.Distance([[0, 1], [0, 2], [1, 2]])])
+    assert bonds_of(motion.constraint_set, atoms.positions, 0.0, None).tolist() == [[0, 1], [0, 2]]
+    chain = molecule("trans-butane")
+    carbons = np.flatnonzero(chain.numbers == 6)
+    ends = max(combinations(carbons.tolist(), 2), key=lambda pair: chain.get_distance(*pair))
+    motion = engine(chain, [held.Distance([ends])])
+    found = bonds_of(motion.constraint_set, chain.positions, 0.0, None)
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(chain))
