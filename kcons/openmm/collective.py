@@ -20,6 +20,7 @@ from kcons.errors import (
 )
 from kcons.openmm.context_rows import ContextRows, variables_of
 from kcons.openmm.group_rows import GroupRows
+from kcons.openmm.part import Miss
 from kcons.openmm.row_algebra import blocks
 from kcons.openmm.row_forces import Rigid, Row, forces_in, found_values, moved_atoms, number, period_of, place
 from kcons.steppers.compositions import Composition
@@ -171,6 +172,11 @@ class CollectiveRows(GroupRows):
         """Whether targets move."""
         return any(rate != 0.0 for rate in self._rates)
 
+    @property
+    def steered(self) -> bool:
+        """Whether a target is a context parameter, which others may set for the step to come."""
+        return any(isinstance(target, str) for target in self._targets)
+
     def values(self, context: openmm.Context) -> FloatArray:
         """q of each row, shape (n_rows,)."""
         return self.at(context).values()
@@ -250,11 +256,11 @@ class CollectiveRows(GroupRows):
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
         variables = variables_of(self, integrator)
         if slope is not None:
-            integrator.setGlobalVariableByName(self._of("rate", row), slope)
+            integrator.program.set(self._of("rate", row), slope)
         if self._rates[row] != 0.0:
             slope = integrator.getGlobalVariableByName(self._of("rate", row))
             value -= slope * self._clock(variables)
-        integrator.setGlobalVariableByName(self._of("target", row), value)
+        integrator.program.set(self._of("target", row), value)
 
     def _clock(self, variables: dict[str, float]) -> float:
         if not self._drives:
@@ -291,9 +297,20 @@ class CollectiveRows(GroupRows):
         self.at(context).apply_velocities()
 
     def restore(self, context: openmm.Context, tolerance: float | None = None) -> None:
-        """`apply_positions`, then `apply_velocities`."""
+        """`apply_positions`, then `apply_velocities`.
+
+        Raises
+        ------
+        ConvergenceError, SingularGeometryError
+            As these. Also where the rows say that they are not fulfilled afterwards.
+        """
         self.apply_positions(context, tolerance)
         self.apply_velocities(context)
+        miss = self.worst_miss(context)
+        if miss is not None:
+            raise ConvergenceError(
+                f"after restoring, the {miss}", residual=abs(miss.off), row=miss.row, atoms=miss.atoms
+            )
 
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows.
@@ -310,6 +327,10 @@ class CollectiveRows(GroupRows):
             Positions or velocities are not on the rows; `restore` brings them there.
         """
         self.at(context).check()
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v from the Forces themselves, at the state of the context."""
+        return self.at(context).worst_miss(velocities)
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         """The error for a step in which the rows failed."""

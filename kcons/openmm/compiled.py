@@ -31,7 +31,7 @@ class EndWriter(LeanStepWriter):
 
     def write(self) -> None:
         p = self.program
-        p.number("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
+        p.control("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
         with p.when("end = 0", "a step"):
             super().write()
         with p.when("end = 1", "leapfrog steps follow"):
@@ -49,11 +49,11 @@ class Ends(ProjectedIntegrator):
 
     def execute(self, end: float) -> None:
         """Begin or end leapfrog steps; OpenMM takes that for a step, and moves its clock."""
-        self.setGlobalVariableByName("end", end)
+        self.program.write("end", end)
         try:
             openmm.CustomIntegrator.step(self, 1)
         finally:
-            self.setGlobalVariableByName("end", _STEP)
+            self.program.write("end", _STEP)
 
 
 class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
@@ -104,6 +104,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     def __repr__(self) -> str:
         return f"<RattleIntegrator: {self._dt * 1e3:g} fs>"
 
+    #: Others may not change which integrator is in use.
+    closed = True
+
     # -- running --------------------------------------------------------------------------------
 
     @property
@@ -135,7 +138,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         """
         ends = self._ends
         guard = ends._watch()
-        if not guard.started:
+        if guard.disturbed:
             guard.begin()
         guard.meet_others()
         while steps > 0:

@@ -12,6 +12,7 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
+from kcons.openmm.part import Miss
 from kcons.openmm.row_forces import energy
 from kcons.openmm.system_checks import refuse_barostat, refuse_motion_remover
 
@@ -301,25 +302,27 @@ class ContextRows:
         sizes = np.linalg.norm(gradients, axis=(1, 2))
         if np.any(np.linalg.norm(gradients.sum(axis=1), axis=1) > 1e-9 * sizes):
             refuse_motion_remover(system, "a collective row")
-        scales = np.array(rows.scales)
-        self._refuse(self.sigma(), scales * max(START_TOLERANCE, 10 * rows.tolerance), "positions")
-        integrator = owner(rows, self.context)
-        if getattr(rows, "_leapfrog", False) and integrator is not None:
-            return  # velocities of half a step before
-        v = self.velocities
-        rates = np.einsum("kai,ai->k", gradients, v) - self.target_rates()
-        size = sizes * float(np.linalg.norm(v, axis=1).max(initial=0.0))
-        self._refuse(rates, START_TOLERANCE * (size + np.abs(self.target_rates())), "velocities")
+        late = getattr(rows, "_leapfrog", False) and owner(rows, self.context) is not None
+        miss = self.worst_miss(velocities=not late)  # those of the leapfrog are of half a step before
+        if miss is not None:
+            raise ConstraintError(f"the {miss}; call restore(context)", rows=[miss.row], atoms=miss.atoms)
 
-    def _refuse(self, off: FloatArray, allowed: FloatArray, what: str) -> None:
-        wrong = ~(np.abs(off) <= allowed)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise ConstraintError(
-                f"the {what} are not on row {row} ({self.rows.names[row]}): off by {off[row]:.3g}; "
-                "call restore(context)",
-                rows=[row],
-            )
+    def worst_miss(self, velocities: bool = True) -> Miss | None:
+        """Energies of the Forces less the targets, and their gradients times v."""
+        rows = self.rows
+        allowed = np.array(rows.scales) * max(START_TOLERANCE, 10 * rows.tolerance)
+        miss = Miss.worst("positions", self.sigma(), allowed, self._name, rows.atoms.__getitem__)
+        if miss is not None or not velocities:
+            return miss
+        gradients, v = self.gradients(), self.velocities
+        demanded = self.target_rates()
+        size = np.linalg.norm(gradients, axis=(1, 2)) * float(np.linalg.norm(v, axis=1).max(initial=0.0))
+        rates = np.einsum("kai,ai->k", gradients, v) - demanded
+        allowed = START_TOLERANCE * (size + np.abs(demanded))
+        return Miss.worst("velocities", rates, allowed, self._name, rows.atoms.__getitem__)
+
+    def _name(self, row: int) -> str:
+        return f"{row} ({self.rows.names[row]})"
 
 
 def owner(rows: CollectiveRows, context: openmm.Context) -> openmm.CustomIntegrator | None:

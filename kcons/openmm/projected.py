@@ -14,7 +14,9 @@ from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.hearing import listen
 from kcons.openmm.isokinetic import kelvins
+from kcons.openmm.langevin import Langevin
 from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
@@ -22,6 +24,9 @@ from kcons.openmm.schemes import LEAPFROG, to_scheme
 from kcons.openmm.states import StatesOnConstraints, value_in
 from kcons.openmm.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
+
+#: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
+_SAME = 1e-6
 
 
 class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
@@ -83,8 +88,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         self.check_every = int(check_every)
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
-        self.ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
-        self.ensemble.check(self.scheme)
+        self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
+        self._ensemble.check(self.scheme)
         self.parts = tuple(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
@@ -98,6 +103,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         self.program = Program(self)
         self._plan = self._writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        listen(self)
 
     def __repr__(self) -> str:
         scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
@@ -126,6 +132,11 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         return count_step(self.program, iterations=iterations, **known)
 
     # -- running --------------------------------------------------------------------------------
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """How velocities change between drifts, as it is now; see `setTemperature`, `setFriction`."""
+        return self._ensemble
 
     @property
     def thermostatted(self) -> bool:
@@ -177,7 +188,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             At the first step: the System cannot be propagated, or the start is not on the constraints.
         """
         guard = self._watch()
-        if not guard.started:
+        if guard.disturbed:
             guard.begin()
         if self._plan.kept and guard.surroundings_changed():
             self.refresh()
@@ -195,14 +206,14 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         """Where the program can do less in steps whose end nobody looks at, let it."""
         unseen = steps - self._plan.observed if self._plan.lazy else 0
         if self._plan.lean:
-            self.setGlobalVariableByName("lean", float(guard.undisturbed))
-            self.setGlobalVariableByName("moving", float(guard.moving))
+            self.program.write("lean", guard.undisturbed)
+            self.program.write("moving", guard.moving)
         if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
-            self.setGlobalVariableByName("between", 1.0)
+            self.program.write("between", 1.0)
             try:
                 self._run(guard, unseen)
             finally:
-                self.setGlobalVariableByName("between", 0.0)
+                self.program.write("between", 0.0)
             steps -= unseen
         self._run(guard, steps)
 
@@ -232,25 +243,69 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
             if self._plan.lean and self.getGlobalVariableByName("loose"):
-                self.setGlobalVariableByName("between", 0.0)
+                self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             raise failure
 
     def _failure(self, code: int, step: int) -> KconsError:
         error = self.parts[code - 1].failure(self, step)
-        self.setGlobalVariableByName("failed", 0.0)
+        self.program.write("failed", 0.0)
         return error
 
     def refresh(self) -> None:
         """Compute the forces anew at the next step.
 
-        To be called after `updateParametersInContext`, which cannot be seen from here; where parts are held, forces
-        are kept from one step to the next. Changed positions, parameters and boxes are seen.
+        Where parts are held, forces are kept from one step to the next. What changes them is seen: positions,
+        parameters, boxes, `updateParametersInContext`.
         """
         if self.parts:
-            self.setGlobalVariableByName("stale", 1.0)
+            self.program.write("stale", 1.0)
         if "behind" in self.program.numbers:
-            self.setGlobalVariableByName("behind", 0.0)
+            self.program.write("behind", 0.0)
+
+    # -- what the Context is told, see kcons.openmm.hearing -------------------------------------
+
+    def _hear_moved(self) -> None:
+        """Something has moved x or v."""
+        if self._guard is not None:
+            self._guard.disturbed = True
+
+    def _hear_forget(self) -> None:
+        """A State is about to be loaded: what it does not bring is that of a new integrator."""
+        self.program.forget()
+        if self.scheme is None:
+            self.setPerDofVariableByName("impulse", [openmm.Vec3(0, 0, 0)] * self._n_particles())
+
+    def _hear_loaded(self, context: openmm.Context) -> None:
+        """Variables were read from a State or checkpoint: what this integrator was made with wins.
+
+        The run goes on as if nothing had happened where the State is that of this run. Forces that were kept are
+        those of another System otherwise, or of other settings.
+        """
+        other = bool(self.program.differing())
+        self.program.push()
+        if other or not self._forces_kept(context):
+            self.refresh()
+        if self._guard is not None:
+            self._guard.started, self._guard.disturbed = False, True
+
+    def _hear_reinitialized(self) -> None:
+        """The Context has read the System again."""
+        self._guard = None
+        self.program.push()
+        self.refresh()
+
+    def _forces_kept(self, context: openmm.Context) -> bool:
+        """Whether forces that the program has kept are those at x."""
+        if "force" not in self.program.vectors or self.getGlobalVariableByName("stale"):
+            return True
+        kept = np.array(self.getPerDofVariableByName("force"))
+        state = context.getState(forces=True, groups=self.getIntegrationForceGroups())
+        now = np.asarray(state.getForces(asNumpy=True)._value)
+        return bool(np.abs(kept - now).max(initial=0.0) <= _SAME * np.abs(now).max(initial=0.0))
+
+    def _n_particles(self) -> int:
+        return len(self.getPerDofVariableByName("xu"))
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
@@ -265,6 +320,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             code = int(self.getGlobalVariableByName("failed"))
             if code:
                 raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
+        for part in self.parts if guard.disturbed else ():
+            part.check(guard.context)
         guard.check()
         for part in self.parts:
             part.check(guard.context)
@@ -326,14 +383,15 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         context = guard.context
         time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
         self.refresh()
-        self.setGlobalVariableByName("first_stage", float(first))
-        self.setGlobalVariableByName("end_stage", float(end))
+        program = self.program
+        program.write("first_stage", first)
+        program.write("end_stage", end)
         try:
             super().step(1)
         finally:
-            self.setGlobalVariableByName("first_stage", 0.0)
-            self.setGlobalVariableByName("end_stage", float(len(self._plan.drifts)))
-            self.setGlobalVariableByName("good_steps", good)
+            for name in ("first_stage", "end_stage"):
+                program.write(name, (program.settings | program.idle)[name])
+            program.write("good_steps", good)
             self.refresh()
             context.setTime(time)
             context.setStepCount(count)
@@ -349,11 +407,58 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         Raises
         ------
         InputError
-            It is not above zero.
+            It is below zero; with `Isokinetic`, zero.
         UnsupportedError
             The ensemble has none.
         """
-        self.ensemble.set_temperature(self, kelvins(temperature))
+        self._take(self.ensemble.at(kelvins(temperature)))
+
+    def getTemperature(self) -> unit.Quantity:
+        """The temperature of the ensemble.
+
+        Raises
+        ------
+        UnsupportedError
+            It has none.
+        """
+        return self._given("temperature") * unit.kelvin
+
+    def setFriction(self, friction: unit.Quantity | float) -> None:
+        """Change the friction (1/ps if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is below zero.
+        UnsupportedError
+            The ensemble has none.
+        """
+        self._given("friction")
+        assert isinstance(self.ensemble, Langevin)
+        self._take(self.ensemble.with_friction(friction))
+
+    def getFriction(self) -> unit.Quantity:
+        """The friction of the ensemble.
+
+        Raises
+        ------
+        UnsupportedError
+            It has none.
+        """
+        return self._given("friction") / unit.picosecond
+
+    def _given(self, what: str) -> float:
+        value = getattr(self.ensemble, what, None)
+        if not isinstance(value, float):
+            name = "constant energy" if not self.thermostatted else repr(self.ensemble)
+            raise UnsupportedError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
+        return value
+
+    def _take(self, ensemble: Ensemble) -> None:
+        self._ensemble = ensemble
+        for name, value in ensemble.settings().items():
+            self.program.set(name, value)
+        ensemble.follow(self)
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
@@ -407,6 +512,24 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         if not 0 < tol < 1:
             raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
         super().setConstraintTolerance(tol)
+
+    def setGlobalVariableByName(self, name: str, value: float) -> None:
+        """Set a variable of the program.
+
+        Raises
+        ------
+        UnsupportedError
+            It is a setting, which has a method of its own.
+        """
+        if name in self.program.settings:
+            raise UnsupportedError(
+                f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
+            )
+        super().setGlobalVariableByName(name, value)
+
+    def setGlobalVariable(self, index: int, value: float) -> None:
+        """As `setGlobalVariableByName`."""
+        self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.

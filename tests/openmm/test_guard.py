@@ -88,7 +88,7 @@ def test_compound_integrator_tells_of_failures_when_asked():
 def test_start_off_the_constraints_is_refused(kind):
     system, x, v = alanine()
     x = x.copy()
-    x[4] += 0.01
+    x[4] += 0.03
     integrator = kind(1e-3)
     context = started(system, integrator, x, v)
     with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimise") as caught:
