@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openmm
@@ -22,9 +23,12 @@ from kcons.openmm.context_rows import ContextRows, variables_of
 from kcons.openmm.group_rows import GroupRows
 from kcons.openmm.part import Miss
 from kcons.openmm.row_algebra import blocks
-from kcons.openmm.row_forces import Rigid, Row, forces_in, found_values, moved_atoms, number, period_of, place
+from kcons.openmm.row_forces import Rigid, Row, forces_in, found_values, moved_atoms, number, period_of, place, unit_of
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
+
+if TYPE_CHECKING:
+    from kcons.openmm.projected import ProjectedIntegrator
 
 
 class CollectiveRows(GroupRows):
@@ -93,15 +97,21 @@ class CollectiveRows(GroupRows):
         self.tolerance = float(tolerance)
         self.max_iterations = int(max_iterations)
         self.n_rows = len(given)
-        self._targets = [
-            None if row.target is None else _value_or_name(row.target, f"target of row {k}")
-            for k, row in enumerate(given)
-        ]
-        self._rates = [_value_or_name(row.rate, f"rate of row {k}") for k, row in enumerate(given)]
-        periods = [
-            None if row.period is None else number(row.period, f"period of row {k}") for k, row in enumerate(given)
-        ]
-        scales = [None if row.scale is None else number(row.scale, f"scale of row {k}") for k, row in enumerate(given)]
+        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
+        self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]
+
+        def read(name: str, per: unit.Unit = unit.dimensionless) -> list[Any]:
+            """An attribute of all rows: numbers, None, and for targets and rates names."""
+            values = [getattr(row, name) for row in given]
+            kept = (str, type(None)) if name in ("target", "rate") else type(None)
+            return [
+                value if isinstance(value, kept) else number(value, f"{name} of row {k}", of, per)
+                for k, (value, of) in enumerate(zip(values, self._units, strict=True))
+            ]
+
+        self._targets = read("target")
+        self._rates = read("rate", unit.picosecond)
+        periods, scales = read("period"), read("scale")
         for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
             if target is None and positions is None:
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
@@ -117,7 +127,6 @@ class CollectiveRows(GroupRows):
                     "define it by addGlobalParameter of a Force",
                     item="target",
                 )
-        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
         self.names = tuple(_name(row, f) for row, f in zip(given, forces, strict=True))
         self.periods = tuple(
             (period_of(f[0]) if len(f) == 1 else 0.0) if period is None else period
@@ -239,9 +248,11 @@ class CollectiveRows(GroupRows):
         return self.at(context).targets()
 
     def set_target(
-        self, integrator: openmm.CustomIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
+        self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
     ) -> None:
         """Hold row `row` at another value from now on; `restore` brings the state there.
+
+        It belongs to this integrator: no State or checkpoint changes it.
 
         Raises
         ------
@@ -250,8 +261,9 @@ class CollectiveRows(GroupRows):
         """
         if isinstance(self._targets[row], str):
             raise InputError(f"the target of row {row} is the context parameter {self._targets[row]}", item="target")
-        value = number(target, f"target of row {row}")
-        slope = None if rate is None else number(rate, f"rate of row {row}")
+        of = self._units[row]
+        value = number(target, f"target of row {row}", of)
+        slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
         variables = variables_of(self, integrator)
@@ -373,10 +385,6 @@ class CollectiveRows(GroupRows):
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"
-
-
-def _value_or_name(value: object, item: str) -> float | str:
-    return value if isinstance(value, str) else number(value, item)
 
 
 def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> list[openmm.Force]:

@@ -68,6 +68,12 @@ class ContextRows:
         integrator = owner(self.rows, self.context)
         return {} if integrator is None else variables_of(self.rows, integrator)
 
+    @cached_property
+    def _settings(self) -> dict[str, float]:
+        """What the integrator was made with or told; its variables are copies for the program."""
+        integrator = owner(self.rows, self.context)
+        return integrator.program.settings if hasattr(integrator, "program") else self._variables
+
     def targets(self) -> FloatArray:
         """Where each target is now, shape (n_rows,)."""
         rows, found = self.rows, []
@@ -76,7 +82,7 @@ class ContextRows:
                 found.append(self.context.getParameter(target))
             elif self._variables:
                 moved = self.target_rates()[k] * rows._clock(self._variables) if rows._rates[k] != 0.0 else 0.0
-                found.append(self._variables[rows._of("target", k)] + moved)
+                found.append(self._settings[rows._of("target", k)] + moved)
             else:
                 assert target is not None
                 found.append(target)
@@ -88,7 +94,7 @@ class ContextRows:
             if isinstance(rate, str):
                 found.append(self.context.getParameter(rate))
             else:
-                found.append(self._variables.get(rows._of("rate", k), rate))
+                found.append(self._settings.get(rows._of("rate", k), rate))
         return np.array(found)
 
     # -- the rows -------------------------------------------------------------------------------

@@ -214,7 +214,7 @@ class Guard:
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:
             raise InputError(
-                f"the {miss}. Whatever moved them does not know the rows that are held (OpenMM's minimiser is one: take "
+                f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimiser is one: take "
                 "integrator.minimizeEnergy); call integrator.applyConstraints(context) and "
                 "integrator.applyVelocityConstraints(context)",
                 item=miss.what,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -47,7 +47,7 @@ class Miss:
         off: FloatArray,
         allowed: ArrayLike,
         name: Callable[[int], str],
-        atoms: Callable[[int], Sequence[int]],
+        atoms: Callable[[int], Iterable[int]],
         near: ArrayLike = 0.0,
     ) -> Miss | None:
         """The worst of some rows, or None if each is off by no more than allowed; NaN is the worst."""
