@@ -71,8 +71,8 @@ class ContextRows:
     @cached_property
     def _settings(self) -> dict[str, float]:
         """What the integrator was made with or told; its variables are copies for the program."""
-        integrator = owner(self.rows, self.context)
-        return integrator.program.settings if hasattr(integrator, "program") else self._variables
+        program = getattr(owner(self.rows, self.context), "program", None)
+        return self._variables if program is None else program.settings
 
     def targets(self) -> FloatArray:
         """Where each target is now, shape (n_rows,)."""
