@@ -88,6 +88,8 @@ class CarriedConstraints:
     #: Whether the System had no constraints of its own when the forces were added.
     alone = False
     _told = False
+    #: Sizes of the gradients, where velocities were looked at first.
+    _slopes: FloatArray | None = None
 
     def __init__(
         self,
@@ -290,18 +292,18 @@ class CarriedConstraints:
 
     def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
         held = self.motion.sources[0]
-        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
-        sigma = held.value(x, time)
-        miss = Miss.worst("positions", sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
-        if miss is not None or v is None:
+        found = held.residuals(x, v, time)
+        allowed = np.maximum(START_TOLERANCE * held.scale, found.allowed)
+        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        if miss is not None or found.rates is None or found.speeds is None:
             return miss
-        slopes = held.jacobian(x, time)
-        demanded = held.velocity_target(x, time)
-        length = np.sqrt(slopes.multiply(slopes).sum(axis=1))
-        # The last is what carrying v together with x takes from it.
-        speed = START_TOLERANCE * np.abs(v).max() + 4 * SPEED_SCALE * np.spacing(np.abs(x[held.touched]).max())
-        allowed = length * speed + START_TOLERANCE * np.abs(demanded)
-        return Miss.worst("velocities", slopes @ v.ravel() - demanded, allowed, held.row_name, held.row_atoms)
+        if self._slopes is None:
+            gradients = held.jacobian(x, time)
+            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+        size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
+        # What is taken from v where it is carried together with x: all there is of a body at rest.
+        lost = 4 * SPEED_SCALE * np.spacing(np.abs(x[held.touched]).max(initial=0.0)) * self._slopes
+        return Miss.worst("velocities", found.rates, START_TOLERANCE * size + lost, held.row_name, held.row_atoms)
 
     def _tell_of_rounding(self, x: FloatArray) -> None:
         """Warn, once, of coordinates so large that their rounding becomes velocity; nobody else would see it."""

@@ -12,6 +12,7 @@ from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
+    CertificateError,
     ConvergenceError,
     InputError,
     KconsError,
@@ -314,14 +315,16 @@ class CollectiveRows(GroupRows):
         Raises
         ------
         ConvergenceError, SingularGeometryError
-            As these. Also where the rows say that they are not fulfilled afterwards.
+            As these.
+        CertificateError
+            The rows say that they are not fulfilled afterwards.
         """
         self.apply_positions(context, tolerance)
         self.apply_velocities(context)
         miss = self.worst_miss(context)
         if miss is not None:
-            raise ConvergenceError(
-                f"after restoring, the {miss}", residual=abs(miss.off), row=miss.row, atoms=miss.atoms
+            raise CertificateError(
+                f"after restoring, the {miss}", row=miss.row, residual=abs(miss.off), atoms=miss.atoms
             )
 
     def check(self, context: openmm.Context) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import openmm
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, NonFiniteError
+from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.openmm.part import Miss
 from kcons.openmm.system_checks import (
     SystemRows,
@@ -278,7 +278,7 @@ class Guard:
 
         Raises
         ------
-        ConvergenceError, NonFiniteError
+        CertificateError, ConvergenceError, NonFiniteError
             The Context is put back to where it was checked last.
         """
         self.since_check += steps
@@ -305,16 +305,17 @@ class Guard:
             misses += [part.worst_miss(context, velocities=not self._late) for part in integrator.parts]
             for miss in misses:
                 if miss is not None:
-                    raise ConvergenceError(
-                        f"at step {step} the {miss} (allowed {miss.allowed:.3g}), and no solver told. Take a smaller "
-                        "time step",
-                        residual=abs(miss.off),
-                        tolerance=miss.allowed,
+                    raise CertificateError(
+                        f"at step {step} the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take "
+                        "a smaller time step, or see what changed the state or the rows behind their back",
                         row=miss.row,
+                        residual=abs(miss.off),
                         atoms=miss.atoms,
-                        step=step,
                     )
-        except (ConvergenceError, NonFiniteError) as error:
+        except (CertificateError, ConvergenceError, NonFiniteError) as error:
+            error.step = step
+            if isinstance(error, CertificateError):
+                error.state = self._good
             if not self.disturbed and self._good is not None:
                 self.put_back()
                 good = context.getStepCount()
