@@ -267,7 +267,7 @@ class CollectiveRows(GroupRows):
         slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
-        variables = variables_of(self, integrator)
+        variables = variables_of(integrator)
         if slope is not None:
             integrator.program.set(self._of("rate", row), slope)
         if self._rates[row] != 0.0:

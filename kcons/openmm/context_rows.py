@@ -12,6 +12,7 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
+from kcons.openmm.hearing import listeners
 from kcons.openmm.part import Miss
 from kcons.openmm.row_forces import energy
 from kcons.openmm.system_checks import refuse_barostat, refuse_motion_remover
@@ -64,15 +65,20 @@ class ContextRows:
         return np.array(self.context.getState(getVelocities=True).getVelocities(asNumpy=True)._value)
 
     @cached_property
-    def _variables(self) -> dict[str, float]:
-        integrator = owner(self.rows, self.context)
-        return {} if integrator is None else variables_of(self.rows, integrator)
+    def _owner(self) -> openmm.CustomIntegrator | None:
+        return owner(self.rows, self.context)
 
     @cached_property
     def _settings(self) -> dict[str, float]:
         """What the integrator was made with or told; its variables are copies for the program."""
-        program = getattr(owner(self.rows, self.context), "program", None)
-        return self._variables if program is None else program.settings
+        if self._owner is None:
+            return {}
+        program = getattr(self._owner, "program", None)
+        return variables_of(self._owner) if program is None else program.settings
+
+    @cached_property
+    def _clock(self) -> float:
+        return 0.0 if self._owner is None else self.rows._clock(variables_of(self._owner))
 
     def targets(self) -> FloatArray:
         """Where each target is now, shape (n_rows,)."""
@@ -80,8 +86,8 @@ class ContextRows:
         for k, target in enumerate(rows._targets):
             if isinstance(target, str):
                 found.append(self.context.getParameter(target))
-            elif self._variables:
-                moved = self.target_rates()[k] * rows._clock(self._variables) if rows._rates[k] != 0.0 else 0.0
+            elif self._settings:
+                moved = self.target_rates()[k] * self._clock if rows._rates[k] != 0.0 else 0.0
                 found.append(self._settings[rows._of("target", k)] + moved)
             else:
                 assert target is not None
@@ -333,6 +339,9 @@ class ContextRows:
 
 def owner(rows: CollectiveRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
+    for ours in listeners(context):
+        if rows._of("push", 0) in ours.program.numbers:
+            return ours
     integrator = context.getIntegrator()
     found = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
@@ -348,7 +357,7 @@ def _names(integrator: openmm.CustomIntegrator) -> list[str]:
     return [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
 
 
-def variables_of(rows: CollectiveRows, integrator: openmm.CustomIntegrator) -> dict[str, float]:
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
     """All global variables of the integrator by name."""
     return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
 

@@ -73,7 +73,7 @@ def as_projected(
     kind: type[ProjectedIntegrator],
     integrator: openmm.CustomIntegrator,
     parts: Sequence[Part] = (),
-    check_every: int = 100,
+    check_every: int | None = None,
     ensemble: Ensemble | None = None,
 ) -> ProjectedIntegrator:
     """The integrator of this class that has the program of `integrator`.

@@ -5,11 +5,13 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openmm
 
+from kcons.certificate import MOST, SHARE
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.openmm.part import Miss
@@ -99,6 +101,8 @@ class Guard:
         self.since_check = 0
         self._surroundings: tuple[object, ...] | None = None
         self._good: openmm.State | None = None
+        #: When the last check ended, what it took, and how many were put off since.
+        self._checked, self._cost, self._put_off = perf_counter(), 0.0, 0
         self._freedom: int | None = None
         self._left: tuple[int, Any] | None = None
         self._parameters: dict[str, float] | None = None
@@ -276,6 +280,8 @@ class Guard:
     def count(self, steps: int) -> None:
         """Count steps that were made; check where a check is due.
 
+        Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
+
         Raises
         ------
         CertificateError, ConvergenceError, NonFiniteError
@@ -283,8 +289,14 @@ class Guard:
         """
         self.since_check += steps
         self.disturbed = False
-        if self.integrator.check_every and self.since_check >= self.integrator.check_every:
-            self.check()
+        if not self.integrator.check_every or self.since_check < self.integrator.check_every:
+            return
+        spare = self.integrator.spare and self._put_off < MOST
+        if spare and self._cost > SHARE * (perf_counter() - self._checked):
+            self._put_off += 1
+            self.since_check = 0
+            return
+        self.check()
 
     def check(self) -> None:
         """Positions and velocities finite and on all that is held, or back to where they were.
@@ -293,7 +305,7 @@ class Guard:
         velocities of the Context, whatever the solvers have found.
         """
         context, integrator = self.context, self.integrator
-        step = context.getStepCount()
+        step, begun = context.getStepCount(), perf_counter()
         try:
             integrator.ensemble.verify(integrator)
             now = context.getState(positions=True, velocities=True)
@@ -325,9 +337,11 @@ class Guard:
                 )
             raise
         self._remember(now)
+        self._cost = self._checked - begun
 
     def _remember(self, now: openmm.State) -> None:
-        self.since_check = 0
+        self.since_check = self._put_off = 0
+        self._checked = perf_counter()
         self._good = now
 
     def put_back(self) -> None:

@@ -170,14 +170,16 @@ def _reinitialize(original: Callable[..., None], context: openmm.Context, *args:
 
 
 def _get_state(original: Callable[..., openmm.State], context: openmm.Context, *args: Any, **kwargs: Any) -> Any:
-    if len(args) <= _GROUPS and kwargs.get("groups", -1) in (-1, 0xFFFFFFFF):
+    computes = args or not _COMPUTES.isdisjoint(kwargs)
+    if computes and len(args) <= _GROUPS and kwargs.get("groups", -1) in (-1, 0xFFFFFFFF):
         rows = {group for one in listeners(context) for group in one.row_groups}
         if rows:
             kwargs["groups"] = set(range(32)) - rows
     return original(context, *args, **kwargs)
 
 
-#: Place of `groups` among the arguments of getState.
+#: What needs forces or energies, and the place of `groups` among the arguments of getState.
+_COMPUTES = frozenset(["forces", "energy", "parameterDerivatives", "getForces", "getEnergy", "getParameterDerivatives"])
 _GROUPS = 8
 
 

@@ -38,8 +38,9 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     limits the accuracy.
 
     At the first step the integrator looks at the System and its Context: what it cannot propagate it refuses, and
-    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that OpenMM's
-    solvers did converge, which OpenMM itself does not tell.
+    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that positions and
+    velocities are on all that is held, by the constraints of the System and the rows themselves: whether its solvers
+    did converge OpenMM does not tell.
 
     Parameters
     ----------
@@ -53,8 +54,9 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float
         Relative tolerance of the System's constraints.
-    check_every : int
-        Steps between two checks; 0 for none but the first.
+    check_every : int, optional
+        Steps between two checks; 0 for none but the first. Left open, 100, and later, up to 10,000, where checks would
+        take more than a hundredth of the time.
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
 
@@ -68,6 +70,10 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
     """
 
+    #: Steps between two checks, if nothing else is asked for, ...
+    _check_every = 100
+    #: ... when checks come later where they would take more than a hundredth of the time.
+    spare = True
     #: What writes the program.
     _writer: type[LeanStepWriter] = LeanStepWriter
 
@@ -78,14 +84,13 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         *,
         parts: Sequence[Part] = (),
         tolerance: float = 1e-10,
-        check_every: int = 100,
+        check_every: int | None = None,
         ensemble: Ensemble | None = None,
     ) -> None:
         super().__init__(_picoseconds(timestep))
         self.setConstraintTolerance(tolerance)
-        if int(check_every) != check_every or check_every < 0:
-            raise InputError(f"check_every is {check_every}; give a number of steps, 0 for never", item="check_every")
-        self.check_every = int(check_every)
+        if check_every is not None:
+            self.check_every = check_every
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
         self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
@@ -132,6 +137,17 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         return count_step(self.program, iterations=iterations, **known)
 
     # -- running --------------------------------------------------------------------------------
+
+    @property
+    def check_every(self) -> int:
+        """Steps between two checks; 0 for none but the first."""
+        return self._check_every
+
+    @check_every.setter
+    def check_every(self, steps: int) -> None:
+        if int(steps) != steps or steps < 0:
+            raise InputError(f"check_every is {steps}; give a number of steps, 0 for never", item="check_every")
+        self._check_every, self.spare = int(steps), False
 
     @property
     def ensemble(self) -> Ensemble:
@@ -587,7 +603,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
 
     def _making(self) -> tuple[Any, ...]:
         scheme = LEAPFROG if self.scheme is None else self.scheme
-        return self._dt, scheme, self.parts, self.getConstraintTolerance(), self.check_every, self.ensemble
+        every = None if self.spare else self.check_every
+        return self._dt, scheme, self.parts, self.getConstraintTolerance(), every, self.ensemble
 
     def __reduce__(self) -> tuple[Any, ...]:
         return remade, (type(self), self._making(), settings_of(self))
