@@ -316,14 +316,7 @@ class Guard:
             misses = [] if self._late else [self._speed_miss(x, v)]
             misses += [part.worst_miss(context, velocities=not self._late) for part in integrator.parts]
             for miss in misses:
-                if miss is not None:
-                    raise CertificateError(
-                        f"at step {step} the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take "
-                        "a smaller time step, or see what changed the state or the rows behind their back",
-                        row=miss.row,
-                        residual=abs(miss.off),
-                        atoms=miss.atoms,
-                    )
+                self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:
             error.step = step
             if isinstance(error, CertificateError):
@@ -338,6 +331,17 @@ class Guard:
             raise
         self._remember(now)
         self._cost = self._checked - begun
+
+    def certify(self, miss: Miss | None, where: str = "") -> None:
+        """Raise `CertificateError` for a miss that the solvers have not told of."""
+        if miss is not None:
+            raise CertificateError(
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
+                "step, or see what changed the state or the rows behind their back",
+                row=miss.row,
+                residual=abs(miss.off),
+                atoms=miss.atoms,
+            )
 
     def _remember(self, now: openmm.State) -> None:
         self.since_check = self._put_off = 0

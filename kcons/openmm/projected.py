@@ -365,6 +365,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
                 context.setVelocities(np.zeros_like(velocities))
                 self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
             guard.check_rows(positions_of(context), None)
+            for part in self.parts:
+                guard.certify(part.worst_miss(context, velocities=False))
         except KconsError:
             context.setPositions(start)
             raise
