@@ -15,21 +15,17 @@ from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.hearing import listen
-from kcons.openmm.isokinetic import kelvins
-from kcons.openmm.langevin import Langevin
 from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
 from kcons.openmm.schemes import LEAPFROG, to_scheme
-from kcons.openmm.states import StatesOnConstraints, value_in
+from kcons.openmm.settings import Settings, picoseconds
+from kcons.openmm.states import StatesOnConstraints
 from kcons.openmm.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
 
-#: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
-_SAME = 1e-6
 
-
-class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
+class ProjectedIntegrator(StatesOnConstraints, Settings):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -87,7 +83,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         check_every: int | None = None,
         ensemble: Ensemble | None = None,
     ) -> None:
-        super().__init__(_picoseconds(timestep))
+        super().__init__(picoseconds(timestep))
         self.setConstraintTolerance(tolerance)
         if check_every is not None:
             self.check_every = check_every
@@ -148,16 +144,6 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         if int(steps) != steps or steps < 0:
             raise InputError(f"check_every is {steps}; give a number of steps, 0 for never", item="check_every")
         self._check_every, self.spare = int(steps), False
-
-    @property
-    def ensemble(self) -> Ensemble:
-        """How velocities change between drifts, as it is now; see `setTemperature`, `setFriction`."""
-        return self._ensemble
-
-    @property
-    def thermostatted(self) -> bool:
-        """Whether velocities change by more than forces and constraints."""
-        return type(self.ensemble) is not ConstantEnergy
 
     @property
     def context(self) -> openmm.Context:
@@ -279,50 +265,6 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         if "behind" in self.program.numbers:
             self.program.write("behind", 0.0)
 
-    # -- what the Context is told, see kcons.openmm.hearing -------------------------------------
-
-    def _hear_moved(self) -> None:
-        """Something has moved x or v."""
-        if self._guard is not None:
-            self._guard.disturbed = True
-
-    def _hear_forget(self) -> None:
-        """A State is about to be loaded: what it does not bring is that of a new integrator."""
-        self.program.forget()
-        if self.scheme is None:
-            self.setPerDofVariableByName("impulse", [openmm.Vec3(0, 0, 0)] * self._n_particles())
-
-    def _hear_loaded(self, context: openmm.Context) -> None:
-        """Variables were read from a State or checkpoint: what this integrator was made with wins.
-
-        The run goes on as if nothing had happened where the State is that of this run. Forces that were kept are
-        those of another System otherwise, or of other settings.
-        """
-        other = bool(self.program.differing())
-        self.program.push()
-        if other or not self._forces_kept(context):
-            self.refresh()
-        if self._guard is not None:
-            self._guard.started, self._guard.disturbed = False, True
-
-    def _hear_reinitialized(self) -> None:
-        """The Context has read the System again."""
-        self._guard = None
-        self.program.push()
-        self.refresh()
-
-    def _forces_kept(self, context: openmm.Context) -> bool:
-        """Whether forces that the program has kept are those at x."""
-        if "force" not in self.program.vectors or self.getGlobalVariableByName("stale"):
-            return True
-        kept = np.array(self.getPerDofVariableByName("force"))
-        state = context.getState(forces=True, groups=self.getIntegrationForceGroups())
-        now = np.asarray(state.getForces(asNumpy=True)._value)
-        return bool(np.abs(kept - now).max(initial=0.0) <= _SAME * np.abs(now).max(initial=0.0))
-
-    def _n_particles(self) -> int:
-        return len(self.getPerDofVariableByName("xu"))
-
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
 
@@ -417,66 +359,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         if code:
             raise self._failure(code, count)
 
-    # -- temperature ----------------------------------------------------------------------------
-
-    def setTemperature(self, temperature: unit.Quantity | float) -> None:
-        """Change the temperature (K if a float) of the ensemble.
-
-        Raises
-        ------
-        InputError
-            It is below zero; with `Isokinetic`, zero.
-        UnsupportedError
-            The ensemble has none.
-        """
-        self._take(self.ensemble.at(kelvins(temperature)))
-
-    def getTemperature(self) -> unit.Quantity:
-        """The temperature of the ensemble.
-
-        Raises
-        ------
-        UnsupportedError
-            It has none.
-        """
-        return self._given("temperature") * unit.kelvin
-
-    def setFriction(self, friction: unit.Quantity | float) -> None:
-        """Change the friction (1/ps if a float) of the ensemble.
-
-        Raises
-        ------
-        InputError
-            It is below zero.
-        UnsupportedError
-            The ensemble has none.
-        """
-        self._given("friction")
-        assert isinstance(self.ensemble, Langevin)
-        self._take(self.ensemble.with_friction(friction))
-
-    def getFriction(self) -> unit.Quantity:
-        """The friction of the ensemble.
-
-        Raises
-        ------
-        UnsupportedError
-            It has none.
-        """
-        return self._given("friction") / unit.picosecond
-
-    def _given(self, what: str) -> float:
-        value = getattr(self.ensemble, what, None)
-        if not isinstance(value, float):
-            name = "constant energy" if not self.thermostatted else repr(self.ensemble)
-            raise UnsupportedError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
-        return value
-
-    def _take(self, ensemble: Ensemble) -> None:
-        self._ensemble = ensemble
-        for name, value in ensemble.settings().items():
-            self.program.set(name, value)
-        ensemble.follow(self)
+    # -- temperature that is found --------------------------------------------------------------
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
@@ -504,50 +387,6 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
 
     # -- settings -------------------------------------------------------------------------------
-
-    @property
-    def _dt(self) -> float:
-        return float(self.getStepSize().value_in_unit(unit.picosecond))
-
-    def setStepSize(self, size: unit.Quantity | float) -> None:
-        """Change the time step.
-
-        Raises
-        ------
-        InputError
-            It is no positive number.
-        """
-        super().setStepSize(_picoseconds(size))
-
-    def setConstraintTolerance(self, tol: float) -> None:
-        """Change the relative tolerance of the System's constraints.
-
-        Raises
-        ------
-        InputError
-            It is not between 0 and 1.
-        """
-        if not 0 < tol < 1:
-            raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
-        super().setConstraintTolerance(tol)
-
-    def setGlobalVariableByName(self, name: str, value: float) -> None:
-        """Set a variable of the program.
-
-        Raises
-        ------
-        UnsupportedError
-            It is a setting, which has a method of its own.
-        """
-        if name in self.program.settings:
-            raise UnsupportedError(
-                f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
-            )
-        super().setGlobalVariableByName(name, value)
-
-    def setGlobalVariable(self, index: int, value: float) -> None:
-        """As `setGlobalVariableByName`."""
-        self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.
@@ -617,13 +456,3 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
         return self.__copy__()
-
-
-def _picoseconds(timestep: Any) -> float:
-    dt = value_in(timestep, unit.picosecond)
-    if not (np.isfinite(dt) and dt > 0):
-        raise InputError(
-            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
-            item="timestep",
-        )
-    return dt
