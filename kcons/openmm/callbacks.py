@@ -31,6 +31,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion import Motion
+from kcons.openmm.system_checks import ROW_NAME
 from kcons.steppers.drifts import NonholonomicFlight
 from kcons.steppers.summation import Point
 
@@ -45,7 +46,7 @@ LOW_SCALE = 2.0**27
 CARRY_SCALE = 2.0**20
 
 PHASES = ("remember", "land", "project")
-PREFIX = "kcons rows"
+PREFIX = f"{ROW_NAME}s"
 LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
 
 

@@ -16,7 +16,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
-from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm.callbacks import (
     CARRY_SCALE,
@@ -30,6 +30,8 @@ from kcons.openmm.callbacks import (
     cell_of,
     force_name,
 )
+from kcons.openmm.guard import NEAR
+from kcons.openmm.part import Miss
 from kcons.openmm.program import Program
 from kcons.openmm.requirements import (
     bonds_of,
@@ -87,6 +89,8 @@ class CarriedConstraints:
     #: Whether the System had no constraints of its own when the forces were added.
     alone = False
     _told = False
+    #: Sizes of the gradients, where velocities were looked at first.
+    _slopes: FloatArray | None = None
 
     def __init__(
         self,
@@ -263,19 +267,15 @@ class CarriedConstraints:
         self._check_system(system)
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
-        held, motion = self.motion.constraint_set, self.motion
         self._tell_of_rounding(x)
-        miss = np.abs(held.value(x, time))
-        allowed = np.maximum(START_TOLERANCE * held.scale, 4 * held.tolerance(x, time))
-        if not np.all(miss <= allowed):
-            row = int(np.argmax(np.where(np.isfinite(miss), miss / allowed, np.inf)))
+        miss = self._worst(x, None, time)
+        if miss is not None:
             raise InputError(
-                f"positions are off row {held.row_name(row)} by {miss[row]:.6g}; bring them onto the rows by "
-                "apply_positions(context), or correct them",
+                f"{miss}; bring them onto the rows by apply_positions(context), or correct them",
                 item="positions",
-                atoms=held.row_atoms(row),
+                atoms=miss.atoms,
             )
-        tangent = motion.project_velocities(x, v, time=time)
+        tangent = self.motion.project_velocities(x, v, time=time)
         away = np.abs(tangent - v)
         if away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
             atom = int(np.argmax(away.max(axis=1)))
@@ -285,6 +285,26 @@ class CarriedConstraints:
                 item="velocities",
                 atoms=[atom],
             )
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
+        x, v, time = self._state(context)
+        return self._worst(x, v if velocities else None, time)
+
+    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
+        held = self.motion.sources[0]
+        found = held.residuals(x, v, time)
+        allowed = np.maximum(START_TOLERANCE * held.scale, found.allowed)
+        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        if miss is not None or found.rates is None or found.speeds is None:
+            return miss
+        if self._slopes is None:
+            gradients = held.jacobian(x, time)
+            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+        size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
+        # What is taken from v where it is carried together with x: all there is of a body at rest.
+        lost = 4 * SPEED_SCALE * np.spacing(np.abs(x[held.touched]).max(initial=0.0)) * self._slopes
+        return Miss.worst("velocities", found.rates, START_TOLERANCE * size + lost, held.row_name, held.row_atoms)
 
     def _tell_of_rounding(self, x: FloatArray) -> None:
         """Warn, once, of coordinates so large that their rounding becomes velocity; nobody else would see it."""
@@ -313,7 +333,16 @@ class CarriedConstraints:
         """
         x, _, time = self._state(context)
         bonds = bonds_of(context.getSystem())
-        context.setPositions(self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None))
+        brought = self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None)
+        miss = self._worst(brought, None, time)
+        if miss is not None:
+            raise InfeasibleError(
+                f"the rows cannot be reached from here: {miss}; nothing was changed. Start nearer to the targets",
+                residual=abs(miss.off),
+                row=miss.row,
+                atoms=miss.atoms,
+            )
+        context.setPositions(brought)
         context.computeVirtualSites()
 
     def apply_velocities(self, context: openmm.Context) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openmm
@@ -11,6 +12,7 @@ from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
+    CertificateError,
     ConvergenceError,
     InputError,
     KconsError,
@@ -20,10 +22,14 @@ from kcons.errors import (
 )
 from kcons.openmm.context_rows import ContextRows, variables_of
 from kcons.openmm.group_rows import GroupRows
+from kcons.openmm.part import Miss
 from kcons.openmm.row_algebra import blocks
-from kcons.openmm.row_forces import Rigid, Row, forces_in, found_values, moved_atoms, number, period_of, place
+from kcons.openmm.row_forces import Rigid, Row, forces_in, found_values, moved_atoms, number, period_of, place, unit_of
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
+
+if TYPE_CHECKING:
+    from kcons.openmm.projected import ProjectedIntegrator
 
 
 class CollectiveRows(GroupRows):
@@ -92,15 +98,21 @@ class CollectiveRows(GroupRows):
         self.tolerance = float(tolerance)
         self.max_iterations = int(max_iterations)
         self.n_rows = len(given)
-        self._targets = [
-            None if row.target is None else _value_or_name(row.target, f"target of row {k}")
-            for k, row in enumerate(given)
-        ]
-        self._rates = [_value_or_name(row.rate, f"rate of row {k}") for k, row in enumerate(given)]
-        periods = [
-            None if row.period is None else number(row.period, f"period of row {k}") for k, row in enumerate(given)
-        ]
-        scales = [None if row.scale is None else number(row.scale, f"scale of row {k}") for k, row in enumerate(given)]
+        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
+        self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]
+
+        def read(name: str, per: unit.Unit = unit.dimensionless) -> list[Any]:
+            """An attribute of all rows: numbers, None, and for targets and rates names."""
+            values = [getattr(row, name) for row in given]
+            kept = (str, type(None)) if name in ("target", "rate") else type(None)
+            return [
+                value if isinstance(value, kept) else number(value, f"{name} of row {k}", of, per)
+                for k, (value, of) in enumerate(zip(values, self._units, strict=True))
+            ]
+
+        self._targets = read("target")
+        self._rates = read("rate", unit.picosecond)
+        periods, scales = read("period"), read("scale")
         for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
             if target is None and positions is None:
                 raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
@@ -116,7 +128,6 @@ class CollectiveRows(GroupRows):
                     "define it by addGlobalParameter of a Force",
                     item="target",
                 )
-        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
         self.names = tuple(_name(row, f) for row, f in zip(given, forces, strict=True))
         self.periods = tuple(
             (period_of(f[0]) if len(f) == 1 else 0.0) if period is None else period
@@ -170,6 +181,11 @@ class CollectiveRows(GroupRows):
     def driven(self) -> bool:
         """Whether targets move."""
         return any(rate != 0.0 for rate in self._rates)
+
+    @property
+    def steered(self) -> bool:
+        """Whether a target is a context parameter, which others may set for the step to come."""
+        return any(isinstance(target, str) for target in self._targets)
 
     def values(self, context: openmm.Context) -> FloatArray:
         """q of each row, shape (n_rows,)."""
@@ -233,9 +249,11 @@ class CollectiveRows(GroupRows):
         return self.at(context).targets()
 
     def set_target(
-        self, integrator: openmm.CustomIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
+        self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
     ) -> None:
         """Hold row `row` at another value from now on; `restore` brings the state there.
+
+        It belongs to this integrator: no State or checkpoint changes it.
 
         Raises
         ------
@@ -244,17 +262,18 @@ class CollectiveRows(GroupRows):
         """
         if isinstance(self._targets[row], str):
             raise InputError(f"the target of row {row} is the context parameter {self._targets[row]}", item="target")
-        value = number(target, f"target of row {row}")
-        slope = None if rate is None else number(rate, f"rate of row {row}")
+        of = self._units[row]
+        value = number(target, f"target of row {row}", of)
+        slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
         if slope is not None and self._rates[row] == 0.0:
             raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
-        variables = variables_of(self, integrator)
+        variables = variables_of(integrator)
         if slope is not None:
-            integrator.setGlobalVariableByName(self._of("rate", row), slope)
+            integrator.program.set(self._of("rate", row), slope)
         if self._rates[row] != 0.0:
             slope = integrator.getGlobalVariableByName(self._of("rate", row))
             value -= slope * self._clock(variables)
-        integrator.setGlobalVariableByName(self._of("target", row), value)
+        integrator.program.set(self._of("target", row), value)
 
     def _clock(self, variables: dict[str, float]) -> float:
         if not self._drives:
@@ -291,9 +310,22 @@ class CollectiveRows(GroupRows):
         self.at(context).apply_velocities()
 
     def restore(self, context: openmm.Context, tolerance: float | None = None) -> None:
-        """`apply_positions`, then `apply_velocities`."""
+        """`apply_positions`, then `apply_velocities`.
+
+        Raises
+        ------
+        ConvergenceError, SingularGeometryError
+            As these.
+        CertificateError
+            The rows say that they are not fulfilled afterwards.
+        """
         self.apply_positions(context, tolerance)
         self.apply_velocities(context)
+        miss = self.worst_miss(context)
+        if miss is not None:
+            raise CertificateError(
+                f"after restoring, the {miss}", row=miss.row, residual=abs(miss.off), atoms=miss.atoms
+            )
 
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows.
@@ -310,6 +342,10 @@ class CollectiveRows(GroupRows):
             Positions or velocities are not on the rows; `restore` brings them there.
         """
         self.at(context).check()
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v from the Forces themselves, at the state of the context."""
+        return self.at(context).worst_miss(velocities)
 
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         """The error for a step in which the rows failed."""
@@ -352,10 +388,6 @@ class CollectiveRows(GroupRows):
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"
-
-
-def _value_or_name(value: object, item: str) -> float | str:
-    return value if isinstance(value, str) else number(value, item)
 
 
 def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> list[openmm.Force]:

@@ -31,7 +31,7 @@ class EndWriter(LeanStepWriter):
 
     def write(self) -> None:
         p = self.program
-        p.number("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
+        p.control("end", "0 for a step, 1 to begin leapfrog steps, 2 to end them")
         with p.when("end = 0", "a step"):
             super().write()
         with p.when("end = 1", "leapfrog steps follow"):
@@ -45,15 +45,16 @@ class EndWriter(LeanStepWriter):
 class Ends(ProjectedIntegrator):
     """RATTLE by a program, which also makes the ends of leapfrog steps."""
 
+    _check_every = 1000
     _writer = EndWriter
 
     def execute(self, end: float) -> None:
         """Begin or end leapfrog steps; OpenMM takes that for a step, and moves its clock."""
-        self.setGlobalVariableByName("end", end)
+        self.program.write("end", end)
         try:
             openmm.CustomIntegrator.step(self, 1)
         finally:
-            self.setGlobalVariableByName("end", _STEP)
+            self.program.write("end", _STEP)
 
 
 class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
@@ -72,10 +73,10 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         In ps if a float; more than 0.
     tolerance : float
         Relative tolerance of the System's constraints.
-    check_every : int
-        Steps between two checks that OpenMM's solvers did converge; 0 for none but the first. A check takes as long as
-        some ten steps of a hundred atoms. One that is due shortly before the end of a call is made there, up to half as
-        many steps late: to stop on the way costs more.
+    check_every : int, optional
+        Steps between two checks that OpenMM's solvers did converge; 0 for none but the first. Left open, 1000, and
+        later where checks would take more than a hundredth of the time. One that is due shortly before the end of a
+        call is made there, up to half as many steps late: to stop on the way costs more.
 
     Raises
     ------
@@ -92,7 +93,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     An AndersenThermostat draws velocities between steps; with one, all steps are those of ProjectedIntegrator.
     """
 
-    def __init__(self, timestep: unit.Quantity | float, *, tolerance: float = 1e-10, check_every: int = 1000) -> None:
+    def __init__(
+        self, timestep: unit.Quantity | float, *, tolerance: float = 1e-10, check_every: int | None = None
+    ) -> None:
         super().__init__()
         self._ends = Ends(timestep, "rattle", tolerance=tolerance, check_every=check_every)
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
@@ -103,6 +106,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     def __repr__(self) -> str:
         return f"<RattleIntegrator: {self._dt * 1e3:g} fs>"
+
+    #: Others may not change which integrator is in use.
+    closed = True
 
     # -- running --------------------------------------------------------------------------------
 
@@ -135,7 +141,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         """
         ends = self._ends
         guard = ends._watch()
-        if not guard.started:
+        if guard.disturbed:
             guard.begin()
         guard.meet_others()
         while steps > 0:
@@ -266,7 +272,8 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     # -- copies ---------------------------------------------------------------------------------
 
     def _making(self) -> tuple[Any, ...]:
-        return self._dt, self.getConstraintTolerance(), self.check_every, settings_of(self._ends)
+        every = None if self._ends.spare else self.check_every
+        return self._dt, self.getConstraintTolerance(), every, settings_of(self._ends)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()
@@ -279,7 +286,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         return self.__copy__()
 
 
-def _remade(dt: float, tolerance: float, check_every: int, settings: dict[str, Any]) -> RattleIntegrator:
+def _remade(dt: float, tolerance: float, check_every: int | None, settings: dict[str, Any]) -> RattleIntegrator:
     made = RattleIntegrator(dt, tolerance=tolerance, check_every=check_every)
     made.setIntegrationForceGroups(settings["groups"])
     return made

@@ -21,6 +21,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError, UnsupportedError
 from kcons.openmm.program import Program
 from kcons.openmm.quadric_rows import QuadricRows
+from kcons.openmm.system_checks import SURFACE_NAME
 
 #: Where drifts began; both callbacks of a System run in turn within one drift.
 _STARTS: dict[str, FloatArray] = {}
@@ -58,7 +59,7 @@ class CompiledQuadricRows(QuadricRows):
             force = openmm.PythonForce(callback)
             force.setParticles(self.atoms[order].tolist())
             force.setForceGroup(group)
-            force.setName("kcons surface")
+            force.setName(SURFACE_NAME)
             system.addForce(force)
         self._order = order
 

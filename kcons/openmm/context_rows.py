@@ -12,6 +12,8 @@ import openmm
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
+from kcons.openmm.hearing import listeners
+from kcons.openmm.part import Miss
 from kcons.openmm.row_forces import energy
 from kcons.openmm.system_checks import refuse_barostat, refuse_motion_remover
 
@@ -63,9 +65,20 @@ class ContextRows:
         return np.array(self.context.getState(getVelocities=True).getVelocities(asNumpy=True)._value)
 
     @cached_property
-    def _variables(self) -> dict[str, float]:
-        integrator = owner(self.rows, self.context)
-        return {} if integrator is None else variables_of(self.rows, integrator)
+    def _owner(self) -> openmm.CustomIntegrator | None:
+        return owner(self.rows, self.context)
+
+    @cached_property
+    def _settings(self) -> dict[str, float]:
+        """What the integrator was made with or told; its variables are copies for the program."""
+        if self._owner is None:
+            return {}
+        program = getattr(self._owner, "program", None)
+        return variables_of(self._owner) if program is None else program.settings
+
+    @cached_property
+    def _clock(self) -> float:
+        return 0.0 if self._owner is None else self.rows._clock(variables_of(self._owner))
 
     def targets(self) -> FloatArray:
         """Where each target is now, shape (n_rows,)."""
@@ -73,9 +86,9 @@ class ContextRows:
         for k, target in enumerate(rows._targets):
             if isinstance(target, str):
                 found.append(self.context.getParameter(target))
-            elif self._variables:
-                moved = self.target_rates()[k] * rows._clock(self._variables) if rows._rates[k] != 0.0 else 0.0
-                found.append(self._variables[rows._of("target", k)] + moved)
+            elif self._settings:
+                moved = self.target_rates()[k] * self._clock if rows._rates[k] != 0.0 else 0.0
+                found.append(self._settings[rows._of("target", k)] + moved)
             else:
                 assert target is not None
                 found.append(target)
@@ -87,7 +100,7 @@ class ContextRows:
             if isinstance(rate, str):
                 found.append(self.context.getParameter(rate))
             else:
-                found.append(self._variables.get(rows._of("rate", k), rate))
+                found.append(self._settings.get(rows._of("rate", k), rate))
         return np.array(found)
 
     # -- the rows -------------------------------------------------------------------------------
@@ -301,29 +314,34 @@ class ContextRows:
         sizes = np.linalg.norm(gradients, axis=(1, 2))
         if np.any(np.linalg.norm(gradients.sum(axis=1), axis=1) > 1e-9 * sizes):
             refuse_motion_remover(system, "a collective row")
-        scales = np.array(rows.scales)
-        self._refuse(self.sigma(), scales * max(START_TOLERANCE, 10 * rows.tolerance), "positions")
-        integrator = owner(rows, self.context)
-        if getattr(rows, "_leapfrog", False) and integrator is not None:
-            return  # velocities of half a step before
-        v = self.velocities
-        rates = np.einsum("kai,ai->k", gradients, v) - self.target_rates()
-        size = sizes * float(np.linalg.norm(v, axis=1).max(initial=0.0))
-        self._refuse(rates, START_TOLERANCE * (size + np.abs(self.target_rates())), "velocities")
+        late = getattr(rows, "_leapfrog", False) and owner(rows, self.context) is not None
+        miss = self.worst_miss(velocities=not late)  # those of the leapfrog are of half a step before
+        if miss is not None:
+            raise ConstraintError(f"the {miss}; call restore(context)", rows=[miss.row], atoms=miss.atoms)
 
-    def _refuse(self, off: FloatArray, allowed: FloatArray, what: str) -> None:
-        wrong = ~(np.abs(off) <= allowed)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise ConstraintError(
-                f"the {what} are not on row {row} ({self.rows.names[row]}): off by {off[row]:.3g}; "
-                "call restore(context)",
-                rows=[row],
-            )
+    def worst_miss(self, velocities: bool = True) -> Miss | None:
+        """Energies of the Forces less the targets, and their gradients times v."""
+        rows = self.rows
+        allowed = np.array(rows.scales) * max(START_TOLERANCE, 10 * rows.tolerance)
+        miss = Miss.worst("positions", self.sigma(), allowed, self._name, rows.atoms.__getitem__)
+        if miss is not None or not velocities:
+            return miss
+        gradients, v = self.gradients(), self.velocities
+        demanded = self.target_rates()
+        size = np.linalg.norm(gradients, axis=(1, 2)) * float(np.linalg.norm(v, axis=1).max(initial=0.0))
+        rates = np.einsum("kai,ai->k", gradients, v) - demanded
+        allowed = START_TOLERANCE * (size + np.abs(demanded))
+        return Miss.worst("velocities", rates, allowed, self._name, rows.atoms.__getitem__)
+
+    def _name(self, row: int) -> str:
+        return f"{row} ({self.rows.names[row]})"
 
 
 def owner(rows: CollectiveRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
+    for ours in listeners(context):
+        if rows._of("push", 0) in ours.program.numbers:
+            return ours
     integrator = context.getIntegrator()
     found = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
@@ -339,7 +357,7 @@ def _names(integrator: openmm.CustomIntegrator) -> list[str]:
     return [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
 
 
-def variables_of(rows: CollectiveRows, integrator: openmm.CustomIntegrator) -> dict[str, float]:
+def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
     """All global variables of the integrator by name."""
     return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
 

@@ -19,27 +19,20 @@ if TYPE_CHECKING:
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
 RUN_STATE = frozenset(
     [
-        "failed",
         "good_steps",
         "stale",
         "moved",
         "stage",
         "h",
         "per_h",
-        "first_stage",
-        "end_stage",
-        "between",
         "looked",
         "behind",
         "led",
         "loose",
-        "lean",
-        "moving",
         "dt_last",
         "kick",
         "growth",
         "lost",
-        "end",
     ]
 )
 
@@ -47,18 +40,25 @@ RUN_STATE = frozenset(
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:
     """What a user may have set: seed, force groups, global variables."""
     names = [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
+    program = getattr(integrator, "program", None)
     return {
         "seed": integrator.getRandomNumberSeed(),
         "groups": integrator.getIntegrationForceGroups(),
         "globals": {name: integrator.getGlobalVariableByName(name) for name in names if name not in RUN_STATE},
+        "settings": {} if program is None else dict(program.settings),
     }
 
 
-def apply_settings(integrator: openmm.CustomIntegrator, settings: dict[str, Any]) -> None:
+def apply_settings(integrator: ProjectedIntegrator, settings: dict[str, Any]) -> None:
+    """What was set, but no setting of the ensemble or of a part that the integrator itself has kept."""
+    program = integrator.program
     integrator.setRandomNumberSeed(settings["seed"])
     openmm.Integrator.setIntegrationForceGroups(integrator, settings["groups"])
     for name, value in settings["globals"].items():
-        integrator.setGlobalVariableByName(name, value)
+        if name not in program.settings and name not in program.idle:
+            program.write(name, value)
+    for name, value in settings["settings"].items():
+        program.set(name, value)
 
 
 def remade(kind: type[ProjectedIntegrator], making: tuple[Any, ...], settings: dict[str, Any]) -> ProjectedIntegrator:
@@ -73,7 +73,7 @@ def as_projected(
     kind: type[ProjectedIntegrator],
     integrator: openmm.CustomIntegrator,
     parts: Sequence[Part] = (),
-    check_every: int = 100,
+    check_every: int | None = None,
     ensemble: Ensemble | None = None,
 ) -> ProjectedIntegrator:
     """The integrator of this class that has the program of `integrator`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import openmm
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 class Ensemble(Protocol):
     """The kicks of an integrator, and what happens in the middle of its step.
+
+    A value: it never changes, and may be given to any number of integrators. What changes belongs to the integrator.
 
     Attributes
     ----------
@@ -86,12 +88,42 @@ class Ensemble(Protocol):
         """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
         ...
 
-    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
-        """Another temperature (K) from now on."""
+    def settings(self) -> dict[str, float]:
+        """The global variables of the program that are settings of the ensemble, by name."""
+        ...
+
+    def at(self, temperature: float) -> Ensemble:
+        """The same at another temperature (K)."""
+        ...
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        """The integrator has taken this ensemble in the middle of a run."""
         ...
 
 
-class ConstantEnergy:
+class Value:
+    """Attributes that are given once; equal if they are."""
+
+    def _keep(self, **attributes: Any) -> None:
+        self.__dict__.update(attributes)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise UnsupportedError(
+            f"{self!r} is a value and does not change: call setTemperature or setFriction of the integrator, or make "
+            f"another {type(self).__name__}"
+        )
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and other.__dict__ == self.__dict__
+
+    def __hash__(self) -> int:
+        return hash((type(self), *self.__dict__.items()))
+
+
+class ConstantEnergy(Value):
     """Newton's equations: v += h f/m."""
 
     stays_tangent = False
@@ -124,5 +156,11 @@ class ConstantEnergy:
     def warmth(self, integrator: ProjectedIntegrator) -> float:
         return 1.0
 
-    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
+    def settings(self) -> dict[str, float]:
+        return {}
+
+    def at(self, temperature: float) -> Ensemble:
         raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        pass

@@ -70,9 +70,9 @@ class GroupRows:
             p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
             target, rate = self._targets[k], self._rates[k]
             if isinstance(target, float):
-                p.number(self._of("target", k), f"target of row {k}", target)
+                p.setting(self._of("target", k), f"target of row {k}", target)
             if isinstance(rate, float):
-                p.number(self._of("rate", k), "change of this target in a ps", rate)
+                p.setting(self._of("rate", k), "change of this target in a ps", rate)
             p.number(self._of("push", k), "L: x moves by L times the row")
             p.number(self._of("more", k), "change of L")
             p.number(self._of("sigma", k), "coordinate less target")

@@ -20,6 +20,7 @@ from kcons.errors import InputError, KconsError
 from kcons.openmm.compiled_quadrics import free_groups
 from kcons.openmm.program import Program
 from kcons.openmm.surface_rows import SurfaceRows
+from kcons.openmm.system_checks import SURFACE_NAME
 
 #: Newton steps at most. The loop ends after steps of less than this (nm): the number of right digits doubles.
 NEWTON_STEPS = 12
@@ -155,7 +156,7 @@ class ImplicitRows(SurfaceRows):
             surface.rows().measure(np.zeros((len(surface.atoms), 1, 3)), 0.0)  # a formula that cannot be read
             for group, force in zip(free, surface.forces(surface.atoms), strict=True):
                 force.setForceGroup(group)
-                force.setName("kcons surface")
+                force.setName(SURFACE_NAME)
                 system.addForce(force)
 
     def declare(self, program: Program) -> None:

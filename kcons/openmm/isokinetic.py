@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.ensemble import Value
 from kcons.openmm.guard import positions_of, velocities_of
 from kcons.openmm.momenta import NONE, Momenta, Momentum, conserved_momenta
 from kcons.openmm.program import Program
@@ -34,7 +35,7 @@ _CANCELS = 1e-4
 GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 
 
-class Isokinetic:
+class Isokinetic(Value):
     """Constant kinetic energy, for `ProjectedIntegrator(ensemble=...)`.
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
@@ -79,6 +80,12 @@ class Isokinetic:
     stays_tangent = True
     halves = False
     adds_up = True
+    temperature: float | None
+    kinetic_energy: float | None
+    convention: Literal["exact", "notes"]
+    #: Numbers, or True and False for each particle.
+    atoms: tuple[int, ...] | tuple[bool, ...] | None
+    momentum: Momentum
 
     def __init__(
         self,
@@ -95,13 +102,13 @@ class Isokinetic:
             raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
         if temperature is not None and kinetic_energy is not None:
             raise InputError("give temperature or kinetic_energy, not both", item="temperature")
-        self.temperature = None if temperature is None else kelvins(temperature)
-        self.kinetic_energy = None if kinetic_energy is None else _energy(kinetic_energy)
-        self.convention = convention
-        self.atoms = None if atoms is None else np.asarray(atoms)
-        self.momentum: Momentum = momentum
-        #: g, known after the first step.
-        self.count: int | None = None
+        self._keep(
+            temperature=None if temperature is None else positive(kelvins(temperature), "temperature"),
+            kinetic_energy=None if kinetic_energy is None else _energy(kinetic_energy),
+            convention=convention,
+            atoms=None if atoms is None else tuple(np.asarray(atoms).tolist()),
+            momentum=momentum,
+        )
 
     def __repr__(self) -> str:
         given = [f"{self.temperature:g} K"] if self.temperature is not None else []
@@ -220,8 +227,7 @@ class Isokinetic:
                 item="velocities",
             )
         momenta = self._momenta(integrator, context)
-        count = self._count(integrator, context, momenta)
-        twice = self._twice_kinetic(count, int(np.sum(masses > 0)), found)
+        twice = self._twice_kinetic(self._count(integrator, context, momenta), int(np.sum(masses > 0)), found)
         if _momentum_share(masses, v, momenta.directions) > AT_REST:
             warnings.warn(
                 "total momentum is not zero, and a thermostat that scales velocities scales it too instead of "
@@ -237,7 +243,7 @@ class Isokinetic:
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
-        integrator.setGlobalVariableByName("two_k", twice)
+        integrator.program.write("two_k", twice)
         if abs(found / twice - 1) > ROUNDING:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
@@ -245,7 +251,7 @@ class Isokinetic:
     def verify(self, integrator: ProjectedIntegrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
         if integrator.getGlobalVariableByName("lost"):
-            integrator.setGlobalVariableByName("lost", 0.0)
+            integrator.program.write("lost", 0.0)
             raise ConvergenceError(
                 "a kick turned all velocities round against a force that stops them many times over within the "
                 "step, and lost digits; take a smaller time step"
@@ -259,7 +265,7 @@ class Isokinetic:
         if self.atoms is None:
             return masses
         inside = np.zeros(n, dtype=bool)
-        inside[atom_numbers(self.atoms, n)] = True
+        inside[atom_numbers(np.asarray(self.atoms), n)] = True
         if integrator.parts:
             raise UnsupportedError(
                 "a part of the particles can be thermostatted beside constraints of the System, not beside parts="
@@ -280,7 +286,7 @@ class Isokinetic:
         return conserved_momenta(integrator, context, self.momentum)
 
     def _count(self, integrator: ProjectedIntegrator, context: openmm.Context, momenta: Momenta) -> int:
-        """g."""
+        """g: momenta that are thermostatted and independent."""
         if self.atoms is None:
             count = integrator.independent_momenta(context)
         else:
@@ -292,7 +298,7 @@ class Isokinetic:
         count -= len(momenta.directions)
         if count < 1:
             raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
-        self.count = count
+        integrator._watch().thermal = count
         return count
 
     def _twice_kinetic(self, count: int, n_moving: int, found: float) -> float:
@@ -312,25 +318,33 @@ class Isokinetic:
 
     # -- what can be read -----------------------------------------------------------------------
 
+    def count(self, integrator: ProjectedIntegrator) -> int:
+        """g of an integrator: its momenta that are thermostatted and independent."""
+        guard = integrator._watch()
+        if guard.thermal is None:
+            return self._count(integrator, guard.context, self._momenta(integrator, guard.context))
+        return guard.thermal
+
     def warmth(self, integrator: ProjectedIntegrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
-        count = self.count
-        if count is None:
-            context = integrator.context
-            count = self._count(integrator, context, self._momenta(integrator, context))
+        count = self.count(integrator)
         if self.atoms is not None or count < 2:
             return 1.0
         return integrator.degrees_of_freedom() / (count - 1)
 
-    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
-        """Another temperature from the next step on; velocities are scaled by the kicks."""
-        self.temperature, self.kinetic_energy = temperature, None
+    def settings(self) -> dict[str, float]:
+        return {}
+
+    def at(self, temperature: float) -> Isokinetic:
+        atoms = None if self.atoms is None else np.asarray(self.atoms)
+        return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        """Kicks scale the velocities from the next step on."""
         if integrator.getGlobalVariableByName("two_k"):
-            context = integrator.context
-            masses = self._masses(integrator, context)
-            count = self._count(integrator, context, self._momenta(integrator, context))
-            twice = self._twice_kinetic(count, int(np.sum(masses > 0)), 0.0)
-            integrator.setGlobalVariableByName("two_k", twice)
+            masses = self._masses(integrator, integrator.context)
+            twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
+            integrator.program.write("two_k", twice)
 
     def friction(self, integrator: ProjectedIntegrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
@@ -343,10 +357,7 @@ class Isokinetic:
 
     def compression_rate(self, integrator: ProjectedIntegrator) -> float:
         """Divergence of the flow in phase space, -(g - 1) alpha, in 1/ps."""
-        if self.count is None:
-            self._count(integrator, integrator.context, self._momenta(integrator, integrator.context))
-        assert self.count is not None
-        return -(self.count - 1) * self.friction(integrator)
+        return -(self.count(integrator) - 1) * self.friction(integrator)
 
     def conserved_energy(self, integrator: ProjectedIntegrator) -> float:
         """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
@@ -356,16 +367,21 @@ class Isokinetic:
 
 
 def kelvins(temperature: unit.Quantity | float) -> float:
-    """A temperature above zero, in K.
+    """A temperature in K, not below zero.
 
     Raises
     ------
     InputError
         It is none.
     """
-    if unit.is_quantity(temperature):
-        temperature = temperature.value_in_unit(unit.kelvin)  # type: ignore[union-attr]
-    return positive(temperature, "temperature")  # type: ignore[arg-type]
+    value = temperature
+    if unit.is_quantity(value):
+        if not value.unit.is_compatible(unit.kelvin):  # type: ignore[union-attr]
+            raise InputError(f"temperature is {temperature}; give it in K", item="temperature")
+        value = value.value_in_unit(unit.kelvin)  # type: ignore[union-attr]
+    if not 0 <= float(value) < math.inf:  # type: ignore[arg-type]
+        raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
+    return float(value)  # type: ignore[arg-type]
 
 
 def _energy(energy: unit.Quantity | float) -> float:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
@@ -14,9 +12,6 @@ from kcons.openmm.isokinetic import GAS_CONSTANT, kelvins
 from kcons.openmm.program import Program
 from kcons.steppers.splitting import Splitting
 
-if TYPE_CHECKING:
-    from kcons.openmm.projected import ProjectedIntegrator
-
 
 class Langevin(ConstantEnergy):
     """Canonical ensemble, for `ProjectedIntegrator(ensemble=...)`: half a kick, half a drift along the constraints,
@@ -24,19 +19,20 @@ class Langevin(ConstantEnergy):
         v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
 
     half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator makes
-    a run reproducible, as far as the platform's forces are.
+    a run reproducible, as far as the platform's forces are. A value: to change temperature or friction of a run, call
+    `setTemperature` and `setFriction` of its integrator.
 
     Parameters
     ----------
     temperature : Quantity or float
-        In K if a float.
+        In K if a float; 0 for friction without noise.
     friction : Quantity or float
         gamma in 1/ps if a float; 0 for none.
 
     Raises
     ------
     InputError
-        A temperature that is not above zero, a friction below.
+        A temperature or a friction below zero.
 
     Notes
     -----
@@ -49,14 +45,18 @@ class Langevin(ConstantEnergy):
 
     halves = True
     adds_up = False
+    temperature: float
+    friction: float
 
     def __init__(self, temperature: unit.Quantity | float, friction: unit.Quantity | float) -> None:
-        self.temperature = kelvins(temperature)
-        if unit.is_quantity(friction):
-            friction = friction.value_in_unit(unit.picosecond**-1)  # type: ignore[union-attr]
-        self.friction = float(friction)  # type: ignore[arg-type]
-        if not 0 <= self.friction < float("inf"):
+        gamma = friction
+        if unit.is_quantity(gamma):
+            if not gamma.unit.is_compatible(unit.picosecond**-1):  # type: ignore[union-attr]
+                raise InputError(f"friction is {friction}; give it in 1/ps", item="friction")
+            gamma = gamma.value_in_unit(unit.picosecond**-1)  # type: ignore[union-attr]
+        if not 0 <= float(gamma) < float("inf"):  # type: ignore[arg-type]
             raise InputError(f"friction is {friction}; give a number in 1/ps, not below zero", item="friction")
+        self._keep(temperature=kelvins(temperature), friction=float(gamma))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         return f"Langevin({self.temperature:g} K, {self.friction:g}/ps)"
@@ -72,8 +72,9 @@ class Langevin(ConstantEnergy):
             raise UnsupportedError(f"Langevin splits the drift of scheme='rattle' in two; {scheme!r} has another form")
 
     def declare(self, program: Program) -> None:
-        program.number("kT", "Boltzmann's constant times the temperature, kJ/mol", GAS_CONSTANT * self.temperature)
-        program.number("friction", "1/ps", self.friction)
+        kT, friction = self.settings().values()
+        program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
+        program.setting("friction", "1/ps", friction)
         program.number("kept_share", "what friction leaves of v in a step")
         program.number("spread", "size of the noise")
 
@@ -85,9 +86,12 @@ class Langevin(ConstantEnergy):
         p.each("v", f"kept_share*(v+{impulse})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
         project()
 
-    def set_temperature(self, integrator: ProjectedIntegrator, temperature: float) -> None:
-        self.temperature = temperature
-        integrator.setGlobalVariableByName("kT", GAS_CONSTANT * temperature)
+    def settings(self) -> dict[str, float]:
+        return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
-        self.set_temperature(integrator, self.temperature)
+    def at(self, temperature: float) -> Langevin:
+        return Langevin(temperature, self.friction)
+
+    def with_friction(self, friction: unit.Quantity | float) -> Langevin:
+        """The same with another friction."""
+        return Langevin(self.temperature, friction)

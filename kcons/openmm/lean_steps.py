@@ -51,7 +51,7 @@ class LeanStepWriter(StepWriter):
         self.observed = 2 if self.lean else 1
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:
-            self.program.number("between", "1 if nobody looks at the velocities after this step")
+            self.program.control("between", "1 if nobody looks at the velocities after this step")
         super().write()
 
     # -- the leapfrog without parts -------------------------------------------------------------
@@ -126,9 +126,9 @@ class LeanStepWriter(StepWriter):
         p.vector("u", "velocities of the drift")
         p.vector("raw", "v at the end of the last call, with half a kick and a projection to come")
         p.number("moved", "how far others have moved x or v since the last call")
-        p.number("moving", "1 where barostats may move x between steps")
+        p.control("moving", "1 where barostats may move x between steps")
         p.number("looked", "1 if somebody may have looked since the last step", 1.0)
-        p.number("lean", "1 where v may do without half a kick between steps")
+        p.control("lean", "1 where v may do without half a kick between steps")
         p.number("behind", "1 where v, or else raw, does so now")
         p.number("led", "the same when the last drift began")
         p.number("dt_last", "length of the last step")

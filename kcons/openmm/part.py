@@ -2,12 +2,68 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import openmm
+from numpy.typing import ArrayLike
 
+from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
 from kcons.openmm.program import Program
+
+
+@dataclass(frozen=True)
+class Miss:
+    """A row that is off by more than it may be.
+
+    Attributes
+    ----------
+    what : str
+        'positions', or 'velocities'.
+    row : int
+    name : str
+    off, allowed : float
+        sigma in the unit of the row, or A v less its target, per ps.
+    atoms : sequence of int
+    near : bool
+        Whether positions are off by less than a tenth of the length that is held.
+    """
+
+    what: str
+    row: int
+    name: str
+    off: float
+    allowed: float
+    atoms: Sequence[int] = ()
+    near: bool = False
+
+    @classmethod
+    def worst(
+        cls,
+        what: str,
+        off: FloatArray,
+        allowed: ArrayLike,
+        name: Callable[[int], str],
+        atoms: Callable[[int], Iterable[int]],
+        near: ArrayLike = 0.0,
+    ) -> Miss | None:
+        """The worst of some rows, or None if each is off by no more than allowed; NaN is the worst."""
+        size = np.abs(off)
+        limit = np.broadcast_to(np.asarray(allowed, dtype=float), size.shape)
+        wrong = ~(size <= limit)
+        if not wrong.any():
+            return None
+        with np.errstate(all="ignore"):
+            row = int(np.argmax(np.where(np.isfinite(size), np.where(wrong, size / limit, 0.0), np.inf)))
+        close = bool(np.all(size[wrong] <= np.broadcast_to(near, size.shape)[wrong]))
+        return cls(what, row, name(row), float(off[row]), float(limit[row]), [int(a) for a in atoms(row)], close)
+
+    def __str__(self) -> str:
+        rate = "" if self.what == "positions" else " per ps"
+        return f"{self.what} are off row {self.name} by {abs(self.off):.3g}{rate}"
 
 
 class Part(Protocol):
@@ -25,6 +81,7 @@ class Part(Protocol):
     Some things are optional.
 
     - `driven`: whether rows demand velocities that are not 0.
+    - `steered`: whether context parameters move targets; positions need not be on the rows after one has changed.
     - `engine_at(context)`: the engine for the rows and the positions it takes, by which thermostats see what the rows
       do to total momentum.
     - `begin_run()` is called before steps are made.
@@ -87,6 +144,10 @@ class Part(Protocol):
 
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
+        ...
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """What the rows themselves say of the state of the context, whatever solvers believe; None if all hold."""
         ...
 
     def apply_positions(self, context: openmm.Context) -> Any:

@@ -6,7 +6,10 @@ import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import numpy as np
 import openmm
+
+from kcons.constraints.target import FloatArray
 
 _GIVEN = "x, v, m, f, dt: positions, velocities, masses, applied forces, time step"
 
@@ -18,6 +21,14 @@ class Program:
     ----------
     integrator : openmm.CustomIntegrator
         The computations are added to it as they are written.
+
+    Attributes
+    ----------
+    settings : dict of float
+        Global variables that the integrator was made with, or was told since. They are kept here; the variables of a
+        Context are copies of them, which a State or a checkpoint may overwrite, and `push` puts right.
+    idle : dict of float
+        Global variables that control the program, as they are between two calls of `step`.
     """
 
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
@@ -31,6 +42,11 @@ class Program:
         self.operations: list[tuple[str, str, str]] = []
         self.tables: dict[str, tuple[float, ...]] = {}
         self.numbers: dict[str, float] = {}
+        self.settings: dict[str, float] = {}
+        self.idle: dict[str, float] = {}
+        #: Variables with a value for each degree of freedom.
+        self.vectors: set[str] = set()
+        self._vectors: dict[str, FloatArray] = {}
 
     @property
     def integrator(self) -> openmm.CustomIntegrator:
@@ -49,10 +65,30 @@ class Program:
             self.variables.append(f"{name}: {words}")
         return name
 
+    def setting(self, name: str, words: str, value: float) -> str:
+        """Declare a global variable that the integrator was made with; returns its name."""
+        if name not in self._known:
+            self.settings[name] = float(value)
+        return self.number(name, words, value)
+
+    def control(self, name: str, words: str, value: float = 0.0) -> str:
+        """Declare a global variable that has this value between two calls of `step`; returns its name."""
+        if name not in self._known:
+            self.idle[name] = float(value)
+        return self.number(name, words, value)
+
+    def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
+        """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""
+        self.vector(name, words)
+        self._vectors[name] = np.array(values, dtype=np.float64)
+        self._write_vector(name)
+        return name
+
     def vector(self, name: str, words: str) -> str:
         """Declare a variable with a value for each degree of freedom; returns its name."""
         if name not in self._known:
             self._known.add(name)
+            self.vectors.add(name)
             self.integrator.addPerDofVariable(name, 0)
             self.variables.append(f"{name}: {words} (each degree of freedom)")
         return name
@@ -64,6 +100,38 @@ class Program:
         self.tables[name] = tuple(values)
         self.variables.append(f"{name}(k): {words}")
         return name
+
+    # -- settings -------------------------------------------------------------------------------
+
+    def set(self, name: str, value: float) -> None:
+        """Change a setting, here and in the Context."""
+        self.settings[name] = float(value)
+        self.write(name, value)
+
+    def write(self, name: str, value: float) -> None:
+        """Change a global variable in the Context only."""
+        openmm.CustomIntegrator.setGlobalVariableByName(self.integrator, name, float(value))
+
+    def differing(self) -> list[str]:
+        """Settings whose variables have other values: something else has written them."""
+        read = self.integrator.getGlobalVariableByName
+        return [name for name, value in self.settings.items() if read(name) != value]
+
+    def push(self) -> None:
+        """Write all settings into the Context, and end what was under way there."""
+        for name, value in (self.settings | self.idle).items():
+            self.write(name, value)
+        for name in self._vectors:
+            self._write_vector(name)
+
+    def forget(self) -> None:
+        """Put all other global variables back to what they are in a new integrator."""
+        for name, value in self.numbers.items():
+            if name not in self.settings:
+                self.write(name, value)
+
+    def _write_vector(self, name: str) -> None:
+        self.integrator.setPerDofVariableByName(name, self._vectors[name].tolist())
 
     # -- computations ---------------------------------------------------------------------------
 

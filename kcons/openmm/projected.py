@@ -14,17 +14,18 @@ from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.copies import as_projected, remade, settings_of
 from kcons.openmm.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.guard import Guard, find_context, positions_of, velocities_of
-from kcons.openmm.isokinetic import kelvins
+from kcons.openmm.hearing import listen
 from kcons.openmm.lean_steps import LeanStepWriter
 from kcons.openmm.part import Part
 from kcons.openmm.program import Program
 from kcons.openmm.schemes import LEAPFROG, to_scheme
-from kcons.openmm.states import StatesOnConstraints, value_in
+from kcons.openmm.settings import Settings, picoseconds
+from kcons.openmm.states import StatesOnConstraints
 from kcons.openmm.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
 
 
-class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
+class ProjectedIntegrator(StatesOnConstraints, Settings):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -33,8 +34,9 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     limits the accuracy.
 
     At the first step the integrator looks at the System and its Context: what it cannot propagate it refuses, and
-    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that OpenMM's
-    solvers did converge, which OpenMM itself does not tell.
+    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that positions and
+    velocities are on all that is held, by the constraints of the System and the rows themselves: whether its solvers
+    did converge OpenMM does not tell.
 
     Parameters
     ----------
@@ -48,8 +50,9 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float
         Relative tolerance of the System's constraints.
-    check_every : int
-        Steps between two checks; 0 for none but the first.
+    check_every : int, optional
+        Steps between two checks; 0 for none but the first. Left open, 100, and later, up to 10,000, where checks would
+        take more than a hundredth of the time.
     ensemble : Ensemble, optional
         How velocities change between drifts; constant energy by default.
 
@@ -63,6 +66,10 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
     """
 
+    #: Steps between two checks, if nothing else is asked for, ...
+    _check_every = 100
+    #: ... when checks come later where they would take more than a hundredth of the time.
+    spare = True
     #: What writes the program.
     _writer: type[LeanStepWriter] = LeanStepWriter
 
@@ -73,18 +80,17 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         *,
         parts: Sequence[Part] = (),
         tolerance: float = 1e-10,
-        check_every: int = 100,
+        check_every: int | None = None,
         ensemble: Ensemble | None = None,
     ) -> None:
-        super().__init__(_picoseconds(timestep))
+        super().__init__(picoseconds(timestep))
         self.setConstraintTolerance(tolerance)
-        if int(check_every) != check_every or check_every < 0:
-            raise InputError(f"check_every is {check_every}; give a number of steps, 0 for never", item="check_every")
-        self.check_every = int(check_every)
+        if check_every is not None:
+            self.check_every = check_every
         #: None for the leapfrog.
         self.scheme = to_scheme(scheme)
-        self.ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
-        self.ensemble.check(self.scheme)
+        self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
+        self._ensemble.check(self.scheme)
         self.parts = tuple(parts)
         if sum(part.meets_system for part in self.parts) > 1:
             raise UnsupportedError("only one part may share atoms with the constraints of the System")
@@ -98,6 +104,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         self.program = Program(self)
         self._plan = self._writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
+        listen(self)
 
     def __repr__(self) -> str:
         scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
@@ -128,9 +135,15 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
     # -- running --------------------------------------------------------------------------------
 
     @property
-    def thermostatted(self) -> bool:
-        """Whether velocities change by more than forces and constraints."""
-        return type(self.ensemble) is not ConstantEnergy
+    def check_every(self) -> int:
+        """Steps between two checks; 0 for none but the first."""
+        return self._check_every
+
+    @check_every.setter
+    def check_every(self, steps: int) -> None:
+        if int(steps) != steps or steps < 0:
+            raise InputError(f"check_every is {steps}; give a number of steps, 0 for never", item="check_every")
+        self._check_every, self.spare = int(steps), False
 
     @property
     def context(self) -> openmm.Context:
@@ -177,7 +190,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             At the first step: the System cannot be propagated, or the start is not on the constraints.
         """
         guard = self._watch()
-        if not guard.started:
+        if guard.disturbed:
             guard.begin()
         if self._plan.kept and guard.surroundings_changed():
             self.refresh()
@@ -195,14 +208,14 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         """Where the program can do less in steps whose end nobody looks at, let it."""
         unseen = steps - self._plan.observed if self._plan.lazy else 0
         if self._plan.lean:
-            self.setGlobalVariableByName("lean", float(guard.undisturbed))
-            self.setGlobalVariableByName("moving", float(guard.moving))
+            self.program.write("lean", guard.undisturbed)
+            self.program.write("moving", guard.moving)
         if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
-            self.setGlobalVariableByName("between", 1.0)
+            self.program.write("between", 1.0)
             try:
                 self._run(guard, unseen)
             finally:
-                self.setGlobalVariableByName("between", 0.0)
+                self.program.write("between", 0.0)
             steps -= unseen
         self._run(guard, steps)
 
@@ -232,25 +245,25 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             guard.since_check += done
             failure = self._failure(code, first + done + 1)
             if self._plan.lean and self.getGlobalVariableByName("loose"):
-                self.setGlobalVariableByName("between", 0.0)
+                self.program.write("between", 0.0)
                 self.applyVelocityConstraints(context)
             raise failure
 
     def _failure(self, code: int, step: int) -> KconsError:
         error = self.parts[code - 1].failure(self, step)
-        self.setGlobalVariableByName("failed", 0.0)
+        self.program.write("failed", 0.0)
         return error
 
     def refresh(self) -> None:
         """Compute the forces anew at the next step.
 
-        To be called after `updateParametersInContext`, which cannot be seen from here; where parts are held, forces
-        are kept from one step to the next. Changed positions, parameters and boxes are seen.
+        Where parts are held, forces are kept from one step to the next. What changes them is seen: positions,
+        parameters, boxes, `updateParametersInContext`.
         """
         if self.parts:
-            self.setGlobalVariableByName("stale", 1.0)
+            self.program.write("stale", 1.0)
         if "behind" in self.program.numbers:
-            self.setGlobalVariableByName("behind", 0.0)
+            self.program.write("behind", 0.0)
 
     def check(self, context: openmm.Context | None = None) -> None:
         """Whether all is well: the System, its constraints and the parts, at the present state.
@@ -265,6 +278,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
             code = int(self.getGlobalVariableByName("failed"))
             if code:
                 raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
+        for part in self.parts if guard.disturbed else ():
+            part.check(guard.context)
         guard.check()
         for part in self.parts:
             part.check(guard.context)
@@ -292,6 +307,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
                 context.setVelocities(np.zeros_like(velocities))
                 self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
             guard.check_rows(positions_of(context), None)
+            for part in self.parts:
+                guard.certify(part.worst_miss(context, velocities=False))
         except KconsError:
             context.setPositions(start)
             raise
@@ -326,14 +343,15 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         context = guard.context
         time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
         self.refresh()
-        self.setGlobalVariableByName("first_stage", float(first))
-        self.setGlobalVariableByName("end_stage", float(end))
+        program = self.program
+        program.write("first_stage", first)
+        program.write("end_stage", end)
         try:
             super().step(1)
         finally:
-            self.setGlobalVariableByName("first_stage", 0.0)
-            self.setGlobalVariableByName("end_stage", float(len(self._plan.drifts)))
-            self.setGlobalVariableByName("good_steps", good)
+            for name in ("first_stage", "end_stage"):
+                program.write(name, (program.settings | program.idle)[name])
+            program.write("good_steps", good)
             self.refresh()
             context.setTime(time)
             context.setStepCount(count)
@@ -341,19 +359,7 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         if code:
             raise self._failure(code, count)
 
-    # -- temperature ----------------------------------------------------------------------------
-
-    def setTemperature(self, temperature: unit.Quantity | float) -> None:
-        """Change the temperature (K if a float) of the ensemble.
-
-        Raises
-        ------
-        InputError
-            It is not above zero.
-        UnsupportedError
-            The ensemble has none.
-        """
-        self.ensemble.set_temperature(self, kelvins(temperature))
+    # -- temperature that is found --------------------------------------------------------------
 
     def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
         """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
@@ -381,32 +387,6 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
         return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
 
     # -- settings -------------------------------------------------------------------------------
-
-    @property
-    def _dt(self) -> float:
-        return float(self.getStepSize().value_in_unit(unit.picosecond))
-
-    def setStepSize(self, size: unit.Quantity | float) -> None:
-        """Change the time step.
-
-        Raises
-        ------
-        InputError
-            It is no positive number.
-        """
-        super().setStepSize(_picoseconds(size))
-
-    def setConstraintTolerance(self, tol: float) -> None:
-        """Change the relative tolerance of the System's constraints.
-
-        Raises
-        ------
-        InputError
-            It is not between 0 and 1.
-        """
-        if not 0 < tol < 1:
-            raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
-        super().setConstraintTolerance(tol)
 
     def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
         """Choose the force groups that act; groups that carry rows never do.
@@ -464,7 +444,8 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
 
     def _making(self) -> tuple[Any, ...]:
         scheme = LEAPFROG if self.scheme is None else self.scheme
-        return self._dt, scheme, self.parts, self.getConstraintTolerance(), self.check_every, self.ensemble
+        every = None if self.spare else self.check_every
+        return self._dt, scheme, self.parts, self.getConstraintTolerance(), every, self.ensemble
 
     def __reduce__(self) -> tuple[Any, ...]:
         return remade, (type(self), self._making(), settings_of(self))
@@ -475,13 +456,3 @@ class ProjectedIntegrator(StatesOnConstraints, openmm.CustomIntegrator):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
         return self.__copy__()
-
-
-def _picoseconds(timestep: Any) -> float:
-    dt = value_in(timestep, unit.picosecond)
-    if not (np.isfinite(dt) and dt > 0):
-        raise InputError(
-            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
-            item="timestep",
-        )
-    return dt

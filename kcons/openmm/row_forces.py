@@ -14,6 +14,7 @@ from openmm import unit
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.system_checks import ROW_NAME
 
 #: Force groups of OpenMM.
 GROUPS = 32
@@ -31,7 +32,8 @@ class Row:
         A Force that is in no System yet, or one of the System, or the number of a force group of the System whose
         Forces together are the coordinate.
     target : float, Quantity, str or None
-        What q is held at; None takes the value at the initial positions. A name stands for a context parameter.
+        What q is held at, a Quantity in a unit of its kind; None takes the value at the initial positions. A name
+        stands for a context parameter.
     rate : float, Quantity or str
         Change of the target in a ps. With a number or None as target, the target is that + rate t, t the time
         since the integrator was made. With a name as target whoever sets that changes it; the rate (a number or
@@ -52,16 +54,41 @@ class Row:
     name: str = ""
 
 
-def number(value: object, item: str) -> float:
+#: What a coordinate can be whose unit its Force does not tell.
+_POSSIBLE = (
+    *(unit.nanometer**power for power in (1, 2, 3, 4, 6, -1, -2, -3, -6)),
+    unit.radian,
+    unit.dimensionless,
+    unit.kilojoule_per_mole,
+)
+
+
+def number(value: object, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
     """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity.
+
+    Parameters
+    ----------
+    value : float or Quantity
+    item : str
+        For messages.
+    of : Unit, optional
+        What a Quantity must be a multiple of; of a length or a power of it, an angle, a plain number or an energy if
+        that is not known.
+    per : Unit
+        What that is divided by.
 
     Raises
     ------
     InputError
-        It is neither, or not finite.
+        It is neither, not finite, or of another unit.
     """
     if unit.is_quantity(value):
-        value = value.value_in_unit_system(unit.md_unit_system)  # type: ignore[attr-defined]
+        possible = [one / per for one in ((of,) if of is not None else _POSSIBLE)]
+        fitting = next((one for one in possible if value.unit.is_compatible(one)), None)  # type: ignore[attr-defined]
+        if fitting is None:
+            wanted = f"in {possible[0]}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
+            raise InputError(f"{item} is {value}, and the coordinate is of another kind; give it {wanted}", item=item)
+        value = value.value_in_unit(fitting)  # type: ignore[attr-defined]
     try:
         result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -223,6 +250,29 @@ def period_of(force: openmm.Force) -> float:
     return 2 * math.pi if plain and bonds == 1 else 0.0
 
 
+# -- units ------------------------------------------------------------------------------------------
+
+#: Kinds of Forces whose value, or one of whose expressions, says what it is.
+_LENGTHS = re.compile(r"^(r|x|y|z|distance\([pg]\d+,[pg]\d+\)|pointdistance\(.*\))$")
+_ANGLES = re.compile(r"^(theta|(angle|dihedral)\([pg]\d+(,[pg]\d+)*\)|pointangle\(.*\)|pointdihedral\(.*\))$")
+
+
+def unit_of(force: openmm.Force) -> unit.Unit | None:
+    """Unit of the coordinate that a Force is, None where that cannot be told."""
+    if isinstance(force, openmm.RMSDForce | openmm.RGForce):
+        return unit.nanometer
+    if not hasattr(force, "getEnergyFunction"):
+        tells = not type(force).__name__.startswith(("Custom", "Python"))
+        return unit.kilojoule_per_mole if tells else None
+    expression = force.getEnergyFunction().replace(" ", "")
+    if isinstance(force, openmm.CustomCVForce):
+        names = [force.getCollectiveVariableName(k) for k in range(force.getNumCollectiveVariables())]
+        return unit_of(force.getCollectiveVariable(names.index(expression))) if expression in names else None
+    if _LENGTHS.match(expression):
+        return unit.nanometer
+    return unit.radian if _ANGLES.match(expression) else None
+
+
 # -- groups -----------------------------------------------------------------------------------------
 
 
@@ -239,7 +289,7 @@ def used_groups(system: openmm.System) -> set[int]:
 
 
 def place(system: openmm.System, forces: Sequence[openmm.Force | int]) -> list[int]:
-    """A force group for each row; Forces that are in no System are added to this one.
+    """A force group for each row; Forces that are in no System are added to this one, by the name of rows.
 
     Raises
     ------
@@ -298,6 +348,8 @@ def place(system: openmm.System, forces: Sequence[openmm.Force | int]) -> list[i
             group = free.pop(0)
             force.setForceGroup(group)
             if int(force.this) not in present:
+                if force.getName() == type(force).__name__:
+                    force.setName(f"{ROW_NAME}: {force.getName()}")
                 system.addForce(force)
         result.append(group)
     return result

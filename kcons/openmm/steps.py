@@ -85,10 +85,10 @@ class StepWriter:
 
     def _declare_guards(self) -> None:
         p, n = self.program, len(self.drifts)
-        p.number("failed", "number of the part whose solve failed, 0 for none")
+        p.control("failed", "number of the part whose solve failed, 0 for none")
         p.number("good_steps", "steps done since the integrator was made")
-        p.number("first_stage", f"0; {self.alone} to apply the constraints alone")
-        p.number("end_stage", "where the stages end", n)
+        p.control("first_stage", f"0; {self.alone} to apply the constraints alone")
+        p.setting("end_stage", "where the stages end", n)
         p.number("stage", "number of the drift")
         p.number("h", "length of the drift")
         if self._last_drift_apart:

@@ -15,6 +15,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
+from kcons.openmm.part import Miss
 from kcons.openmm.program import Program
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
@@ -61,11 +62,9 @@ class SurfaceRows(ABC):
 
     def _parameter(self, p: Program, name: str, words: str, values: FloatArray, elsewhere: float = 0.0) -> str:
         """Declare a variable that holds a number or vector of each row, and `elsewhere` for other particles."""
-        p.vector(name, words)
         table = np.full((self.n_particles, 3), elsewhere)
         table[self.atoms] = values if values.ndim == 2 else values[:, None]
-        p.integrator.setPerDofVariableByName(name, table.tolist())
-        return name
+        return p.vector_setting(name, words, table)
 
     def _fail(self, p: Program, solved: str, words: str) -> None:
         """Set `failed` unless the expression `solved` is 1 for each degree of freedom (NaN counts as 0)."""
@@ -139,28 +138,41 @@ class SurfaceRows(ABC):
         for item in self.rows:
             item.check(x[item.atoms], 0.0, first)
             first += item.n_rows
-        miss = np.abs(self.distances(x))
-        k = int(np.argmax(np.where(np.isfinite(miss), miss, np.inf)))
-        size = max(1.0, float(np.abs(x[self.atoms[k]]).max()))
-        if not miss[k] <= START_TOLERANCE * size:
+        miss = self._worst(x, v)
+        if miss is not None and miss.what == "positions":
             raise InputError(
-                f"particle {self.atoms[k]} is {miss[k]:.3g} nm from its surface, {self.row_name(k)}; move it there "
+                f"particle {miss.atoms[0]} is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there "
                 "with integrator.apply_positions(context). (Surfaces are not repeated in periodic boxes: positions "
                 "must not be wrapped)",
                 item="positions",
-                atoms=[int(self.atoms[k])],
+                atoms=miss.atoms,
             )
-        held = v[self.atoms]
-        across = np.abs(np.einsum("ij,ij->i", self.normals(x), held))
-        speed = np.sqrt(np.einsum("ij,ij->i", held, held))
-        k = int(np.argmax(across - START_TOLERANCE * speed))
-        if not across[k] <= START_TOLERANCE * max(float(speed[k]), float(np.abs(v).max())):
+        if miss is not None:
             raise InputError(
-                f"particle {self.atoms[k]} has the velocity {across[k]:.3g} nm/ps across its surface, "
-                f"{self.row_name(k)}; call integrator.apply_velocities(context) after velocities are set",
+                f"particle {miss.atoms[0]} has the velocity {abs(miss.off):.3g} nm/ps across its surface, "
+                f"{miss.name}; call integrator.apply_velocities(context) after velocities are set",
                 item="velocities",
-                atoms=[int(self.atoms[k])],
+                atoms=miss.atoms,
             )
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """Distances from the surfaces and velocities across them, by the objects that were given."""
+        x, v = positions_and_velocities(context)
+        return self._worst(x, v if velocities else None)
+
+    def _worst(self, x: FloatArray, v: FloatArray | None) -> Miss | None:
+        allowed = START_TOLERANCE * np.maximum(1.0, np.abs(x[self.atoms]).max(axis=1))
+        miss = Miss.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of)
+        if miss is not None or v is None:
+            return miss
+        held = v[self.atoms]
+        across = np.einsum("ij,ij->i", self.normals(x), held)
+        speed = np.sqrt(np.einsum("ij,ij->i", held, held))
+        allowed = START_TOLERANCE * np.maximum(speed, np.abs(v).max())
+        return Miss.worst("velocities", across, allowed, self.row_name, self._atoms_of)
+
+    def _atoms_of(self, row: int) -> list[int]:
+        return [int(self.atoms[row])]
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Move each atom to the nearest point of its surface.
@@ -172,6 +184,14 @@ class SurfaceRows(ABC):
         """
         x, _ = positions_and_velocities(context)
         x[self.atoms] = engine(context, [self], x).restore_positions(x[self.atoms])
+        miss = self._worst(x, None)
+        if miss is not None:
+            raise ConvergenceError(
+                f"particle {miss.atoms[0]} finds no place on its surface, {miss.name}; nothing was moved",
+                residual=abs(miss.off),
+                row=miss.row,
+                atoms=miss.atoms,
+            )
         context.setPositions(x)
 
     def apply_velocities(self, context: openmm.Context) -> None:

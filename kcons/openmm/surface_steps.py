@@ -65,12 +65,12 @@ class SurfaceStepWriter(LeanStepWriter):
 
     def _declare_run(self) -> None:
         p, n = self.program, len(self.drifts)
-        p.number("failed", "number of the part whose solve failed, 0 for none")
+        p.control("failed", "number of the part whose solve failed, 0 for none")
         p.number("good_steps", "steps done since the integrator was made")
-        p.number("first_stage", f"0; {self.alone} to apply the constraints alone")
-        p.number("end_stage", "where the stages end", n)
+        p.control("first_stage", f"0; {self.alone} to apply the constraints alone")
+        p.setting("end_stage", "where the stages end", n)
         p.number("stage", "number of the drift")
-        p.number("between", "1 if nobody looks at the velocities after this step")
+        p.control("between", "1 if nobody looks at the velocities after this step")
         p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
         if self.untouched:

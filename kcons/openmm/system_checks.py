@@ -17,10 +17,13 @@ from openmm import unit
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.plan import make_plan
 
 IntArray = NDArray[np.int64]
+
+#: How the names of Forces begin that carry rows.
+ROW_NAME, SURFACE_NAME = "kcons row", "kcons surface"
 
 #: Forces that need an integrator of their own.
 _FOREIGN = {
@@ -80,13 +83,20 @@ class SystemRows:
         r = x[self.pairs[:, 0]] - x[self.pairs[:, 1]]
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", r, r)) / self.lengths - 1)
 
-    def stretching_speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
-        """A v of each row relative to the root mean square velocity, shape (n_rows,)."""
+    def speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
+        """A v of each row, the rate of its distance, shape (n_rows,)."""
         i, j = self.pairs.T
         r = x[i] - x[j]
-        rate = np.einsum("ij,ij->i", r, v[i] - v[j]) / np.sqrt(np.einsum("ij,ij->i", r, r))
-        speed = np.sqrt(np.mean(v * v)) if v.size else 0.0
-        return np.asarray(rate / speed if speed > 0 else np.zeros(len(rate)))
+        return np.asarray(np.einsum("ij,ij->i", r, v[i] - v[j]) / np.sqrt(np.einsum("ij,ij->i", r, r)))
+
+    def speeds_of_one(self, v: FloatArray) -> FloatArray:
+        """What a tolerance of 1 is for each row: OpenMM's solvers look at 2 m_red A v/d in nm/ps, m_red in dalton.
+
+        At least the root mean square velocity, shape (n_rows,).
+        """
+        with np.errstate(divide="ignore"):
+            reduced = 1 / np.sum(1 / self.masses[self.pairs], axis=1)
+        return np.maximum(self.lengths / (2 * reduced), np.sqrt(np.mean(v * v)))
 
     def name(self, row: int) -> str:
         i, j = self.pairs[row]
@@ -128,6 +138,26 @@ def forces_of(system: openmm.System) -> Iterable[openmm.Force]:
 
 def removes_centre_of_mass_motion(system: openmm.System) -> bool:
     return any(isinstance(force, openmm.CMMotionRemover) for force in forces_of(system))
+
+
+def refuse_forgotten_parts(system: openmm.System, row_groups: Iterable[int]) -> None:
+    """Refuse Forces that carry rows, where the integrator does not have the part that they belong to.
+
+    Raises
+    ------
+    InputError
+        There is one: it would act as a force, or do nothing, and nothing would be held.
+    """
+    known = set(row_groups)
+    for force in forces_of(system):
+        if force.getName().startswith((ROW_NAME, SURFACE_NAME)) and force.getForceGroup() not in known:
+            raise InputError(
+                f"the System has a force {force.getName()!r}, which carries rows that are held, and the integrator has "
+                "no part for it: pass what hold, CollectiveRows or surface_parts returned, "
+                "ProjectedIntegrator(..., parts=[rows]). For a System that was copied or read from XML, the rows of "
+                "hold are CarriedConstraints.of(system)",
+                item="parts",
+            )
 
 
 def refuse_motion_remover(system: openmm.System, kind: str) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.errors import ConvergenceError, InputError
-from kcons.openmm.guard import positions_of
+from kcons.openmm.guard import positions_of, velocities_of
+from kcons.openmm.part import Miss
 
 
 class HeldCoordinates:
@@ -27,7 +28,7 @@ class HeldCoordinates:
 
     def declare(self, program):
         program.vector("held", "1 where a coordinate is held")
-        program.number("level", "where it is held", self.value)
+        program.setting("level", "where it is held", self.value)
         program.number("steepest", "longest way accepted", self.steepest)
         program.number("off", "how far off it was")
         program.integrator.setPerDofVariableByName("held", [list(row) for row in self.mask])
@@ -50,6 +51,13 @@ class HeldCoordinates:
         miss = np.abs(positions_of(context)[self.particles, self.axis] - self.value).max(initial=0.0)
         if miss > 1e-9:
             raise InputError(f"off the level by {miss:.3g}", item="positions")
+
+    def worst_miss(self, context, velocities=True):
+        def worst(what, off):
+            return Miss.worst(what, off, 1e-9, lambda k: f"coordinate of {self.particles[k]}", lambda k: [])
+
+        x, v = (read(context)[self.particles, self.axis] for read in (positions_of, velocities_of))
+        return worst("positions", x - self.value) or (worst("velocities", v) if velocities else None)
 
     def failure(self, integrator, step):
         return ConvergenceError("too steep", step=step)

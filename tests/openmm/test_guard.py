@@ -19,7 +19,7 @@ from openmm_systems import (
 )
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator, guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 kinds = pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])
@@ -88,7 +88,7 @@ def test_compound_integrator_tells_of_failures_when_asked():
 def test_start_off_the_constraints_is_refused(kind):
     system, x, v = alanine()
     x = x.copy()
-    x[4] += 0.01
+    x[4] += 0.03
     integrator = kind(1e-3)
     context = started(system, integrator, x, v)
     with pytest.raises(InputError, match=r"constraint \d+ of the System .* at the start; minimise") as caught:
@@ -178,6 +178,22 @@ def test_explosion_puts_back_what_was_checked_last(platform, kind):
     other = started(system, untroubled := kind(1e-3, check_every=10), *start)
     untroubled.step(30)
     np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("given", "number"), [({}, 2), ({"check_every": 100}, 104)])
+def test_checks_that_would_take_too_long_come_later(monkeypatch, given, number):
+    """No share of the time is left for them here; an interval that was asked for is kept."""
+    monkeypatch.setattr(guard, "SHARE", 0.0)
+    checks = []
+    check = guard.Guard.check
+    monkeypatch.setattr(guard.Guard, "check", lambda self: checks.append(1) or check(self))
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-4, **given)
+    context = started(system, integrator, x, v)
+    integrator.step(100 * 104)
+    # Of the first it is not known how long it takes; after it, a hundred are put off each time.
+    assert len(checks) == number
+    assert context.getStepCount() == 10400
 
 
 def test_clock_follows_the_step_size():

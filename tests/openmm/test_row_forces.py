@@ -10,6 +10,7 @@ import pytest
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
 from kcons.openmm.row_forces import (
     Rigid,
@@ -22,6 +23,7 @@ from kcons.openmm.row_forces import (
     number,
     period_of,
     place,
+    unit_of,
     used_groups,
 )
 
@@ -69,13 +71,91 @@ def variables(expression, **members):
     [
         (0.3, 0.3),
         (3 * unit.angstrom, 0.3),
+        (3 * unit.angstrom**2, 0.03),
         (90 * unit.degree, math.pi / 2),
-        (2 * unit.angstrom / unit.femtosecond, 200.0),
         (1 * unit.kilocalorie_per_mole, 4.184),
     ],
 )
 def test_units_of_the_user(value, expected):
     assert number(value, "target") == pytest.approx(expected, rel=1e-15)
+    if unit.is_quantity(value):
+        assert number(value / unit.femtosecond, "rate", per=unit.picosecond) == pytest.approx(1e3 * expected, rel=1e-15)
+
+
+def _custom(kind, expression, *arguments):
+    force = getattr(openmm, kind)(*arguments, expression)
+    return force
+
+
+def _as_variable(force, expression="q"):
+    made = openmm.CustomCVForce(expression)
+    made.addCollectiveVariable("q", force)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("force", "of"),
+    [
+        (lambda: _custom("CustomBondForce", "r"), unit.nanometer),
+        (lambda: _custom("CustomExternalForce", " z "), unit.nanometer),
+        (lambda: _custom("CustomCompoundBondForce", "distance(p1, p2)", 2), unit.nanometer),
+        (lambda: _custom("CustomCentroidBondForce", "distance(g1,g2)", 2), unit.nanometer),
+        (lambda: openmm.RGForce([0, 1]), unit.nanometer),
+        (lambda: _as_variable(openmm.RGForce([0, 1])), unit.nanometer),
+        (lambda: _custom("CustomAngleForce", "theta"), unit.radian),
+        (lambda: _custom("CustomCompoundBondForce", "dihedral(p1,p2,p3,p4)", 4), unit.radian),
+        (openmm.HarmonicBondForce, unit.kilojoule_per_mole),
+        (lambda: _custom("CustomBondForce", "r^2"), None),
+        (lambda: _as_variable(openmm.RGForce([0, 1]), "q^2"), None),
+    ],
+)
+def test_unit_of_a_coordinate(force, of):
+    assert unit_of(force()) == of
+
+
+@pytest.mark.parametrize(
+    ("value", "of"),
+    [
+        (3 * unit.kelvin, None),
+        (3 * unit.picosecond, None),
+        (3 * unit.kelvin, unit.nanometer),
+        (90 * unit.degree, unit.nanometer),
+        (3 * unit.angstrom, unit.radian),
+        (3 * unit.angstrom / unit.picosecond, unit.nanometer),
+    ],
+)
+def test_a_target_of_another_kind_is_refused(value, of):
+    with pytest.raises(InputError, match=r"target is .* another kind"):
+        number(value, "target", of)
+
+
+def test_units_of_rows():
+    system = openmm.System()
+    for _ in range(2):
+        system.addParticle(1.0)
+
+    def bond():
+        force = openmm.CustomBondForce("r")
+        force.addBond(0, 1)
+        return force
+
+    for wrong in (
+        {"target": 3 * unit.kelvin},
+        {"target": 0.3, "rate": 3 * unit.nanometer},
+        {"target": 0.3, "rate": 3 * unit.degree / unit.picosecond},
+        {"target": 0.3, "scale": 1 * unit.radian},
+        {"target": 0.3, "period": 1 * unit.radian},
+        {"target": 0.3, "period": "name"},
+    ):
+        with pytest.raises(InputError, match="of row 0"):
+            CollectiveRows(system, [Row(bond(), **wrong)])
+    assert system.getNumForces() == 0
+    rows = CollectiveRows(system, [Row(bond(), 3 * unit.angstrom, rate=1 * unit.nanometer / unit.nanosecond)])
+    integrator = ProjectedIntegrator(0.001, parts=[rows])
+    settings = integrator.program.settings
+    assert [settings["target1_0"], settings["rate1_0"]] == pytest.approx([0.3, 1e-3], rel=1e-15)
+    with pytest.raises(InputError, match="give it in nanometer"):
+        rows.set_target(integrator, 0, 3 * unit.degree)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, "three", None, math.inf * unit.nanometer])

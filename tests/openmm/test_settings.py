@@ -1,0 +1,516 @@
+"""What an integrator was made with wins over what States, checkpoints, XML and copies carry."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import context_of, potential_energy, state_of
+
+from kcons.constraints import Distance, Sphere
+from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    SurfaceIntegrator,
+    hold,
+)
+from kcons.openmm.isokinetic import GAS_CONSTANT
+
+X = np.random.default_rng(3).random((8, 3)) * 0.3
+MASSES = np.full(8, 12.0)
+EVERYTHING = {"positions": True, "velocities": True, "parameters": True, "integratorParameters": True}
+#: Radius of the sphere that holds particle 0, about a centre that is not the origin.
+RADIUS, CENTRE = 0.2, X[0] - [0.2, 0, 0]
+
+
+def cluster(strength=200.0, bonded=False):
+    """Eight particles tied by springs to one another and to a place; with `bonded`, one distance held by OpenMM."""
+    system, force, field = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomExternalForce("50*(x^2+y^2+z^2)")
+    for i in range(8):
+        field.addParticle(system.addParticle(MASSES[i]), [])
+        for j in range(i):
+            force.addBond(i, j, 0.3, strength)
+    system.addForce(force)
+    system.addForce(field)
+    if bonded:
+        system.addConstraint(6, 7, float(np.linalg.norm(X[6] - X[7])))
+    return system
+
+
+def bond(i=0, j=7):
+    force = openmm.CustomBondForce("r")
+    force.addBond(i, j)
+    return force
+
+
+@dataclass
+class Made:
+    """An integrator with its Context, and what can be asked of it."""
+
+    integrator: Any
+    context: openmm.Context
+    part: Any = None
+
+    def run(self, steps=1):
+        self.integrator.step(steps)
+        return self.context.getState(**EVERYTHING)
+
+
+def thermostatted(ensemble, **options):
+    def make(strength=200.0):
+        integrator = ProjectedIntegrator(0.002, ensemble=ensemble, **options)
+        return _begun(cluster(strength, bonded=True), integrator)
+
+    return make
+
+
+def rattle(strength=200.0):
+    return _begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
+
+
+def on_a_sphere(radius=RADIUS, strength=200.0, **options):
+    system = cluster(strength)
+    surface = Sphere([0], CENTRE, radius)
+    integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
+    return _begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
+
+
+def row_at(target=0.30, strength=200.0, **options):
+    system = cluster(strength)
+    rows = CollectiveRows(system, [Row(bond(), target)], positions=X)
+    return _begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
+
+
+def carried_at(target=0.30, strength=200.0, **options):
+    system = cluster(strength)
+    part = hold(system, [Distance([[0, 7]], target)], X)
+    return _begun(system, ProjectedIntegrator(0.002, parts=[part], **options), part.apply_positions, part)
+
+
+def _begun(system, integrator, restore=None, part=None):
+    context = context_of(system, integrator)
+    context.setPositions(X)
+    context.setVelocities(0.3 * np.random.default_rng(1).normal(size=X.shape))
+    if restore is not None:
+        restore(context)
+    return Made(integrator, context, part)
+
+
+#: Every class and ensemble, each as often as wanted.
+KINDS = {
+    "constant energy": thermostatted(None),
+    "suzuki4": thermostatted(None, scheme="suzuki4"),
+    "leapfrog": thermostatted(None, scheme="leapfrog"),
+    "Langevin": thermostatted(Langevin(300, 1.0)),
+    "Isokinetic": thermostatted(Isokinetic(300)),
+    "isokinetic4": thermostatted(Isokinetic(300), scheme="isokinetic4"),
+    "RattleIntegrator": rattle,
+    "sphere": on_a_sphere,
+    "sphere, compiled": lambda **given: on_a_sphere(compiled=True, **given),
+    "sphere, Langevin": lambda **given: on_a_sphere(ensemble=Langevin(300, 1.0), **given),
+    "collective": row_at,
+    "collective, leapfrog": lambda **given: row_at(scheme="leapfrog", **given),
+    "collective, Langevin": lambda **given: row_at(ensemble=Langevin(300, 1.0), **given),
+    "carried": carried_at,
+    "carried, suzuki4": lambda **given: carried_at(scheme="suzuki4", **given),
+}
+kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+# -- a run goes on ------------------------------------------------------------------------------------
+
+
+@kinds
+@pytest.mark.parametrize("way", ["State", "XML", "checkpoint"])
+def test_a_run_goes_on_bit_for_bit(kind, way):
+    """In another Context with an integrator of the same settings; noise aside, which a State does not carry."""
+    if "Langevin" in kind and way != "checkpoint":
+        pytest.skip("a State does not carry random numbers")
+    made, other = KINDS[kind](), KINDS[kind]()
+    made.run(7)
+    state, checkpoint = made.context.getState(**EVERYTHING), made.context.createCheckpoint()
+    if way == "checkpoint":
+        other.run(2)
+        other.context.loadCheckpoint(checkpoint)
+        if "Langevin" in kind:  # random numbers of the Reference platform belong to the process
+            other.run(5)
+            made.context.loadCheckpoint(checkpoint)
+            made.run(5)
+            np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
+            return
+    else:
+        text = openmm.XmlSerializer.serialize(state)
+        other.context.setState(openmm.XmlSerializer.deserialize(text) if way == "XML" else state)
+    assert other.context.getStepCount() == 7
+    made.run(5)
+    other.run(5)
+    np.testing.assert_array_equal(state_of(other.context), state_of(made.context))
+
+
+# -- settings stay ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["State", "checkpoint"])
+@pytest.mark.parametrize("options", [{}, {"part": True}])
+def test_friction_and_temperature_stay(way, options):
+    def make(temperature, friction):
+        ensemble = Langevin(temperature, friction)
+        return row_at(ensemble=ensemble) if options else thermostatted(ensemble)()
+
+    made, other = make(300, 1.0), make(400, 50.0)
+    made.run(3)
+    kept = made.context.createCheckpoint() if way == "checkpoint" else made.context.getState(**EVERYTHING)
+    for _ in range(2):
+        if way == "checkpoint":
+            other.context.loadCheckpoint(kept)
+        else:
+            other.context.setState(kept)
+        other.run()
+        read = other.integrator.getGlobalVariableByName
+        assert (read("friction"), read("kT")) == (50.0, GAS_CONSTANT * 400)
+    other.integrator.setFriction(2 / unit.picosecond)
+    other.integrator.setTemperature(350 * unit.kelvin)
+    other.context.setState(made.context.getState(**EVERYTHING))
+    other.run()
+    assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+    assert other.integrator.ensemble == Langevin(350, 2.0)
+    other.context.reinitialize(preserveState=True)
+    assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+    other.context.reinitialize()
+    assert (read("friction"), read("kT")) == (2.0, GAS_CONSTANT * 350)
+
+
+@pytest.mark.parametrize("way", ["State", "checkpoint"])
+def test_the_kinetic_energy_of_isokinetic_stays(way):
+    made, other = thermostatted(Isokinetic(300))(), thermostatted(Isokinetic(400))()
+    first = made.run(3)
+    checkpoint = made.context.createCheckpoint()
+    other.run(1)
+    if way == "checkpoint":
+        other.context.loadCheckpoint(checkpoint)
+    else:
+        other.context.setState(first)
+    other.run(2)
+    v = state_of(other.context)[1]
+    count = other.integrator.ensemble.count(other.integrator)
+    assert abs(MASSES @ np.sum(v**2, axis=1) / ((count - 1) * GAS_CONSTANT * 400) - 1) < 1e-12
+
+
+@pytest.mark.parametrize("way", ["State", "checkpoint"])
+@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere], ids=["collective", "carried", "surface"])
+def test_targets_stay(make, way):
+    """Where a State of another target is loaded, the step refuses to begin until the rows are restored."""
+    made, other = make(0.20), make(0.22)
+    made.run(3)
+    other.run(3)
+    if way == "checkpoint":
+        checkpoint = made.context.createCheckpoint()
+        if make is carried_at:  # the rows of kcons are no numbers of the program, but forces of the System
+            other.context.loadCheckpoint(checkpoint)
+        else:
+            other.context.loadCheckpoint(checkpoint)
+    else:
+        other.context.setState(made.context.getState(**EVERYTHING))
+    loaded = state_of(other.context)
+    if make is carried_at:  # nearer than a tenth of the length: put right
+        other.run(1)
+    else:
+        with pytest.raises(KconsError, match=r"call restore|apply_positions"):
+            other.run(1)
+        np.testing.assert_array_equal(state_of(other.context), loaded)
+        other.integrator.applyConstraints(other.context)
+        other.run(1)
+    x = state_of(other.context)[0]
+    length = np.linalg.norm(x[0] - CENTRE) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+    assert abs(length - 0.22) < 1e-12
+
+
+def test_set_target_outlives_a_state():
+    made = row_at(0.30)
+    before = made.run(2)
+    made.part.set_target(made.integrator, 0, 3.5 * unit.angstrom)
+    made.part.restore(made.context)
+    made.run(2)
+    made.context.setState(before)
+    with pytest.raises(KconsError, match="restore"):
+        made.run()
+    made.part.restore(made.context)
+    made.run()
+    assert abs(made.part.values(made.context)[0] - 0.35) < 1e-12
+    assert copy.copy(made.integrator).program.settings == made.integrator.program.settings
+
+
+def test_number_of_stages_stays():
+    """A scheme of five drifts leaves a State that says where they end."""
+    made, other = carried_at(scheme="suzuki4"), carried_at()
+    twin = carried_at()
+    state = made.run(3)
+    other.context.setState(state)
+    other.run(3)
+    twin.context.setState(made_plain(made))
+    twin.context.setStepCount(0)
+    state = other.context.getState(positions=True)
+    assert other.integrator.getGlobalVariableByName("end_stage") == 1
+    twin.run(3)
+    np.testing.assert_allclose(state_of(other.context), state_of(twin.context), rtol=0, atol=1e-12)
+
+
+def made_plain(made):
+    """The State before the last three steps is gone: that of now, positions and velocities only."""
+    again = carried_at(scheme="suzuki4")
+    again.run(3)
+    return again.context.getState(positions=True, velocities=True)
+
+
+def test_seeds_of_checkpoints():
+    """Replicas that start from one checkpoint go their own ways where they were given seeds."""
+
+    def make(seed):
+        integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 10.0))
+        integrator.setRandomNumberSeed(seed)
+        return _begun(cluster(bonded=True), integrator)
+
+    first = make(1)
+    first.run(3)
+    kept = first.context.createCheckpoint()
+    ends = []
+    for seed in (1, 1, 2, 2, 3):
+        made = make(seed)
+        made.context.loadCheckpoint(kept)
+        assert made.context.getStepCount() == 3
+        made.run(3)
+        ends.append(state_of(made.context)[0])
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[2], ends[3])
+    for a, b in ((0, 2), (2, 4), (0, 4)):
+        assert np.abs(ends[a] - ends[b]).max() > 1e-5
+
+
+@pytest.mark.parametrize("way", ["XML", "plain"])
+def test_from_xml_takes_what_is_given(way):
+    text = openmm.XmlSerializer.serialize(ProjectedIntegrator(0.002, ensemble=Langevin(300, 1.0)))
+    given = openmm.XmlSerializer.deserialize(text)
+    kind, ensemble = ProjectedIntegrator, Langevin(400, 50.0)
+    made = kind.from_xml(text, ensemble=ensemble) if way == "XML" else kind.as_projected(given, ensemble=ensemble)
+    read = made.getGlobalVariableByName
+    assert (read("friction"), read("kT")) == (50.0, GAS_CONSTANT * 400)
+    rows = CollectiveRows(cluster(), [Row(bond(), 0.3)])
+    text = openmm.XmlSerializer.serialize(ProjectedIntegrator(0.002, parts=[rows]))
+    others = CollectiveRows(cluster(), [Row(bond(), 0.35)])
+    again = ProjectedIntegrator.from_xml(text, parts=[others])
+    assert again.getGlobalVariableByName("target1_0") == 0.35
+
+
+@kinds
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda i: pickle.loads(pickle.dumps(i))])
+def test_copies_have_the_settings_of_now(kind, how):
+    made = KINDS[kind]()
+    if kind.startswith("carried") and how not in (copy.copy, copy.deepcopy):
+        pytest.skip("a System takes carried rows along, not an integrator")
+    if "Langevin" in kind:
+        made.integrator.setTemperature(310)
+        made.integrator.setFriction(3)
+    if kind.startswith("collective"):
+        made.part.set_target(made.integrator, 0, 0.31)
+    again = how(made.integrator)
+    if kind != "RattleIntegrator":
+        assert again.program.settings == made.integrator.program.settings
+        assert again.ensemble == made.integrator.ensemble
+        for name, value in again.program.settings.items():
+            assert again.getGlobalVariableByName(name) == value
+    assert again.getStepSize() == made.integrator.getStepSize()
+
+
+# -- ensembles are values -----------------------------------------------------------------------------
+
+
+def test_ensembles_are_values():
+    shared = Langevin(300, 1.0)
+    one, two = thermostatted(shared)(), thermostatted(shared)()
+    one.integrator.setTemperature(500)
+    one.integrator.setFriction(7)
+    two.run()
+    assert two.integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
+    assert (shared.temperature, shared.friction) == (300, 1.0)
+    assert one.integrator.getTemperature() == 500 * unit.kelvin
+    assert one.integrator.getFriction() == 7 / unit.picosecond
+    for value, name in ((shared, "temperature"), (shared, "friction"), (Isokinetic(300), "temperature")):
+        with pytest.raises(UnsupportedError, match="setTemperature or setFriction"):
+            setattr(value, name, 400.0)
+    with pytest.raises(AttributeError):
+        one.integrator.ensemble = shared
+    with pytest.raises(UnsupportedError, match="setting of the integrator"):
+        one.integrator.setGlobalVariableByName("kT", 3.0)
+    with pytest.raises(UnsupportedError, match="setting of the integrator"):
+        one.integrator.setGlobalVariable(one.integrator.program.variables.index("friction: 1/ps") - 1, 3.0)
+    assert Langevin(300, 1.0) == shared != Langevin(300, 2.0)
+    assert len({Langevin(300, 1.0), shared, Isokinetic(300, atoms=[1, 2]), Isokinetic(300, atoms=[1, 2])}) == 2
+    twins = Isokinetic(300), Isokinetic(300)
+    made = [thermostatted(ensemble)() for ensemble in (twins[0], twins[0])]
+    made[0].run()
+    made[0].integrator.setTemperature(600)
+    made[1].run(2)
+    assert made[1].integrator.getTemperature() == 300 * unit.kelvin
+    v = state_of(made[1].context)[1]
+    count = twins[0].count(made[1].integrator)
+    assert abs(MASSES @ np.sum(v**2, axis=1) / ((count - 1) * GAS_CONSTANT * 300) - 1) < 1e-12
+
+
+def test_what_an_ensemble_lacks():
+    plain, smooth = ProjectedIntegrator(0.002), ProjectedIntegrator(0.002, ensemble=Isokinetic(300))
+    for call in (plain.getTemperature, plain.getFriction, smooth.getFriction, lambda: smooth.setFriction(1)):
+        with pytest.raises(UnsupportedError, match="ensemble=Langevin"):
+            call()
+    assert smooth.getTemperature() == 300 * unit.kelvin
+    for wrong, match in (
+        (lambda: Langevin(-1, 1), "temperature"),
+        (lambda: Langevin(300 * unit.nanometer, 1), "give it in K"),
+        (lambda: Langevin(300, 1 * unit.picosecond), "give it in 1/ps"),
+        (lambda: Langevin(300, -1), "friction"),
+        (lambda: Langevin(float("nan"), 1), "temperature"),
+        (lambda: Isokinetic(0), "temperature"),
+        (lambda: smooth.setTemperature(0), "temperature"),
+        (lambda: smooth.setTemperature(3 * unit.nanometer), "give it in K"),
+    ):
+        with pytest.raises(InputError, match=match):
+            wrong()
+
+
+@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere, lambda **given: thermostatted(**given)()])
+def test_zero_kelvin_brings_to_rest(make):
+    """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
+    made = make(ensemble=Langevin(0, 6.0))  # as the field damps fastest
+    first = potential_energy(made.context)
+    made.run(4000)
+    assert np.abs(state_of(made.context)[1]).max() < 5e-3
+    assert potential_energy(made.context) < first
+    assert made.integrator.getTemperature() == 0 * unit.kelvin
+    made.integrator.check(made.context)
+    made.run(16000)
+    assert np.abs(state_of(made.context)[1]).max() < 1e-4
+
+
+# -- States of other integrators ----------------------------------------------------------------------
+
+
+def stock(integrator):
+    return lambda: _begun(cluster(bonded=True), integrator())
+
+
+STOCK = {
+    "Verlet": stock(lambda: openmm.VerletIntegrator(0.002)),
+    "LangevinMiddle": stock(lambda: openmm.LangevinMiddleIntegrator(300, 1, 0.002)),
+    "NoseHoover": stock(lambda: openmm.NoseHooverIntegrator(300, 1, 0.002)),
+    "Custom": stock(lambda: _custom()),
+    "Compound": stock(lambda: _compound()),
+}
+
+
+def _custom():
+    integrator = openmm.CustomIntegrator(0.002)
+    integrator.addGlobalVariable("stale", 0.5)
+    integrator.addPerDofVariable("force", 7.0)
+    integrator.addPerDofVariable("x_last", 0.0)
+    integrator.addComputePerDof("x_last", "x")
+    return integrator
+
+
+def _compound():
+    integrator = openmm.CompoundIntegrator()
+    integrator.addIntegrator(openmm.VerletIntegrator(0.002))
+    integrator.addIntegrator(openmm.VerletIntegrator(0.002))
+    integrator.setCurrentIntegrator(1)
+    return integrator
+
+
+@kinds
+def test_states_of_all_integrators_load(kind):
+    """Each run starts as from positions and velocities alone."""
+    quiet = {name: make for name, make in KINDS.items() if "Langevin" not in name}
+    for make in (*STOCK.values(), *quiet.values()):
+        giver, taker, plain = make(), KINDS[kind](), KINDS[kind]()
+        giver.run(2)
+        taker.run(2)
+        state = giver.context.getState(**EVERYTHING)
+        taker.context.setState(state)
+        np.testing.assert_array_equal(state_of(taker.context), state_of(giver.context))
+        assert taker.context.getStepCount() == 2
+        assert taker.context.getTime() == giver.context.getTime()
+        if "Langevin" in kind:
+            taker.integrator.setFriction(0)
+            plain.integrator.setFriction(0)
+        plain.context.setState(giver.context.getState(positions=True, velocities=True))
+        for one in (taker, plain):
+            one.integrator.applyConstraints(one.context)
+            one.run(3)
+        late = "leapfrog" in kind
+        within = 1e-3 if late else 1e-9
+        np.testing.assert_allclose(state_of(taker.context), state_of(plain.context), rtol=0, atol=within)
+
+
+def test_nvt_to_nve_and_back_through_a_simulation(tmp_path):
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for _ in range(8):
+        topology.addAtom("C", app.element.carbon, residue)
+    place = openmm.Platform.getPlatformByName("Reference")
+
+    def simulation(**given):
+        made = app.Simulation(topology, cluster(bonded=True), ProjectedIntegrator(0.002, **given), place)
+        return made
+
+    warm = simulation(ensemble=Langevin(300, 1.0))
+    warm.context.setPositions(X)
+    warm.integrator.setVelocitiesToTemperature(warm.context, 300, 1)
+    warm.step(5)
+    for number, given in enumerate(({}, {"ensemble": Isokinetic(300)}, {"ensemble": Langevin(310, 2.0)}, {})):
+        file = str(tmp_path / f"{number}.xml")
+        warm.saveState(file)
+        again = simulation(**given)
+        again.loadState(file)
+        np.testing.assert_array_equal(state_of(again.context), state_of(warm.context))
+        again.step(5)
+        warm = again
+    assert warm.currentStep == 25
+
+
+@pytest.mark.parametrize("kind", ["constant energy", "collective", "sphere", "RattleIntegrator"])
+def test_checkpoints_of_other_programs_are_refused(kind):
+    taker = KINDS[kind]()
+    taker.run(2)
+    before = state_of(taker.context)
+    verlet = STOCK["Verlet"]()
+    verlet.run(3)
+    for checkpoint in (verlet.context.createCheckpoint(), KINDS["Langevin"]().context.createCheckpoint(), b"", b"x"):
+        with pytest.raises(InputError, match=r"another integrator.*Load a State"):
+            taker.context.loadCheckpoint(checkpoint)
+        np.testing.assert_array_equal(state_of(taker.context), before)
+        taker.run(1)
+        before = state_of(taker.context)
+
+
+def test_states_into_a_compound_integrator():
+    """OpenMM runs the program there, and nothing of kcons comes before its first step."""
+    compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(0.002, ensemble=Langevin(400, 50.0))
+    compound.addIntegrator(ours)
+    compound.addIntegrator(openmm.VerletIntegrator(0.002))
+    made = _begun(cluster(bonded=True), compound)
+    giver = openmm.CompoundIntegrator()
+    giver.addIntegrator(other := ProjectedIntegrator(0.002, ensemble=Langevin(300, 1.0)))
+    giver.addIntegrator(openmm.VerletIntegrator(0.002))
+    given = _begun(cluster(bonded=True), giver)
+    made.context.setState(given.run(2))
+    compound.step(1)
+    assert ours.getGlobalVariableByName("friction") == 50.0
+    assert other.getGlobalVariableByName("friction") == 1.0
