@@ -9,11 +9,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
+from openmm_systems import PLATFORMS
 from surface_cases import (
     CENTER,
     KINDS,
     MASSES,
-    PLATFORMS,
     POSITIONS,
     VELOCITIES,
     force_of,
