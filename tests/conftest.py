@@ -8,7 +8,8 @@ import pytest
 
 HERE = Path(__file__).parent
 #: Modules of the package and of its tests, as they are called when they are imported.
-OWN = sorted({"kcons", "tests", *(path.stem for path in HERE.rglob("*.py")), *(p.name for p in HERE.iterdir())})
+FILES = list(HERE.rglob("*.py"))
+OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
 
 
 def pytest_configure(config: pytest.Config) -> None:
