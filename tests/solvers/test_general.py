@@ -136,6 +136,18 @@ def test_rows_that_are_nearly_parallel(exponent: int) -> None:
     np.testing.assert_allclose(from_lam, y - new, rtol=0, atol=1e-13 + 1e-16 * np.abs(lam).max())
 
 
+def test_atoms_of_infinite_mass_move_as_prescribed() -> None:
+    """The others follow them."""
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=(2, 3, 3))
+    whole = ConstraintSet(held.Distance([[0, 1], [1, 2]]), x, np.ones(3))
+    solver = GeneralClusters(whole, np.arange(2), np.zeros(2, dtype=np.int64), np.array([0.0, 1.0, 0.5]))
+    driving, rates = y[0].copy(), np.array([0.3, -0.2])
+    assert solver.tangents(x, y, rates, None, None, 0.0).converged
+    np.testing.assert_array_equal(y[0], driving)
+    assert whole.jacobian(x) @ y.ravel() == pytest.approx(rates, abs=1e-14)
+
+
 @pytest.mark.parametrize(("apart", "converged"), [(1e-14, True), (1e-9, False)])
 def test_velocities_that_cannot_be_tangent_are_refused(apart: float, converged: bool) -> None:
     """Two rows of one bond with rates that differ: by rounding, or by more than that."""
