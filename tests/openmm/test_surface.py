@@ -249,7 +249,7 @@ def test_a_first_step_without_solution_leaves_velocities_without_a_kick():
     x, v = state_of(context)
     v[0, 1] = 40.0
     context.setVelocities(v)
-    with pytest.raises(ConvergenceError, match="step 1: .*time step too large"):
+    with pytest.raises(ConvergenceError, match=r"step 1: .*time step too large"):
         integrator.step(10)
     assert np.array_equal(state_of(context)[0], x)
     assert np.abs(state_of(context)[1] - v).max() <= 1e-14 * 40
