@@ -85,13 +85,13 @@ MUTANTS = [
         "solvers/water.py",
         "kept = all_within(TINY, ps) and all_within(TINY, qt) and all_within(TINY, us)",
         "kept = all_within(TINY, ps) and all_within(TINY, qt)",
-        "tests/solvers/test_water.py::test_failure_changes_nothing_and_names_the_triangle[turned]",
+        "tests/solvers/test_water.py::test_a_third_side_that_turned_round_is_no_solution",
     ),
     (
         "solvers/water.py",
         "c10, c11, c12 = -(a12 * a20 + a10 * a22)",
         "c10, c11, c12 = -(a12 * a20 - a10 * a22)",
-        "tests/solvers/test_water.py::test_matches_dense_newton[7]",
+        "tests/solvers/test_water.py::test_newton_and_a_chord_step_gain_together",
     ),
     (
         "solvers/water.py",
@@ -114,8 +114,8 @@ MUTANTS = [
     ),
     (
         "solvers/sweeps.py",
-        "both = (load(weights, end) + from_next(load(weights, first))) * real",
-        "both = (load(weights, end) + load(weights, first)) * real",
+        "rx + real * (gx - fx)",
+        "rx + real * (gx + fx)",
         "tests/solvers/test_chain.py::test_ten_thousand_bonds[free]",
     ),
     # -- solvers: rows of several kinds --
