@@ -154,31 +154,37 @@ def start(name: str) -> State:
 def sensitivities(name: str) -> tuple[float, ...]:
     """Of the solution at each stored time to its start.
 
-    By differences where the file has none, the planar pendulum; there to its state at earlier stored times as well,
-    since rounding on the way counts as that at the start does, and more near the top.
+    By differences where the file has none, to the state at earlier stored times as well, since rounding on the way
+    counts as that at the start does, and may count more: a pendulum near the top, a body about its middle axis.
     """
     case = cases.load(name)
     known = [s.condition for s in case.solution]
-    if np.isfinite(known).all() or len(case.masses) > 1:
-        return tuple(float(c) for c in np.nan_to_num(known, nan=1.0))
-    setting, size = system(name), 1e-6
-    largest = np.zeros(len(known))
+    if np.isfinite(known).all():
+        return tuple(float(c) for c in known)
+    setting, size, dt = system(name), 1e-6, min(0.1, 4 * FLOOR_STEPS.get(name, 0.05))
+    largest = np.nan_to_num(known, nan=1.0)
     snapshots = [case.initial, *case.solution]
     for j, s in enumerate(snapshots[:-1]):
-        x, v = s.positions[0], s.velocities[0]
-        along = np.cross([0.0, 1.0, 0.0], x)  # in the plane of the pendulum
-        angle = (np.cos(size), np.sin(size))
-        states = [
-            setting.initial_state(y[None], u[None], time=s.time, project=True)
-            for y, u in ((x, v), (x * angle[0] + along * angle[1], v), (x, v + size * along))
-        ]
+        starts = [(s.positions, s.velocities), *disturbed(s, size)]
+        states = [setting.initial_state(y, u, time=s.time, project=True) for y, u in starts]
         for k in range(j, len(known)):
             length = snapshots[k + 1].time - states[0].time
-            n = int(np.ceil(length / 0.1))
+            n = int(np.ceil(length / dt))
             states = [run(setting, state, length / n, n, stepper=KahanLi6()) for state in states]
             flat = np.array([np.concatenate([e.positions.ravel(), e.velocities.ravel()]) for e in states])
             largest[k] = max(largest[k], np.linalg.norm(flat[1:] - flat[0]) / size)
     return tuple(largest.tolist())
+
+
+def disturbed(snapshot: Snapshot, size: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Positions and velocities that differ from these by `size` along each axis of the tangent space, or at random."""
+    x, v = snapshot.positions, snapshot.velocities
+    if len(x) == 1:
+        along = np.cross([0.0, 1.0, 0.0], x)  # in the plane of the pendulum
+        return [(x * np.cos(size) + along * np.sin(size), v), (x, v + size * along)]
+    # Of a matrix J, the mean of |J g|^2 over normal deviates g is |J|^2.
+    some = np.random.default_rng(0).standard_normal((6, 2, *x.shape)) * size / np.sqrt(6)
+    return [(x + a, v + b) for a, b in some]
 
 
 def floor(name: str, index: int) -> float:

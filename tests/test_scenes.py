@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from ase import units
 from scipy.integrate import solve_ivp
+from test_reference_orders import EPS, sensitivities
 
 from kcons import projection, scenes
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.scenes import chain, dumbbells, molecule, water
+from kcons.scenes.minimal import COARSER, FINEST
 from kcons.scenes.potential import Potential
 from kcons.scenes.scene import converged, thermal_velocities
 from kcons.scenes.sphere import swing
@@ -139,15 +141,18 @@ def test_scene_is_the_stored_case(name):
 
 @pytest.mark.parametrize("name", STORED)
 def test_solution_meets_the_stored_one(name):
+    # What is wrong at the start, or on the way, grows as the stored case is sensitive to its start. The start is wrong
+    # by rounding, and a step by its tolerance at most; those of many steps do not add up, as they have either sign.
     scene, case = small(name), cases.load(STORED[name])
-    known = [s for s in case.solution if s.time <= scene.horizon]
+    known = [(s, grown) for s, grown in zip(case.solution, sensitivities(STORED[name]), strict=True)]
+    known = [(s, grown) for s, grown in known if s.time <= scene.horizon]
     assert known
-    for s in known:
+    for s, grown in known:
         found = scene.solution(s.time)
         off = scene.deviation(found.positions, s.positions)
-        assert off < 4e-13
-        assert off < 5 * found.error + 1e-14  # the estimate is honest
-        assert found.error < 2e-12
+        assert off < 4 * FINEST * grown
+        assert found.error < 4 * (FINEST + COARSER) * grown
+        assert off < 5 * found.error + 4 * EPS * grown  # the estimate is honest
 
 
 @pytest.mark.parametrize("name", STORED)

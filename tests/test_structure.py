@@ -120,6 +120,20 @@ def test_hydrogens_are_added(bare):
     assert scene.constraint_set.n_rows == 12
 
 
+def test_hydrogens_do_not_depend_on_the_platforms_of_the_machine(bare, monkeypatch):
+    """OpenMM would take its fastest, of whatever precision."""
+    seen = []
+    add = app.Modeller.addHydrogens
+
+    def recorded(self, *args, platform=None, **options):
+        seen.append(platform and platform.getName())
+        return add(self, *args, platform=platform, **options)
+
+    monkeypatch.setattr(app.Modeller, "addHydrogens", recorded)
+    scenes.from_file(bare, add_hydrogens=True)
+    assert seen == ["CPU"]
+
+
 def test_box_decides_about_the_forces(tmp_path, alanine):
     scene = scenes.from_file(water(tmp_path / "water.pdb"))
     assert "PME" in scene.title

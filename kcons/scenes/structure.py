@@ -196,11 +196,13 @@ def force_field_of(files: Sequence[str]) -> Any:
 
 
 def _with_hydrogens(topology: Any, positions: Any, field: Any) -> tuple[Any, FloatArray]:
+    import openmm
     from openmm import app
 
     modeller = app.Modeller(topology, positions)
     try:
-        modeller.addHydrogens(field)
+        # Without a platform the fastest is taken, of whatever precision, and hydrogens differ from machine to machine.
+        modeller.addHydrogens(field, platform=openmm.Platform.getPlatformByName("CPU"))
     except ValueError as error:
         raise _explained(error, topology) from error
     from openmm import unit

@@ -16,6 +16,7 @@ from ase.md.velocitydistribution import thermalize_momenta
 
 from kcons.ase import Constraints, constrain, rigid_water
 from kcons.constraints import Angle, Distance
+from kcons.solvers.groups import POSITION_TOLERANCE
 
 FS = units.fs
 TEMPERATURE = 300.0
@@ -139,6 +140,17 @@ def ethanol() -> tuple[Atoms, Constraints]:
 def off(atoms, held) -> float:
     """Largest violation of a row by the positions."""
     return float(np.abs(held.engine(atoms).constraint_set.value(atoms.positions)).max())
+
+
+def unavoidable(atoms, length) -> float:
+    """What `off` may be of held distances up to `length`, however well they are solved.
+
+    The solver accepts POSITION_TOLERANCE of a length. Storing rounds each coordinate of both atoms by half a unit in
+    the last place, sqrt(3) units along a bond at most. Measuring rounds three differences, their squares, two sums and
+    a root, 3.5 units of 2^-53 at most; so did the solver when it measured.
+    """
+    stored = np.sqrt(3) * np.spacing(np.abs(atoms.positions).max())
+    return float(stored + (POSITION_TOLERANCE + 7 * 2.0**-53) * length)
 
 
 def slip(atoms, held) -> float:

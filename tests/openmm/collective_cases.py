@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import openmm
 from openmm import app, unit
+from openmm_systems import PROPERTIES
 
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
 
 DATA = Path(__file__).parent.parent / "data"
-PLATFORMS = ["Reference", "CPU"]
 #: A bent chain with a branch: no three atoms in a line.
 CHAIN = np.array(
     [[0.0, 0, 0], [0.14, 0.03, 0], [0.2, 0.15, 0.02], [0.1, 0.22, 0.1], [0.0, 0.2, 0.2], [0.08, 0.3, 0.25]]
@@ -53,9 +53,7 @@ def chain_system():
 
 
 def context_of(system, integrator, positions, velocities=None, platform="Reference"):
-    # With several threads, forces are summed in any order, and no run is like another.
-    properties = {"Threads": "1", "DeterministicForces": "true"} if platform == "CPU" else {}
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(platform), properties)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatform(platform), PROPERTIES.get(platform, {}))
     context.setPositions(positions)
     if velocities is not None:
         context.setVelocities(velocities)

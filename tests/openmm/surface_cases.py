@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 from openmm import unit
+from openmm_systems import context_of
 
 from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
@@ -14,7 +15,6 @@ from kcons.openmm.surface import SurfaceIntegrator
 from kcons.steppers import State
 from kcons.steppers import System as CoreSystem
 
-PLATFORMS = ("Reference", "CPU")
 #: Neither a multiple of the identity nor along an axis.
 TURN = np.linalg.qr(np.array([[1.0, 0.4, -0.3], [0.2, 1.0, 0.5], [-0.6, 0.1, 1.0]]))[0]
 CENTER = np.array([0.3, -0.2, 0.5])
@@ -68,8 +68,7 @@ def system_of(masses=MASSES, potential=POTENTIAL, springs=0.3):
 
 
 def started(system, integrator, x, v, platform="Reference"):
-    properties = {"Threads": "1", "DeterministicForces": "true"} if platform == "CPU" else {}
-    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+    context = context_of(system, integrator, platform)
     context.setPositions(x)
     context.setVelocities(v)
     integrator.apply_velocities(context)

@@ -6,9 +6,9 @@ import numpy as np
 import openmm
 import pytest
 from carried_systems import PEPTIDE, PEPTIDE_FILE, context_of, free, peptide, pull, start, state_of
-from openmm import app
+from openmm import app, unit
 
-from kcons.constraints import Distance, Sphere
+from kcons.constraints import Distance, FixedAtoms, Sphere
 from kcons.errors import ConvergenceError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.transfer import hold
@@ -30,6 +30,22 @@ def test_rows_are_held_to_rounding(platform):
     assert worst[0] <= 1e-14
     assert worst[1] <= 1e-13
     assert part.rank(context) == 22
+
+
+def test_particles_without_mass_take_no_degree_of_freedom():
+    """Bonds to a particle that OpenMM does not move, and one that is held there as well: two degrees go, not eight."""
+    system = free([0.0, 12.0, 12.0, 0.0])
+    x = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0.5, 0.5, 0.5]])
+    part = hold(system, [Distance([[0, 1], [1, 2]]), FixedAtoms([3])], x)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    assert part.rank(context) == 2
+    assert integrator.degrees_of_freedom(context) == 2 * 3 - 2
+    context.setVelocities([[0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 0]])
+    integrator.step(5)
+    twice = 2 * integrator.kinetic_energy() / (4 * unit.MOLAR_GAS_CONSTANT_R)
+    assert integrator.computeSystemTemperature() / unit.kelvin == pytest.approx(twice / unit.kelvin, rel=1e-12)
 
 
 def test_positions_come_back_to_the_last_bit():

@@ -14,7 +14,6 @@ from collective_cases import (
     CHAIN,
     FORCES,
     MASSES,
-    PLATFORMS,
     angle,
     bond,
     chain_system,
@@ -28,6 +27,7 @@ from collective_cases import (
     state_of,
     with_variable,
 )
+from openmm_systems import PLATFORMS
 
 from kcons import ConstraintSet
 from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusOfGyration

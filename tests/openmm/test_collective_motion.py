@@ -9,7 +9,6 @@ import openmm
 import pytest
 from collective_cases import (
     CHAIN,
-    PLATFORMS,
     angle,
     bond,
     chain_system,
@@ -22,6 +21,7 @@ from collective_cases import (
     with_variable,
 )
 from openmm import app, unit
+from openmm_systems import PLATFORMS
 
 from kcons.errors import ConstraintError, ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator

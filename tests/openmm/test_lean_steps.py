@@ -189,3 +189,25 @@ def test_leapfrog_knows_its_kinetic_energy(platform):
         ends.append(state_of(context))
     np.testing.assert_array_equal(ends[0], ends[1])
     assert energies[0] == energies[1]
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_leapfrog_at_rest_has_no_kinetic_energy(platform):
+    """Two particles pressed against each other at a held distance: half a kick and half of what holds it cancel."""
+    system = openmm.System()
+    press = openmm.CustomExternalForce("-100*sign*x")
+    press.addPerParticleParameter("sign")
+    for k, sign in enumerate((1.0, -1.0)):
+        system.addParticle(4.0)
+        press.addParticle(k, [sign])
+    system.addForce(press)
+    system.addConstraint(0, 1, 0.3)
+    x = np.array([[-0.15, 0, 0], [0.15, 0, 0]])
+    integrator = ProjectedIntegrator(0.01, "leapfrog")
+    context = started(system, integrator, x, np.zeros((2, 3)), platform)
+    integrator.step(7)
+    there, v = state_of(context)
+    assert np.abs(there - x).max() <= 1e-12
+    assert np.abs(v).max() <= 1e-10
+    # A kick of half a step alone is (0.01 100/4/2)^2 4 = 0.06 kJ/mol.
+    assert context.getState(energy=True).getKineticEnergy()._value <= 1e-10

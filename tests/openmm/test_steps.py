@@ -90,6 +90,34 @@ def test_failed_step_is_taken_back(evaluates):
     np.testing.assert_array_equal(state_of(context), state_of(other))
 
 
+class Reluctant(HeldCoordinates):
+    """Fails to project velocities where the global variable `reluctant` is 1."""
+
+    def declare(self, program):
+        super().declare(program)
+        program.number("reluctant", "1 where velocities cannot be projected")
+
+    def project(self, program):
+        super().project(program)
+        program.let("failed", f"select(reluctant,{self.code},failed)", "told to")
+
+
+@pytest.mark.parametrize("scheme", ["geodesic", "suzuki4"])
+def test_a_step_whose_last_projection_fails_is_not_counted(scheme):
+    system, x, v = loose_alanine()
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=[Reluctant([0], 2, x[0, 2], 22)])
+    context = started(system, integrator, x, v)
+    integrator.step(3)
+    before = state_of(context)
+    integrator.setGlobalVariableByName("reluctant", 1.0)
+    with pytest.raises(ConvergenceError) as caught:
+        integrator.step(5)
+    assert caught.value.step == 4
+    assert context.getStepCount() == 3
+    assert context.getTime() / PS == pytest.approx(0.003, rel=1e-12)
+    np.testing.assert_array_equal(state_of(context), before)
+
+
 def test_failure_in_the_middle_of_many_steps():
     system, x, v = loose_alanine()
     integrator = ProjectedIntegrator(1e-3, parts=[holding(steepest=2e-4)])

@@ -9,11 +9,11 @@ import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
+from openmm_systems import PLATFORMS
 from surface_cases import (
     CENTER,
     KINDS,
     MASSES,
-    PLATFORMS,
     POSITIONS,
     VELOCITIES,
     force_of,
@@ -235,6 +235,35 @@ def test_a_step_without_solution_is_taken_back(scheme, kind, compiled, platform)
     context.setVelocities(v)
     integrator.step(5)
     assert max(worst(integrator, context)) <= 1e-13
+
+
+def falling(dt):
+    system = system_of(potential="200*z", springs=0)
+    integrator = SurfaceIntegrator(dt, "rattle", surfaces=[Sphere([0], [0, 0, 0], 1.0)], system=system)
+    x = np.array([[0.6, 0, 0.8], [5, 5, 5], [0, 1.0, 0]])
+    return integrator, started(system, integrator, x, np.zeros((3, 3)))
+
+
+def test_a_first_step_without_solution_leaves_velocities_without_a_kick():
+    integrator, context = falling(0.06)
+    x, v = state_of(context)
+    v[0, 1] = 40.0
+    context.setVelocities(v)
+    with pytest.raises(ConvergenceError, match=r"step 1: .*time step too large"):
+        integrator.step(10)
+    assert np.array_equal(state_of(context)[0], x)
+    assert np.abs(state_of(context)[1] - v).max() <= 1e-14 * 40
+
+
+def test_a_step_without_solution_in_the_middle_leaves_whole_velocities():
+    (integrator, context), (other, twin) = falling(0.045), falling(0.045)
+    with pytest.raises(ConvergenceError, match="time step too large"):
+        integrator.step(1000)
+    done = context.getStepCount()
+    assert done > 2
+    other.step(done)
+    for here, there in zip(state_of(context), state_of(twin), strict=True):
+        np.testing.assert_allclose(here, there, rtol=0, atol=1e-13 * np.abs(there).max())
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder", "rotated ellipsoid", "torus", "formula"])

@@ -7,12 +7,11 @@ from functools import cache
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import context_of
+from openmm_systems import PLATFORMS, context_of
 from reference import cases
 from surface_cases import (
     FORMULA,
     KINDS,
-    PLATFORMS,
     POSITIONS,
     QUADRICS,
     core_run,

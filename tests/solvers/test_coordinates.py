@@ -71,4 +71,8 @@ def test_all_kinds_together():
 
 def test_dihedrals_miss_by_the_shorter_way():
     assert miss(DIHEDRAL, 3.1, -3.1) == pytest.approx(2 * np.pi - 6.2)
+    # More than a quarter of a turn is nothing to go round for.
+    assert miss(DIHEDRAL, -1.0, 1.9) == pytest.approx(2.9)
+    assert miss(DIHEDRAL, 1.0, -1.9) == pytest.approx(-2.9)
+    assert miss(DIHEDRAL, -1.0, 2.4) == pytest.approx(3.4 - 2 * np.pi)
     assert miss(int(RowKind.ANGLE), 3.1, 0.1) == pytest.approx(-3.0)

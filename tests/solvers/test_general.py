@@ -136,6 +136,53 @@ def test_rows_that_are_nearly_parallel(exponent: int) -> None:
     np.testing.assert_allclose(from_lam, y - new, rtol=0, atol=1e-13 + 1e-16 * np.abs(lam).max())
 
 
+def test_atoms_of_infinite_mass_move_as_prescribed() -> None:
+    """The others follow them."""
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=(2, 3, 3))
+    whole = ConstraintSet(held.Distance([[0, 1], [1, 2]]), x, np.ones(3))
+    solver = GeneralClusters(whole, np.arange(2), np.zeros(2, dtype=np.int64), np.array([0.0, 1.0, 0.5]))
+    driving, rates = y[0].copy(), np.array([0.3, -0.2])
+    assert solver.tangents(x, y, rates, None, None, 0.0).converged
+    np.testing.assert_array_equal(y[0], driving)
+    assert whole.jacobian(x) @ y.ravel() == pytest.approx(rates, abs=1e-14)
+
+
+@pytest.mark.parametrize(("apart", "converged"), [(1e-14, True), (1e-9, False)])
+def test_velocities_that_cannot_be_tangent_are_refused(apart: float, converged: bool) -> None:
+    """Two rows of one bond with rates that differ: by rounding, or by more than that."""
+    x = np.array([[0.1, 0.2, 0.3], [1.2, 0.1, -0.2]])
+    solver, whole = solver_of(held.Distance([[0, 1], [0, 1]]), x)
+    y = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.2]])
+    before = y.copy()
+    rates = np.array([0.7, 0.7 * (1 + apart)])
+    outcome = solver.tangents(x, y, rates, None, None, 0.0)
+    assert outcome.converged == converged
+    if converged:
+        assert whole.jacobian(x) @ y.ravel() == pytest.approx(rates, rel=1e-13)
+    else:
+        np.testing.assert_array_equal(y, before)
+
+
+@pytest.mark.parametrize(
+    ("offset", "apart", "converged"), [(0.0, 4e-15, True), (0.0, 1e-11, False), (1e3, 1e-13, True), (1e3, 1e-10, False)]
+)
+def test_no_more_is_left_than_rounding(offset: float, apart: float, converged: bool) -> None:
+    """Two rows of one bond whose targets part with time: by what positions resolve, or by more than that."""
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0]]) + offset
+    rows = [held.Distance([0, 1], lambda t: 1.0 + 0.0 * t), held.Distance([0, 1], lambda t: 1.0 + apart * t)]
+    solver, whole = solver_of(rows, x)
+    moved = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
+    before = moved.copy()
+    outcome = solver.positions(moved, x, None, None, None, 0.0, None, 1.0, 0.0)
+    assert outcome.converged == converged
+    if converged:
+        assert np.all(np.abs(whole.value(moved, 1.0)) <= whole.tolerance(moved, 1.0))
+    else:
+        np.testing.assert_array_equal(moved, before)
+        assert solver.restore(moved, time=1.0).converged is False
+
+
 def test_velocity_rows_move_no_positions() -> None:
     rows = [held.RadiusOfGyration([[0, 1, 2]]), held.LinearVelocity([[0, 1]], np.ones((2, 3)), 0.7)]
     solver, whole = solver_of(rows, WATER)

@@ -144,6 +144,32 @@ def test_failure_changes_nothing_and_names_the_triangle(damage):
     np.testing.assert_array_equal(velocities, w.velocities)
 
 
+def test_newton_and_a_chord_step_gain_together():
+    """Of order three, a factor for both: from three hundredths of a length to rounding in five steps."""
+    for seed in range(3):
+        w = Water(64, seed)
+        outcome = w.solver.positions(w.x_new.copy(), w.x_ref, w.lengths)
+        assert outcome.converged
+        assert outcome.iterations <= 6
+
+
+def test_a_third_side_that_turned_round_is_no_solution():
+    """The ends of a narrow triangle change places: all lengths are right, and two of the sides hardly turn."""
+    w = Water(9)
+    narrow = np.array([[0.0, 0, 0], [1.0, 0.3, 0], [1.0, -0.3, 0]])
+    w.x_ref[w.atoms] = narrow
+    w.lengths[:] = np.tile(np.linalg.norm(narrow[I] - narrow[J], axis=1), 9)
+    w.x_new[:] = w.x_ref
+    assert w.solver.positions(w.x_new.copy(), w.x_ref, w.lengths).converged
+    _, b, c = w.atoms[4]
+    w.x_new[[b, c]] = w.x_new[[c, b]]
+    x = w.x_new.copy()
+    outcome = w.solver.positions(x, w.x_ref, w.lengths)
+    assert not outcome.converged
+    assert outcome.worst_row == 3 * 4 + PAIRS.index((1, 2))
+    np.testing.assert_array_equal(x, w.x_new)
+
+
 @pytest.mark.parametrize("damage", ["nan", "coincident", "collinear"])
 def test_failed_tangents_change_nothing(damage):
     w = Water(29)

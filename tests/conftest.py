@@ -1,0 +1,19 @@
+"""Warnings are errors; of deprecations only those that this package or its tests cause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+#: Modules of the package and of its tests, as they are called when they are imported.
+FILES = list(HERE.rglob("*.py"))
+OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # What other packages warn of in their own modules, a newer Python or NumPy in most cases, is for them to mend.
+    for kind in ("DeprecationWarning", "PendingDeprecationWarning", "FutureWarning", "SyntaxWarning"):
+        config.addinivalue_line("filterwarnings", f"default::{kind}")
+        config.addinivalue_line("filterwarnings", rf"error::{kind}:({'|'.join(OWN)})(\.|$)")

@@ -1,0 +1,120 @@
+"""Each mutant of `mutants.py` fails the tests named for it, which pass without it. Long; run by `-m mutants`."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mutants import MUTANTS
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "kcons"
+#: What pytest returns: all passed, some failed.
+PASSED, FAILED = 0, 1
+
+
+def ids(mutant):
+    file, old, *_ = mutant
+    return f"{file}-{old.splitlines()[-1].strip()[:40]}"
+
+
+def copied(folder: Path) -> Path:
+    """The package with its compiled kernels, and its tests, where lines can be changed."""
+    shutil.copytree(PACKAGE, folder / "kcons")
+    shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+def imported(file: Path) -> set[str]:
+    """Modules that a file imports, `kcons.a.b` as it stands or as part of another name."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+    return names
+
+
+def users(package: Path, file: str) -> list[Path]:
+    """The file, and all that import it, themselves or through others."""
+    modules = {
+        ".".join(("kcons", *path.relative_to(package).with_suffix("").parts)): path for path in package.rglob("*.py")
+    }
+    needs = {name: imported(path) for name, path in modules.items()}
+    found = {".".join(("kcons", *Path(file).with_suffix("").parts))}
+    while more := {name for name, used in needs.items() if name not in found and used & found}:
+        found |= more
+    return [modules[name] for name in found]
+
+
+def forget_kernels(package: Path, file: str) -> None:
+    """Kernels are kept by the text of their own module, also those that took in functions of others."""
+    for path in users(package, file):
+        for kept in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb?"):
+            kept.unlink()
+
+
+def run(folder: Path, tests: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    for name in ("NUMBA_CACHE_DIR", "PYTEST_ADDOPTS", "PYTEST_XDIST_WORKER"):
+        environment.pop(name, None)
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    return subprocess.run(
+        [*command, *tests.split()], cwd=folder, env=environment, capture_output=True, text=True, timeout=1200
+    )
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=ids)
+def test_the_list_is_true(mutant):
+    """The text is there, once, and so are the tests."""
+    file, old, new, tests = mutant
+    assert (PACKAGE / file).read_text().count(old) == 1
+    assert old != new
+    assert tests
+    for test in tests.split():
+        path, _, name = test.partition("::")
+        assert (ROOT / path).exists()
+        assert not name or f"def {name.partition('[')[0]}(" in (ROOT / path).read_text()
+
+
+@pytest.mark.mutants
+def test_the_tests_pass_without_mutants(tmp_path):
+    folder = copied(tmp_path)
+    where = [sys.executable, "-c", "import kcons; print(kcons.__file__)"]
+    found = subprocess.run(
+        where, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True
+    )
+    assert Path(found.stdout.strip()).is_relative_to(folder), found
+    result = run(folder, " ".join(sorted({test for *_, tests in MUTANTS for test in tests.split()})))
+    assert result.returncode == PASSED, result.stdout
+
+
+@pytest.mark.mutants
+@pytest.mark.parametrize("mutant", MUTANTS, ids=ids)
+def test_the_mutant_is_killed(mutant, tmp_path):
+    file, old, new, tests = mutant
+    folder = copied(tmp_path)
+    target = folder / "kcons" / file
+    text = target.read_text()
+    assert text.count(old) == 1
+    forget_kernels(folder / "kcons", file)
+    target.write_text(text.replace(old, new))
+    for test in tests.split():
+        result = run(folder, test)
+        assert result.returncode == FAILED, f"{test} does not fail:\n{result.stdout[-3000:]}"
+        # What does not run at all shows nothing about the test.
+        assert not re.search(r"TypingError|LoweringError|NameError|SyntaxError", result.stdout), result.stdout[-3000:]
+
+
+def test_modules_that_took_in_a_function_are_found():
+    names = {str(path.relative_to(PACKAGE)) for path in users(PACKAGE, "solvers/narrow.py")}
+    assert {"solvers/narrow.py", "solvers/distances.py", "solvers/packed.py", "motion.py"} <= names
+    assert "errors.py" not in names
