@@ -170,7 +170,7 @@ class Splitting:
                             break
                         if force is not None:
                             now = time + (stage.ends[-1] * dt + left_over)
-                            out.setflags(False)
+                            out.setflags(False)  # type: ignore[call-arg]
                             f = system.accepted(force(out, now), number + made + 1, False)
                         x, out = out, new(shape)
                         found = many(FLY, its_fractions, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
@@ -184,7 +184,7 @@ class Splitting:
                 time = then
                 if force is not None:
                     # The function can neither write to it nor will anybody else: it may keep what it sees.
-                    out.setflags(False)
+                    out.setflags(False)  # type: ignore[call-arg]
                     raw: Any = force(out, time)
                     # What System.accepted finds most often.
                     if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
