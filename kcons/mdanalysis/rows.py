@@ -68,9 +68,12 @@ class RowTable:
             constraint_set.constraints, constraint_set.starts[:-1], constraint_set.starts[1:], strict=True
         ):
             if item.family == "Distance" and not item.moving:
-                length_rows.append(np.arange(first, end))
-                pairs.append(item.atoms)
-                held.append(item.target_at(0.0))
+                # Nearest images are right for all but those that span half the cell, which the set itself looks at.
+                whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole
+                length_rows.append(first + np.flatnonzero(~whole))
+                other_rows.append(first + np.flatnonzero(whole))
+                pairs.append(item.atoms[~whole])
+                held.append(item.target_at(0.0)[~whole])
             else:
                 other_rows.append(np.arange(first, end))
         self.length_rows: IntArray = np.concatenate(length_rows)

@@ -346,3 +346,23 @@ def test_bad_options(water):
         checked(water["dcd"], [])
     with pytest.raises(InputError, match="no atom 120"):
         checked(water["dcd"], Distance([[0, 120]], 1.0))
+
+
+@pytest.mark.parametrize("targets", ["given", "first"])
+def test_bodies_longer_than_half_the_cell_are_seen_whole(tmp_path, targets):
+    """Corners of a hexagon, 2.8 Å across, in a cell of 5 Å: nearest images of opposite corners are 2.2 Å apart."""
+    rng = np.random.default_rng(3)
+    corners = 1.4 * np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(6) * np.pi / 3])
+    frames = []
+    for _ in range(8):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        frames.append((corners @ turn + rng.uniform(0, 5, 3)) % 5.0)
+    frames[5][2] += [0.1, 0.0, 0.0]
+    path = files.write(tmp_path / "ring.dcd", np.array(frames), side=5.0)
+    pairs = [[i, j] for i in range(6) for j in range(i + 1, 6)]
+    lengths = np.linalg.norm(corners[[i for i, _ in pairs]] - corners[[j for _, j in pairs]], axis=1)
+    rows = Distance(pairs, lengths if targets == "given" else None)
+    result = checked(path, rows, n=2, worst=15, targets=targets)
+    largest = np.array(result.series["largest Å"])
+    assert largest[[0, 1, 2, 3, 4, 6, 7]].max() < 1e-5
+    assert 0.02 < largest[5] < 0.2
