@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.errors import InputError
 
 FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
 
 _FLOAT = np.dtype(np.float64)
 #: Kinds of dtype whose values are real numbers: boolean, integers, floating point.
@@ -59,7 +60,7 @@ def lent(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()
     # By place, not by name: this is called in every step.
-    view.setflags(False)  # type: ignore[call-arg]
+    view.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
     return view
 
 
@@ -84,3 +85,25 @@ def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
     good = isinstance(multipliers, np.ndarray) and multipliers.dtype == np.float64 and multipliers.shape == (n_rows,)
     if not good or not multipliers.flags.writeable:
         raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")
+
+
+def check_pairs(pairs: ArrayLike, n_atoms: int) -> IntArray:
+    """Pairs of different atoms, shape (n, 2).
+
+    Raises
+    ------
+    InputError
+        Another shape; numbers that are no integers; atoms that do not exist.
+    """
+    table = np.asarray(pairs)
+    if table.size == 0:
+        return np.zeros((0, 2), np.int64)
+    if table.ndim != 2 or table.shape[1] != 2 or not np.issubdtype(table.dtype, np.integer):
+        raise InputError(f"bonds must be pairs of atoms, shape (n, 2), not {table.dtype} {table.shape}", item="bonds")
+    bad = (table < 0).any(axis=1) | (table >= n_atoms).any(axis=1) | (table[:, 0] == table[:, 1])
+    if bad.any():
+        i, j = table[int(np.argmax(bad))].tolist()
+        raise InputError(
+            f"bonds has the pair ({i}, {j}); give two different atoms of 0 to {n_atoms - 1}", item="bonds", atoms=[i, j]
+        )
+    return table.astype(np.int64)
