@@ -364,7 +364,7 @@ class System:
         if (
             given
             and away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max())
-            and away.max() > self.rest(x, v, time)
+            and (project or away.max() > self.rest(x, v, time))
         ):
             if motion.degrees_of_freedom == 0:
                 raise OverdeterminedError(
@@ -389,7 +389,10 @@ class System:
     def rest(self, x: FloatArray, v: FloatArray, time: float) -> float:
         """Speed below which velocities are rounding: that of a kick by which atoms cross the system in a step."""
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
-        return KICK_ROUNDING * math.sqrt(kick * float(np.ptp(x, axis=0).max(initial=0.0)))
+        size = float(np.ptp(x, axis=0).max(initial=0.0))
+        # Or one by which no atom has moved by more than its rounding since time 0.
+        still = float(np.finfo(float).eps) * size / abs(time) if time else 0.0
+        return max(KICK_ROUNDING * math.sqrt(kick * size), still)
 
     def forces(
         self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True, finite: bool = True
