@@ -59,7 +59,6 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
 def lent(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()
-    # By place, not by name: this is called in every step.
     view.setflags(False)  # type: ignore[call-arg]  # write, which by name takes three times as long
     return view
 
