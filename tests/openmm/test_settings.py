@@ -253,24 +253,13 @@ def test_set_target_outlives_a_state():
 
 def test_number_of_stages_stays():
     """A scheme of five drifts leaves a State that says where they end."""
-    made, other = carried_at(scheme="suzuki4"), carried_at()
-    twin = carried_at()
-    state = made.run(3)
-    other.context.setState(state)
-    other.run(3)
-    twin.context.setState(made_plain(made))
-    twin.context.setStepCount(0)
-    state = other.context.getState(positions=True)
-    assert other.integrator.getGlobalVariableByName("end_stage") == 1
-    twin.run(3)
-    np.testing.assert_allclose(state_of(other.context), state_of(twin.context), rtol=0, atol=1e-12)
-
-
-def made_plain(made):
-    """The State before the last three steps is gone: that of now, positions and velocities only."""
-    again = carried_at(scheme="suzuki4")
-    again.run(3)
-    return again.context.getState(positions=True, velocities=True)
+    giver, taker, plain = carried_at(scheme="suzuki4"), carried_at(), carried_at()
+    taker.context.setState(giver.run(3))
+    plain.context.setState(giver.context.getState(positions=True, velocities=True))
+    for one in (taker, plain):
+        one.run(3)
+    assert taker.integrator.getGlobalVariableByName("end_stage") == 1
+    np.testing.assert_allclose(state_of(taker.context), state_of(plain.context), rtol=0, atol=1e-12)
 
 
 def test_seeds_of_checkpoints():
