@@ -68,9 +68,13 @@ class RowTable:
             constraint_set.constraints, constraint_set.starts[:-1], constraint_set.starts[1:], strict=True
         ):
             if item.family == "Distance" and not item.moving:
-                length_rows.append(np.arange(first, end))
-                pairs.append(item.atoms)
-                held.append(item.target_at(0.0))
+                # Compiled code takes nearest images; whole rows may be longer than half the cell, and are for the set.
+                plain = np.ones(item.n_rows, dtype=bool) if item.whole is None else ~item.whole
+                numbers = np.arange(first, end)
+                length_rows.append(numbers[plain])
+                other_rows.append(numbers[~plain])
+                pairs.append(item.atoms[plain])
+                held.append(item.target_at(0.0)[plain])
             else:
                 other_rows.append(np.arange(first, end))
         self.length_rows: IntArray = np.concatenate(length_rows)
