@@ -332,3 +332,16 @@ def test_half_steps_bound_what_writers_make_of_coordinates(tmp_path):
             off = np.abs(back - positions)
             assert (off.max(axis=1) <= precision.half_step(positions) * (1 + 1e-6)).all(), ending
             assert (off.max(axis=1) / precision.half_step(positions)).max() > 0.3
+
+
+def test_targets_that_are_means_have_the_mean_rounding_of_their_frames(tmp_path):
+    x = whole()
+    x[0, 3 * 7 : 3 * 8] += 1e5
+    path = files.write(tmp_path / "a.dcd", x, side=None)
+    result = checked(path, Distance(files.pairs(N)), targets="mean", rank=False, tolerance=0.0)
+    i, j = files.pairs(N)[FAR]
+    stored = files.dcd_frames(path)
+    once = np.sqrt(3) * (half_units(stored)[:, i] + half_units(stored)[:, j])
+    row = rows(result)[FAR]
+    assert once[0] > 100 * once[1:].max()
+    assert np.isclose(row.allowed, once.mean() + once, rtol=1e-4).any()

@@ -92,6 +92,31 @@ def test_minimum_images_of_a_triclinic_cell(tmp_path):
     assert result.units[0].largest < 2e-5
 
 
+@pytest.mark.parametrize("ending", ["dcd", "trr"])
+@pytest.mark.parametrize("off", [0.0, 0.02])
+def test_a_body_longer_than_half_the_cell(tmp_path, ending, off):
+    """A rigid ring across a small cell, atoms wrapped one by one: its long rows have no nearest image."""
+    side, n, frames = 5.0, 6, 8
+    angles = 2 * np.pi * np.arange(n) / n
+    ring = 1.4 * np.stack([np.cos(angles), np.sin(angles), np.zeros(n)], axis=1)
+    rng = np.random.default_rng(8)
+    x = np.zeros((frames, 3 * n, 3))
+    x[:, n:] = 100.0 * rng.random((frames, 2 * n, 3))
+    for k in range(frames):
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        x[k, :n] = side * rng.random(3) + ring @ turn
+    x[5, 2] += off * np.array([1.0, 0, 0])
+    path = files.write(tmp_path / f"r.{ending}", x % side, side=side)
+    i, j = np.triu_indices(n, 1)
+    rows = Distance(np.stack([i, j], axis=1), np.linalg.norm(ring[i] - ring[j], axis=1))
+    assert rows.target_at(0.0).max() > side / 2
+    result = checked(path, rows, n=n, rank=False, worst=99)
+    assert result.status == ("violated" if off else "kept"), result.verdict
+    assert result.violated_frames == bool(off) and result.units[0].largest < 0.03
+    expected = np.linalg.norm(x[:, i] - x[:, j], axis=2) - rows.target_at(0.0)
+    np.testing.assert_allclose(result.series["largest Å"], np.abs(expected).max(axis=1), atol=2e-6)
+
+
 def test_verdict_names_row_frame_and_amount(water):
     result = checked(water["dcd"], Distance(files.pairs(N), files.targets(N)))
     off = np.abs(files.deviations(files.dcd_frames(water["dcd"]), files.pairs(N), files.targets(N), SIDE))

@@ -63,7 +63,7 @@ def test_rigid_bodies_in_words(villin):
         ("name CAA", "matches nothing: no name CAA"),
         ("resid 9999", "matches nothing; residues are numbered 1 to"),
         ("resname and and", "cannot be read"),
-        ("name N and name O", "matches nothing; look at"),
+        ("name N and name O", "matches nothing; names are those of the topology"),
     ],
 )
 def test_selections_that_match_nothing_say_what_there_is(villin, words, said):
