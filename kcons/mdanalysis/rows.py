@@ -68,14 +68,6 @@ class RowTable:
             constraint_set.constraints, constraint_set.starts[:-1], constraint_set.starts[1:], strict=True
         ):
             if item.family == "Distance" and not item.moving:
-<<<<<<< HEAD
-                # Nearest images are right for all but those that span half the cell, which the set itself looks at.
-                whole = np.zeros(item.n_rows, bool) if item.whole is None else item.whole
-                length_rows.append(first + np.flatnonzero(~whole))
-                other_rows.append(first + np.flatnonzero(whole))
-                pairs.append(item.atoms[~whole])
-                held.append(item.target_at(0.0)[~whole])
-=======
                 # Compiled code takes nearest images; whole rows may be longer than half the cell, and are for the set.
                 plain = np.ones(item.n_rows, dtype=bool) if item.whole is None else ~item.whole
                 numbers = np.arange(first, end)
@@ -83,7 +75,6 @@ class RowTable:
                 other_rows.append(numbers[~plain])
                 pairs.append(item.atoms[plain])
                 held.append(item.target_at(0.0)[plain])
->>>>>>> 83bab7cef872d6e54c1263bb217c4a4173cef4bc
             else:
                 other_rows.append(np.arange(first, end))
         self.length_rows: IntArray = np.concatenate(length_rows)
