@@ -13,10 +13,11 @@ from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
-from kcons.images import BoolArray, minimum_image
+from kcons.images import BoolArray
+from kcons.rank import rank_of_small, ranked, small_enough
 from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances, lengths_resolved
-from kcons.solvers.general import RANK_TOLERANCE, GeneralClusters
+from kcons.solvers.general import GeneralClusters
 from kcons.solvers.lanes import SmallClusters
 from kcons.solvers.outcome import Outcome
 from kcons.solvers.rows import SparseRows
@@ -24,10 +25,6 @@ from kcons.solvers.water import RigidTriangles
 
 #: Rounds of Newton that a chain may take until its stored positions show the lengths.
 MAX_ROUNDS = 4
-#: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
-ORDERED_ROWS = 400
-#: Rows of clusters of one kind among which that is done.
-ORDERED_IN_ALL = 20_000
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
 
@@ -270,11 +267,11 @@ def make_plan(
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = _rank(constraint_set, shape, inverse_masses, whole_positions, lattice, solver, time)
+            rank = _rank(shape, inverse_masses, whole_positions, lattice, solver, time)
         clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
-        if clusters and shape.kind in ("sparse", "mixed") and _small_enough(clusters):
+        if clusters and shape.kind in ("sparse", "mixed") and small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
-            rank = _ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
+            rank = ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
         if rank < shape.rows.size:
             plan.dependent += clusters
             if shape.kind in ("water", "lanes"):
@@ -283,8 +280,8 @@ def make_plan(
                 ends = shape.atoms[:, shape.pairs].reshape(-1, 2)
                 shape = Shape("sparse", flat, shape.clusters, False, pairs=ends)
             if not isinstance(solver, GeneralClusters):
-                if shape.kind == "sparse" and not plan.late[shape.rows].any() and _small_enough(clusters):
-                    _ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
+                if shape.kind == "sparse" and not plan.late[shape.rows].any() and small_enough(clusters):
+                    ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
                 solver = _solver(shape, constraint_set, inverse_masses, labels, time, plan.late)
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
@@ -318,40 +315,6 @@ def _by_cluster(rows: IntArray, labels: IntArray) -> list[IntArray]:
     order = np.argsort(labels[rows], kind="stable")
     cuts = np.flatnonzero(np.diff(labels[rows[order]])) + 1
     return [np.sort(part) for part in np.split(rows[order], cuts)]
-
-
-def _small_enough(clusters: list[IntArray]) -> bool:
-    sizes = [len(rows) for rows in clusters]
-    return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
-
-
-def _ranked(
-    constraint_set: ConstraintSet,
-    clusters: list[IntArray],
-    inverse_masses: FloatArray,
-    positions: FloatArray,
-    time: float,
-    late: BoolArray,
-) -> int:
-    """Independent rows of small clusters, by pivoted QR; marks in `late` what the best conditioned rows leave over."""
-    from scipy.linalg import qr  # slow to import
-
-    jacobian = constraint_set.jacobian(positions, time)
-    root_w = np.repeat(np.sqrt(inverse_masses), 3)
-    rank = 0
-    for rows in clusters:
-        part = jacobian[rows]
-        columns, place = np.unique(part.indices, return_inverse=True)
-        b = np.zeros((len(rows), len(columns)))
-        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
-        size = np.linalg.norm(b, axis=1, keepdims=True)
-        triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
-        diagonal = np.zeros(len(rows))
-        diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
-        left_over = diagonal <= RANK_TOLERANCE * diagonal[0]
-        late[rows[order]] = left_over
-        rank += int(np.sum(~left_over))
-    return rank
 
 
 def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
@@ -506,7 +469,6 @@ def _solver(
 
 
 def _rank(
-    constraint_set: ConstraintSet,
     shape: Shape,
     inverse_masses: FloatArray,
     positions: FloatArray,
@@ -521,25 +483,6 @@ def _rank(
         sparse = solver.solver
         if isinstance(sparse, SparseDistances):
             return sparse.rank(positions, lattice)
-        return _rank_of_small(shape, inverse_masses, positions, lattice)
+        return rank_of_small(shape, inverse_masses, positions, lattice)
     assert isinstance(solver, GeneralClusters)
     return solver.rank(positions, time)
-
-
-def _rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
-    """Rank of many small clusters of distances at once, from the singular values of their B."""
-    ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
-    difference = positions[ends[..., 0]] - positions[ends[..., 1]]
-    if lattice is not None:
-        difference = minimum_image(difference, lattice)
-    n, k = ends.shape[:2]
-    b = np.zeros((n, k, shape.atoms.shape[1], 3))
-    row = np.arange(k)
-    root_w = np.sqrt(inverse_masses[shape.atoms[0]])
-    b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
-    b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
-    flat = b.reshape(n, k, -1)
-    size = np.linalg.norm(flat, axis=2, keepdims=True)
-    unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
-    s = np.linalg.svd(unit, compute_uv=False)
-    return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))

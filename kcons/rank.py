@@ -1,0 +1,70 @@
+"""Independent rows of clusters, and which rows depend on others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.clusters import Shape
+from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.images import BoolArray, minimum_image
+from kcons.solvers.general import RANK_TOLERANCE
+
+#: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
+ORDERED_ROWS = 400
+#: Rows of clusters of one kind among which that is done.
+ORDERED_IN_ALL = 20_000
+
+
+def small_enough(clusters: list[IntArray]) -> bool:
+    sizes = [len(rows) for rows in clusters]
+    return max(sizes, default=0) <= ORDERED_ROWS and sum(sizes) <= ORDERED_IN_ALL
+
+
+def ranked(
+    constraint_set: ConstraintSet,
+    clusters: list[IntArray],
+    inverse_masses: FloatArray,
+    positions: FloatArray,
+    time: float,
+    late: BoolArray,
+) -> int:
+    """Independent rows of small clusters, by pivoted QR; marks in `late` what the best conditioned rows leave over."""
+    from scipy.linalg import qr  # slow to import
+
+    jacobian = constraint_set.jacobian(positions, time)
+    root_w = np.repeat(np.sqrt(inverse_masses), 3)
+    rank = 0
+    for rows in clusters:
+        part = jacobian[rows]
+        columns, place = np.unique(part.indices, return_inverse=True)
+        b = np.zeros((len(rows), len(columns)))
+        b[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), place] = part.data * root_w[part.indices]
+        size = np.linalg.norm(b, axis=1, keepdims=True)
+        triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
+        diagonal = np.zeros(len(rows))
+        diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
+        left_over = diagonal <= RANK_TOLERANCE * diagonal[0]
+        late[rows[order]] = left_over
+        rank += int(np.sum(~left_over))
+    return rank
+
+
+def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
+    """Rank of many small clusters of distances at once, from the singular values of their B."""
+    ends = shape.atoms[:, shape.pairs]  # (n_clusters, K, 2) global atoms
+    difference = positions[ends[..., 0]] - positions[ends[..., 1]]
+    if lattice is not None:
+        difference = minimum_image(difference, lattice)
+    n, k = ends.shape[:2]
+    b = np.zeros((n, k, shape.atoms.shape[1], 3))
+    row = np.arange(k)
+    root_w = np.sqrt(inverse_masses[shape.atoms[0]])
+    b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
+    b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
+    flat = b.reshape(n, k, -1)
+    size = np.linalg.norm(flat, axis=2, keepdims=True)
+    unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
+    s = np.linalg.svd(unit, compute_uv=False)
+    return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
