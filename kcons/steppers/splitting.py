@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kcons.arrays import lent
+from kcons.certificate import checked_every
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.solvers.packed import Packed
@@ -100,18 +101,29 @@ class Splitting:
         return self._piecewise(system, start, dt) if flights is None else self._compiled(system, start, dt, flights)
 
     @np.errstate(over="ignore", invalid="ignore")
-    def march(self, system: System, state: State, dt: float, steps: int) -> State:
+    def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
         """The state after so many steps, the same to the last bit as by `step`.
 
         Nobody looks at the states between: where all is compiled, the end of a step and the beginning of the next are
-        one call.
+        one call. `check_every` is as for `run`.
 
         Raises
         ------
         KconsError
             As `step`; `error.step` says which one.
+        CertificateError
+            As `run`.
         """
         self.check(system)
+        check_every, spare = checked_every(check_every if dt != 0 else 0)
+        while steps > 0:
+            n = system.schedule.within(steps, check_every)
+            state = self._unseen(system, state, dt, n)
+            system.schedule.made(n, check_every, state, spare=spare)
+            steps -= n
+        return state
+
+    def _unseen(self, system: System, state: State, dt: float, steps: int) -> State:
         flights = None
         if type(self).step is Splitting.step and dt != 0 and math.isfinite(dt):
             flights = self._flights(system)

@@ -209,7 +209,7 @@ def run(
         n = min(every - done % every, steps - done) if watching else steps - done
         n = schedule.within(n, check_every)
         if march is not None:
-            state = march(system, state, dt, n)
+            state = march(system, state, dt, n, check_every=0)
         else:
             for _ in range(n):
                 state = stepper.step(system, state, dt)
