@@ -24,12 +24,19 @@ CHECK_EVERY = 1000
 SHARE = 0.01
 #: That many times later at most, and then again.
 MOST = 100
-#: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with.
-SPEED = 1e-9
+#: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with: so many times
+#: the part of its scale that |sigma| may be, since gradients at rounded positions are no better known.
+SPEED = 10.0
 
 
 def certify(
-    held: ConstraintSet, x: FloatArray, v: FloatArray | None = None, time: float = 0.0, *, slack: float = 0.0
+    held: ConstraintSet,
+    x: FloatArray,
+    v: FloatArray | None = None,
+    time: float = 0.0,
+    *,
+    slack: float = 0.0,
+    still: float = 0.0,
 ) -> None:
     """Raise unless `x` (and `v`) fulfil every row of `held`.
 
@@ -40,6 +47,8 @@ def certify(
     time : float
     slack : float
         Added to what |sigma| may be, in parts of the rows' scale, and to what |A v - c| may be.
+    still : float
+        Speed that is no more than rounding: of a kick much larger than what the constraints leave of it.
 
     Raises
     ------
@@ -51,7 +60,8 @@ def certify(
     _refuse(held, np.abs(found.sigma), allowed, "positions", "sigma")
     if found.rates is not None and found.speeds is not None:
         size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
-        _refuse(held, np.abs(found.rates), (SPEED + slack) * size, "velocities", "A v - c")
+        part = SPEED * found.allowed / held.scale + slack
+        _refuse(held, np.abs(found.rates), part * size + still * found.sizes, "velocities", "A v - c")
 
 
 def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: str, residual: str) -> None:
@@ -91,7 +101,7 @@ class Schedule:
     Parameters
     ----------
     certify : callable
-        Takes positions, velocities and time; raises `CertificateError`.
+        Takes positions, velocities, time and the time step; raises `CertificateError`.
 
     Attributes
     ----------
@@ -99,7 +109,7 @@ class Schedule:
         The last state that was certified, or None.
     """
 
-    def __init__(self, certify: Callable[[FloatArray, FloatArray, float], None]) -> None:
+    def __init__(self, certify: Callable[[FloatArray, FloatArray, float, float], None]) -> None:
         self._certify = certify
         self._left = 1
         self._ended, self._cost = -math.inf, 0.0
@@ -112,7 +122,7 @@ class Schedule:
         self._left = min(self._left, every)
         return min(steps, self._left)
 
-    def made(self, steps: int, every: int, state: Any, *, spare: bool = False) -> None:
+    def made(self, steps: int, every: int, state: Any, dt: float, *, spare: bool = False) -> None:
         """`state` is what so many steps led to: certify it if that is due.
 
         With `spare` it waits while it would take more than `SHARE` of the time.
@@ -134,7 +144,7 @@ class Schedule:
             self._left = math.ceil(every * min(self._cost / passed - 1, MOST))
             return
         try:
-            self._certify(state.positions, state.velocities, state.time)
+            self._certify(state.positions, state.velocities, state.time, dt)
         except CertificateError as error:
             error.step, error.state = state.step, self.last
             where = (

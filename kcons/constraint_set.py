@@ -26,13 +26,14 @@ class Residuals(NamedTuple):
     """How far positions and velocities are off the rows, and what counts as held, each shape (n_rows,).
 
     `allowed` is for |sigma|: 1e-10 of the scale, or what rounding leaves of far atoms. `rates` is A v - c, `speeds`
-    the sum of what it is made of; both None without velocities.
+    the sum of what it is made of; both None without velocities. `sizes` is the sum of the gradients' norms.
     """
 
     sigma: FloatArray
     allowed: FloatArray
     rates: FloatArray | None
     speeds: FloatArray | None
+    sizes: FloatArray
 
 
 class ConstraintSet:
@@ -497,11 +498,12 @@ class ConstraintSet:
     def residuals(self, x: FloatArray, v: FloatArray | None = None, time: float = 0.0) -> Residuals:
         """sigma, and A v - c, with what counts as held, in one pass over the constraint objects."""
         y = self.whole(x)
-        sigma, reach, rates, speeds = [], [], [], []
+        sigma, reach, rates, speeds, sizes = [], [], [], [], []
         for c in self.constraints:
             r = self._gather(c, x, y)
             gradient = c.gradient(r, time)
             size = np.sqrt(np.einsum("kai,kai->ka", gradient, gradient))
+            sizes.append(size.sum(axis=1))
             sigma.append(self._sigma(c, r, time))
             reach.append(np.sum(size * np.linalg.norm(x[c.atoms], axis=2), axis=1))
             if v is not None:
@@ -511,8 +513,8 @@ class ConstraintSet:
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
         allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * _joined(reach))
         if v is None:
-            return Residuals(_joined(sigma), allowed, None, None)
-        return Residuals(_joined(sigma), allowed, _joined(rates), _joined(speeds))
+            return Residuals(_joined(sigma), allowed, None, None, _joined(sizes))
+        return Residuals(_joined(sigma), allowed, _joined(rates), _joined(speeds), _joined(sizes))
 
     # -- pieces ---------------------------------------------------------------------------------
 

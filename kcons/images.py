@@ -183,8 +183,11 @@ def find_images(
     frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
     for table in tables:
         table.find_closures(y, lattice, longest, component, frameworks)
+    pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
+    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
+    neighbours = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
     for table in tables:
-        table.settle(component, frameworks)
+        table.settle(component, frameworks, neighbours)
     needed = np.zeros(len(frameworks), bool)
     for table in tables:
         needed[component[table.item.atoms[table.whole].ravel()]] = True
@@ -282,6 +285,7 @@ class _Links:
             bonds = (nearest < self.half_width) & (nearest <= BOND_LIKE * longest[label][:, None])
             closing = (bonds | ~differs).all(axis=1)
             self._local = (nearest < self.half_width).all(axis=1)
+            self._nearest = nearest
         self._closing = closing & differs.any(axis=1)
         frameworks[label[self._closing]] = True
 
@@ -291,14 +295,33 @@ class _Links:
             difference -= self.item.period * np.round(difference / self.item.period)
         return difference
 
-    def settle(self, component: IntArray, frameworks: BoolArray) -> None:
+    def settle(self, component: IntArray, frameworks: BoolArray, held: sp.csr_array) -> None:
         """Rows beside the tree: in a body they have its images, in a framework they are local."""
         closing = self._closing
         if self._local is not None:
             closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
+        if self.held and self.item.target is None:
+            self._refuse_doubtful(self.windings.any(axis=(1, 2)) & ~closing, held)
         if self.held:
             self.whole |= self.unsure & ~closing & (self.windings.any(axis=(1, 2)) | self._long)
         self.windings[~closing] = 0
+
+    def _refuse_doubtful(self, beside: BoolArray, held: sp.csr_array) -> None:
+        """Lengths that are to be found, of rows that may as well close through the boundary as span a body.
+
+        In a body that is held by distances they are one side of a triangle of such.
+        """
+        for k in np.flatnonzero(beside & (self._local if self._local is not None else False)):
+            a, b = (int(atom) for atom in self.item.atoms[k])
+            if held[[a]].multiply(held[[b]]).nnz:
+                continue
+            raise InputError(
+                f"row {self.start + k}, {self.item.row_name(int(k))}: its periodic image is ambiguous: atoms {a} and "
+                f"{b} are {self._nearest[k, 0]:g} apart across the boundary, and farther along the rows that tie them "
+                "together. Give the target of this row",
+                item="target",
+                atoms=[a, b],
+            )
 
     def marked(self, needed: BoolArray) -> Constraint:
         """A copy that knows its whole rows, and the windings of all rows whose atoms are made whole."""

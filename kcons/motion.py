@@ -583,10 +583,10 @@ class Motion:
 
     # -- certificate and report ---------------------------------------------------------------------------------
 
-    def certify(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0) -> None:
+    def certify(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, still: float = 0.0) -> None:
         """Raise unless positions (and velocities) are on the constraints as the set, and not a solver, defines them.
 
-        Where rows were converted, the rows that were given are looked at too.
+        Where rows were converted, the rows that were given are looked at too. Speeds of `still` count as rest.
 
         Raises
         ------
@@ -595,9 +595,9 @@ class Motion:
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()
-        certify(self.constraint_set, here, speed, time)
+        certify(self.constraint_set, here, speed, time, still=still)
         if self.conversions:
-            certify(self._given, here, speed, time, slack=10 * MISFIT)
+            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)
 
     def report(
         self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True

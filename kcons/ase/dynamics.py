@@ -179,7 +179,7 @@ class ConstrainedDynamics(MolecularDynamics):
         try:
             after = self.stepper.step(system, state, self.dt)
             if self._check_every and self.dt and getattr(self.stepper, "holds", True):
-                system.schedule.made(1, self._check_every, after, spare=self._spare)
+                system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta

@@ -332,7 +332,7 @@ class CarriedConstraints:
             As `Motion.restore_positions`; nothing was changed.
         """
         x, _, time = self._state(context)
-        bonds = bonds_of(context.getSystem())
+        bonds = bonds_of(context.getSystem(), x)
         brought = self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None)
         miss = self._worst(brought, None, time)
         if miss is not None:

@@ -119,7 +119,7 @@ class Splitting:
         while steps > 0:
             n = system.schedule.within(steps, check_every)
             state = self._unseen(system, state, dt, n)
-            system.schedule.made(n, check_every, state, spare=spare)
+            system.schedule.made(n, check_every, state, dt, spare=spare)
             steps -= n
         return state
 

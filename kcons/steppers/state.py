@@ -281,19 +281,13 @@ class System:
         """When states of this system are certified."""
         return Schedule(self._certify)
 
-    def _certify(self, x: FloatArray, v: FloatArray, time: float) -> None:
+    def _certify(self, x: FloatArray, v: FloatArray, time: float, dt: float) -> None:
         try:
             self.motion.certify(x, v, time)
         except CertificateError:
-            # Relative to the speed alone nothing that has come to rest could be certified.
-            held, still = self.motion.constraint_set, np.zeros_like(v)
-            slow = np.full_like(v, self.rest(x, v, time))
-            rates, allowed = held.residuals(x, v, time).rates, held.residuals(x, slow, time).speeds
-            wanted = held.residuals(x, still, time).speeds
-            assert rates is not None and allowed is not None and wanted is not None
-            if not np.all(np.abs(rates) <= allowed - wanted):
-                raise
-            self.motion.certify(x, None, time)
+            # Relative to the speed alone nothing that has come to rest could be certified, nor what is left of a kick
+            # along the constraints.
+            self.motion.certify(x, v, time, still=self.rest(x, v, time, dt))
 
     # -- states ---------------------------------------------------------------------------------
 
@@ -386,13 +380,13 @@ class System:
             v = tangent
         return State(x, v, time, remainder=remainder)
 
-    def rest(self, x: FloatArray, v: FloatArray, time: float) -> float:
-        """Speed below which velocities are rounding: that of a kick by which atoms cross the system in a step."""
+    def rest(self, x: FloatArray, v: FloatArray, time: float, dt: float = 0.0) -> float:
+        """Speed below which velocities are rounding: of a kick by which atoms cross the system, or of one for `dt`."""
         kick = float(np.abs(self.forces(x, v, time, 0) * self.inverse_masses).max(initial=0.0))
         size = float(np.ptp(x, axis=0).max(initial=0.0))
         # Or one by which no atom has moved by more than its rounding since time 0.
         still = float(np.finfo(float).eps) * size / abs(time) if time else 0.0
-        return max(KICK_ROUNDING * math.sqrt(kick * size), still)
+        return max(KICK_ROUNDING * math.sqrt(kick * size), KICK_ROUNDING * kick * abs(dt), still)
 
     def forces(
         self, x: FloatArray, v: FloatArray, time: float, step: int, *, copy: bool = True, finite: bool = True

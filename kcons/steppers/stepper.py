@@ -214,7 +214,7 @@ def run(
             for _ in range(n):
                 state = stepper.step(system, state, dt)
         done += n
-        schedule.made(n, check_every, state, spare=spare)
+        schedule.made(n, check_every, state, dt, spare=spare)
         if done % every == 0:
             for observer in watching:
                 observer(state.shown())

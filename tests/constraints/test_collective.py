@@ -71,7 +71,7 @@ def test_groups_across_the_boundary_are_made_whole():
 
 def test_neighbours_in_a_group_must_be_closer_than_half_the_box():
     x = np.array([[0.0, 0.0, 0.0], [3.9, 3.9, 3.9]])
-    with pytest.raises(InputError, match=r"distance of neighbouring atoms .* not shorter than half the box"):
+    with pytest.raises(InputError, match=r"distance .* of atoms 0 and 1 is not shorter than half the box"):
         ConstraintSet([RadiusOfGyration([0, 1])], x, np.ones(2), cell=[8.0, 8.0, 8.0])
 
 

@@ -464,13 +464,13 @@ MUTANTS = [
     ("rank.py", "late[rows[order]] = left_over", "pass", "tests/test_plan.py::test_dependent_rows_are_eliminated_last"),
     (
         "certificate.py",
-        "SPEED = 1e-9",
-        "SPEED = 1.0",
+        "SPEED = 10.0",
+        "SPEED = 1e10",
         "tests/test_certificate.py::test_a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step",
     ),
     (
         "motion.py",
-        "            certify(self._given, here, speed, time, slack=10 * MISFIT)",
+        "            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)",
         "            pass",
         "tests/test_certificate.py::test_rows_that_were_converted_are_looked_at_as_they_were_given",
     ),
