@@ -21,6 +21,9 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 from kcons.images import find_images, image_error, minimum_image
 
+#: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
+MOST_STRAIN = 0.1
+
 
 class Residuals(NamedTuple):
     """How far positions and velocities are off the rows, and what counts as held, each shape (n_rows,).
@@ -145,12 +148,21 @@ class ConstraintSet:
         ------
         InputError
             A degenerate cell; a first cell, or a new periodic direction, for rows that have to be sorted by their
-            images, which needs positions.
+            images, which needs positions; a change by more than a tenth for atoms that nothing ties together.
         """
         before = self.lattice
         self._set_cell(cell, pbc)
         if self.lattice is None or all(c.family == "Distance" and not c.moving for c in self.constraints if c.relative):
             return
+        if before is not None and self.images is not None and np.any(self.images.loose >= 0):
+            change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
+            if np.any(change > MOST_STRAIN):
+                self.lattice = before
+                raise InputError(
+                    f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean among "
+                    "atoms that nothing ties together cannot be followed; make a new ConstraintSet with the cell",
+                    item="cell",
+                )
         periodic = np.zeros(3, bool) if before is None else before[1].any(axis=0)
         if np.any(self.lattice[1].any(axis=0) & ~periodic):
             self.lattice = before

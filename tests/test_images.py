@@ -198,6 +198,12 @@ def test_a_cell_that_shrinks_onto_loose_atoms_is_refused():
     rows = ConstraintSet(CenterDistance([0], [5]), CHAIN[:, [0, 1, 2]], MASSES, cell=np.diag([12.0] * 3))
     motion = Motion(rows, CHAIN)
     before = motion.lattice
+    with pytest.raises(InputError, match="more than a tenth"):
+        motion.set_cell(np.diag([12.0, 6.9, 12.0]), positions=CHAIN)
+    assert motion.lattice is before
+    for width in (11.0, 10.0, 9.1, 8.3, 7.6):
+        motion.set_cell(np.diag([12.0, width, 12.0]), positions=CHAIN)
+    before = motion.lattice
     with pytest.raises(ImageError):
         motion.set_cell(np.diag([12.0, 6.9, 12.0]), positions=CHAIN)
     assert motion.lattice is before
