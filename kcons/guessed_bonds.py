@@ -115,9 +115,14 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if len(finite) < 2:
         return nothing
     y = x[finite]
-    near = cKDTree(y).query(y, k=2)[0][:, 1]
     cell, pbc = (None, np.zeros(3, dtype=bool)) if lattice is None else (lattice[0], lattice[1].any(axis=0))
+    # Atoms may be stored in any image: the nearest neighbour is looked for among the wrapped ones.
+    wrapped = y if cell is None else wrapped_into(y, cell, pbc)[1]
+    near = cKDTree(wrapped).query(wrapped, k=2)[0][:, 1]
     typical = float(np.median(near))
+    if cell is not None and pbc.any():
+        # No bond is longer than a cell vector: an image of the atom itself would be nearer.
+        typical = min(typical, float(np.linalg.norm(cell[pbc], axis=1).min()))
     pairs, away = close_pairs(y, cell, pbc, GAP * NEAREST * _LONE * typical)
     for side in (0, 1):
         np.minimum.at(near, pairs[:, side], away)
@@ -187,14 +192,8 @@ def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: f
     if cell is None or not pbc.any():
         pairs = cKDTree(x).query_pairs(reach, output_type="ndarray").astype(np.int64)
         return pairs, np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    full = cell.copy()
     axes = np.flatnonzero(pbc)
-    if len(axes) < 3:
-        full[~pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
-    inverse = np.linalg.inv(full)
-    fractional = x @ inverse
-    fractional[:, axes] -= np.floor(fractional[:, axes])
-    y = fractional @ full
+    fractional, y, full, inverse = wrapped_into(x, cell, pbc)
     # Atoms within reach of a face of the cell are repeated beyond the opposite one.
     depth = reach * np.linalg.norm(inverse, axis=0)
     whole, number, place = y, np.arange(len(x)), fractional
@@ -211,10 +210,8 @@ def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: f
             shifted[:, axis] += sign
             places.append(shifted)
         whole, number, place = np.concatenate(copies), np.concatenate(owners), np.concatenate(places)
-    pairs = cKDTree(whole).query_pairs(reach, output_type="ndarray").astype(np.int64)
-    pairs = pairs[(pairs < len(x)).any(axis=1)]
-    away = np.linalg.norm(whole[pairs[:, 0]] - whole[pairs[:, 1]], axis=1)
-    owned = np.sort(number[pairs], axis=1)
+    found = cKDTree(y).sparse_distance_matrix(cKDTree(whole), reach, output_type="ndarray")
+    owned, away = np.sort(np.stack([found["i"], number[found["j"]]], axis=1), axis=1), found["v"]
     other = owned[:, 0] != owned[:, 1]
     owned, away = owned[other], away[other]
     # The shortest image of each pair.
@@ -223,3 +220,17 @@ def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: f
     first = np.ones(len(owned), dtype=bool)
     first[1:] = (owned[1:] != owned[:-1]).any(axis=1)
     return owned[first], away[first]
+
+
+def wrapped_into(
+    x: FloatArray, cell: FloatArray, pbc: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Fractional and Cartesian coordinates in the cell along its periodic axes, the cell completed, and its inverse."""
+    full = cell.copy()
+    axes = np.flatnonzero(pbc)
+    if len(axes) < 3:
+        full[~pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
+    inverse = np.linalg.inv(full)
+    fractional = x @ inverse
+    fractional[:, axes] -= np.floor(fractional[:, axes])
+    return fractional, fractional @ full, full, inverse
