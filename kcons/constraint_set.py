@@ -108,12 +108,15 @@ class ConstraintSet:
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
+        home = x if self.lattice is None else x - np.floor(x @ self.lattice[1]) @ self.lattice[0]
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)
             item.check(r, time, int(start))
             if item.target is None:
-                item = item.with_target(item.measure(r, time) if item.holonomic else np.zeros(item.n_rows))
+                # Not where atoms are stored far away: lengths of one body would miss each other by that rounding.
+                near = r if self.lattice is None or not item.relative else self._gather(item, home, self.whole(home))
+                item = item.with_target(item.measure(near, time) if item.holonomic else np.zeros(item.n_rows))
             bound.append(item)
         self.constraints = tuple(bound)
         refuse_contradictions(self.constraints, self.starts, time)
@@ -156,6 +159,7 @@ class ConstraintSet:
             return
         if before is not None and self.images is not None and np.any(self.images.loose >= 0):
             change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
+            change = change[self.lattice[1].any(axis=0)]  # the vector of a direction without periodicity is arbitrary
             if np.any(change > MOST_STRAIN):
                 self.lattice = before
                 raise InputError(

@@ -152,6 +152,10 @@ def _inverse_masses(constraint_set: ConstraintSet) -> FloatArray:
     return inverse
 
 
+#: Radians from a straight line below which a held dihedral is named as the cause of a failure.
+STRAIGHT = 0.1
+
+
 class HasRows(Protocol):
     """Anything with global row numbers."""
 
@@ -229,24 +233,57 @@ def undefined_row(
 
 
 def positions_failed(
-    constraint_set: ConstraintSet, numbers: IntArray | None, outcome: Outcome, solver: HasRows, plan: Plan
+    constraint_set: ConstraintSet,
+    numbers: IntArray | None,
+    x_ref: FloatArray,
+    outcome: Outcome,
+    solver: HasRows,
+    plan: Plan,
 ) -> KconsError:
     """The error for a position projection without solution."""
     row = _global_row(outcome, solver)
     if row < 0:
         return ConvergenceError("the position projection did not converge", residual=outcome.residual)
     name, atoms = _row_label(constraint_set, numbers, row)
+    straight = _nearly_straight(constraint_set, numbers, x_ref, np.flatnonzero(plan.labels == plan.labels[row]))
     return ConvergenceError(
         f"no positions near the given ones fulfil row {name}: relative residual {outcome.residual:.3g} after "
-        f"{outcome.iterations} iterations. The displacement is too large for this geometry; use a smaller "
-        "time step (or optimiser step), or restore_positions for a start that is far off",
+        f"{outcome.iterations} iterations. "
+        + (
+            straight
+            or "The displacement is too large for this geometry; use a smaller time step (or optimiser step), or "
+            "restore_positions for a start that is far off"
+        ),
         residual=outcome.residual,
         tolerance=1e-14,
         iterations=outcome.iterations,
         row=row,
         atoms=atoms,
         cluster=int(plan.labels[row]),
+        singular=bool(straight),
     )
+
+
+def _nearly_straight(constraint_set: ConstraintSet, numbers: IntArray | None, x: FloatArray, rows: IntArray) -> str:
+    """What to say where a held dihedral among `rows` is about to lose its meaning; '' if none is."""
+    least, found = STRAIGHT, ""
+    for row in rows.tolist():
+        item, k = constraint_set.locate(row)
+        if item.family != "Dihedral":
+            continue
+        r = constraint_set.gather(item.select([k]), x)[0]
+        legs = np.diff(r, axis=0)
+        for first in (0, 1):
+            u, w = legs[first], legs[first + 1]
+            bend = float(np.arctan2(np.linalg.norm(np.cross(u, w)), abs(u @ w)))
+            if bend < least:
+                three = ", ".join(str(a) for a in _named(numbers, item.atoms[k][first : first + 3]))
+                least, found = bend, (
+                    f"Atoms {three} of row {_row_label(constraint_set, numbers, row)[0]} are {np.degrees(bend):.2g} "
+                    "degrees from one line, where a dihedral angle is undefined: the motion cannot go through it with "
+                    "any time step. Hold their angle too, or leave this dihedral free"
+                )
+    return found
 
 
 def tangents_failed(

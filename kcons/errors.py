@@ -148,6 +148,8 @@ class ConvergenceError(KconsError, RuntimeError):
         Number of the cluster, -1 if unknown.
     step : int or None
         Step number, where a stepper knows it.
+    singular : bool
+        A held dihedral has come to where it is undefined: a smaller time step does not help.
     """
 
     def __init__(
@@ -161,8 +163,10 @@ class ConvergenceError(KconsError, RuntimeError):
         atoms: Iterable[int] = (),
         cluster: int = -1,
         step: int | None = None,
+        singular: bool = False,
     ) -> None:
         super().__init__(message)
+        self.singular = singular
         self.residual = residual
         self.tolerance = tolerance
         self.iterations = iterations

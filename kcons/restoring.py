@@ -41,6 +41,8 @@ MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
 #: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and atoms up to
 #: which this is tried.
 EASING, HEAVY, MOST_EASED = 60, 1e4, 2000
+#: Sum of squares of the misfits, in units of the rows' scales, that the search for the nearest point may be left with.
+CLOSE = 1e-6
 #: Largest turn of one step, in radian.
 _LONGEST_TURN = 0.5
 
@@ -397,7 +399,7 @@ class _Motions:
         masses = held.masses[self.pieces.atoms]
         usual = float(np.median(masses[masses > 0])) if np.any(masses > 0) else 1.0
         heavy = np.clip(held.masses / usual, 1e-3, 1e3)
-        begin, best = y.copy(), (self._error(y), y.copy())
+        begin, best = y.copy(), (4 * self._error(y), y.copy())
         rng = np.random.default_rng(0)
         for kick in range(KICKS + 1):
             here = begin.copy()
@@ -406,9 +408,9 @@ class _Motions:
                     if move.turns:
                         move.make(here, float(rng.uniform(-0.3, 0.3)) * kick)
             error = self._descend(here, moves, heavy)
-            if error < best[0]:
+            if error < 0.25 * best[0]:  # a little better is no reason to go far
                 best = error, here
-            if best[0] < 1e-12 or self._left < 0:
+            if best[0] < CLOSE or self._left < 0:
                 break
         y[:] = best[1]
 

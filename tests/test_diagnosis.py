@@ -135,12 +135,12 @@ def bond(numbers: np.ndarray | None = None):
 @pytest.mark.parametrize("numbers", [None, np.array([70, 80, 90])])
 def test_positions_failed(numbers: np.ndarray | None) -> None:
     whole, plan, solver, _ = bond()
-    error = diagnosis.positions_failed(whole, numbers, Outcome(False, 0.25, 7, 0), solver, plan)
+    error = diagnosis.positions_failed(whole, numbers, WATER, Outcome(False, 0.25, 7, 0), solver, plan)
     names = (0, 1) if numbers is None else (70, 80)
     assert isinstance(error, ConvergenceError)
     assert (error.row, error.atoms, error.cluster, error.residual, error.iterations) == (0, names, 0, 0.25, 7)
     assert f"#0 Distance({names[0]}, {names[1]})" in str(error) and "restore_positions" in str(error)
-    nameless = diagnosis.positions_failed(whole, numbers, Outcome(False, 0.25, 7, -1), solver, plan)
+    nameless = diagnosis.positions_failed(whole, numbers, WATER, Outcome(False, 0.25, 7, -1), solver, plan)
     assert isinstance(nameless, ConvergenceError) and nameless.row == -1
 
 
@@ -194,6 +194,6 @@ def test_wide_rows_are_cut_short() -> None:
     x = np.random.default_rng(0).normal(size=(9, 3))
     whole = ConstraintSet(held.RadiusOfGyration([np.arange(9)]), x, np.ones(9))
     motion = Motion(whole, x)
-    error = diagnosis.positions_failed(whole, None, Outcome(False, 1.0, 1, 0), motion.plan.solvers[0], motion.plan)
+    error = diagnosis.positions_failed(whole, None, x, Outcome(False, 1.0, 1, 0), motion.plan.solvers[0], motion.plan)
     assert "RadiusOfGyration(0, 1, 2, 3, 4, 5, ...)" in str(error)
     assert isinstance(error, ConvergenceError) and error.atoms == tuple(range(9))

@@ -246,6 +246,8 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
             f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
             "start from System.initial_state(..., project=True)"
         )
+    elif error.singular:
+        cause = "a held dihedral becomes undefined"
     else:
         cause = f"time step too large (dt = {dt:g})"
     return type(error)(
@@ -257,6 +259,7 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
         atoms=error.atoms,
         cluster=error.cluster,
         step=number,
+        singular=error.singular,
     )
 
 

@@ -28,6 +28,12 @@ LIMIT = 5.0
 ROOM = 50.0
 #: A step that would carry atoms this many times as far apart as may be is too long, in whatever cell.
 FAR_JUMP = 3.0
+#: Said of a point that is as good as the oracle's; `summary` counts them.
+ANOTHER = "another solution"
+#: Said where a held dihedral becomes straight.
+UNDEFINED = "where a dihedral angle is undefined"
+#: Said of lengths to be found that could as well close through the boundary.
+TO_GIVE = "Give the target of this row"
 ABOUT_HALF = re.compile(r"half\b.{0,30}\b(box|cell)|minimum image|ambiguous|image", re.IGNORECASE)
 
 
@@ -109,6 +115,28 @@ class Judge:
             return self.say(operation, "right", "", off, allowed)
         return self.say(operation, "silent", "wrong result", off, allowed)
 
+    def other(self, found: Array, exact: Array, start: Array, at: Array, t: float, stored: float) -> bool:
+        """Whether `found` is another solution, no more than twice as far from `start` as the oracle's.
+
+        Flat and nearly straight molecules that are displaced by more than they are bent have two such points: on the
+        rows, and reached along M^-1 A^T at `at`, which is all that defines them.
+        """
+        rows = self.rows
+        if not np.all(np.isfinite(found)):
+            return False
+        inside = rows.basis(at)[0]
+        free = rows.weights > 0
+        heavy = np.sqrt(np.where(free, 1.0 / np.where(free, rows.weights, 1.0), 0.0))[:, None]
+        start = start.copy()
+        rows.pin(start, t)
+        way, exact_way = ((heavy * (p - start)).ravel() for p in (found, exact))
+        length = float(np.linalg.norm(way))
+        outside = float(np.linalg.norm(way - inside.T @ (inside @ way)))
+        limit = 1e-9 * length + 64 * EPS * stored * float(heavy.max(initial=0.0)) * self.dependent[2]
+        on_rows = np.all(np.abs(rows.value(found, t)) <= 8 * rows.rounding(found, stored))
+        still = not rows.pinned.size or float(np.abs(found - start)[rows.pinned].max()) <= 64 * EPS * stored
+        return bool(on_rows and still and outside <= limit and length <= 2 * np.linalg.norm(exact_way))
+
     def refusal(self, operation: str, error: Exception, link: float, solvable: bool = True) -> None:
         """Judge an error."""
         words = f"{type(error).__name__}: {' '.join(str(error).split())[:240]}"
@@ -118,12 +146,25 @@ class Judge:
             self.say(operation, "refused", "impossible")
         elif ABOUT_HALF.search(str(error)):
             self.say(operation, "refused" if link > 1 else "unfounded", f"half the cell, link {link:.2f}: {words}")
-        elif not solvable:
+        elif not solvable or (UNDEFINED in str(error) and self._straight(error)):
             self.say(operation, "refused", words)
         elif 1 < link < FAR_JUMP:
             self.say(operation, "silent", f"wrong remedy, link {link:.2f}: {words}")
         else:
             self.say(operation, "refused" if link >= FAR_JUMP else "unfounded", words)
+
+    def _straight(self, error: Exception) -> bool:
+        """Whether smaller steps stop at the same time, so that a held dihedral really ends the motion."""
+        w, step = self.w, getattr(error, "step", None)
+        if step is None or self.motion is None:
+            return False
+        anchors = w.stored(w.anchors)
+        system = System(self.motion, lambda x, t: -w.springs * (x - anchors))
+        try:
+            run(system, State(self.x.copy(), w.v.copy()), w.dt / 8, 8 * (step + 2), stepper=_stepper(w.stepper))
+        except KconsError as again:
+            return UNDEFINED in str(again) and abs(getattr(again, "step", 0) / 8 - step) < 2
+        return False
 
     def attempt(
         self,
@@ -170,7 +211,16 @@ class Judge:
             self.held = ConstraintSet(w.constraints(), self.x, masses, cell=cell, pbc=w.pbc)
             return Motion(self.held, self.x)
 
-        self.motion = self.attempt("set-up", build, [self.x, masses], link)
+        try:
+            self.motion = build()
+        except Exception as error:  # judged below
+            unknown = [i for i in w.items if i.family == "Distance" and i.how == "open"]
+            if TO_GIVE in str(error) and unknown and "winding" in w.kinds:
+                for item in unknown:
+                    item.how = "given"
+                self.say("set-up", "refused", TO_GIVE)
+        if self.motion is None:
+            self.motion = self.attempt("set-up", build, [self.x, masses], link)
         if self.motion is None:
             return self.verdicts
         self.statics("")
@@ -220,6 +270,10 @@ class Judge:
             self.in_place(label, moved, images, here, t, links)
         if found is not None and not solvable:
             self.say(label + "project_positions", "refused", "no verdict")
+        elif found is not None and self.other(found - images @ w.cell, exact, moved, w.x, t, _top(new, here)) and (
+            float(np.abs(found - images @ w.cell - exact).max()) > allowed
+        ):
+            self.say(label + "project_positions", "right", ANOTHER)
         elif found is not None and self.compare(label + "project_positions", found - images @ w.cell, exact, allowed):
             off = np.abs(rows.value(found - images @ w.cell, t))
             if not np.all(off <= 8 * rows.rounding(exact, _top(new, here))):
@@ -271,7 +325,16 @@ class Judge:
                 self.say(name, "silent", "arguments were changed")
             return
         both, allowed = self.spread(lambda a, b: np.stack(rows.solve(a, b, t)), moved, w.x, stored=_top(new, here))
-        self.compare(name, work[0] - images @ w.cell, both[0], allowed)
+        placed = work[0] - images @ w.cell
+        if float(np.abs(placed - both[0]).max()) > allowed and self.other(
+            placed, both[0], moved, w.x, t, _top(new, here)
+        ):
+            start = moved.copy()
+            rows.pin(start, t)
+            self.say(name, "right", ANOTHER)
+            self.compare(name, work[1], v + (placed - start) / dt, (allowed + 64 * EPS * _top(new)) / dt)
+            return
+        self.compare(name, placed, both[0], allowed)
         self.compare(name, work[1], v + both[1] / dt, allowed / dt)
 
     def values(self) -> None:
@@ -302,7 +365,7 @@ class Judge:
             self.compare("value", found, np.array(expected), 200 * EPS * _top(here, w.x) * _slope(rows, moved))
 
     def restore(self) -> None:
-        """The nearest point on the rows."""
+        """The nearest point on the rows; where bonds that look like such are kept too, any point on them."""
         w, rows = self.w, self.rows
         moved = w.x + 10 ** self.rng.uniform(-4, -2) * self.rng.normal(size=w.x.shape)
         images = self.elsewhere(0.3)
@@ -312,11 +375,21 @@ class Judge:
         except NoSolution:
             return
         link = max(w.nearness(moved, every=True), w.nearness(exact, every=True))
-        found = self.attempt("restore_positions", lambda: self.motion.restore_positions(start), [start], link)
+        if self.rng.random() < 0.3:
+            found = self.attempt("bonds kept", lambda: self.motion.restore_positions(start), [start], link, False)
+            off = 0.0 if found is None else float(np.abs(rows.value(found - images @ w.cell, 0.0)).max(initial=0.0))
+            if not off <= 1e-9:
+                self.say("bonds kept", "silent", "off its rows", off)
+        found = self.attempt("restore_positions", lambda: self.motion.restore_positions(start, bonds=[]), [start], link)
         if found is not None:
             # The foot of the perpendicular is asked for to a part in 1e9 of the way.
             allowed += 1e-9 * float(np.abs(exact - moved).max())
-            if self.compare("restore_positions", found - images @ w.cell, exact, allowed):
+            placed = found - images @ w.cell
+            if float(np.abs(placed - exact).max()) > allowed and self.other(
+                placed, exact, moved, placed, 0.0, _top(start)
+            ):
+                self.say("restore_positions", "right", ANOTHER)
+            elif self.compare("restore_positions", found - images @ w.cell, exact, allowed):
                 off = np.abs(rows.value(found - images @ w.cell, 0.0))
                 if not np.all(off <= 8 * rows.rounding(exact, _top(start))):
                     self.say("restore_positions", "silent", "off its rows", float(off.max()))
@@ -419,16 +492,20 @@ class Judge:
             self.rows.set_cell(cell)
             return True
 
-        return bool(self.attempt("set_cell", change, [], self._cell_link(cell)))
+        return bool(self.attempt("set_cell", change, [], self._cell_link(cell, whole)))
 
-    def _cell_link(self, cell: Array) -> float:
+    def _cell_link(self, cell: Array, x: Array | None = None) -> float:
         """Rows are sorted once: a distance that becomes longer than half the cell may be refused as well."""
         w = self.w
         rows = (r for i in w.items for r in (i.arguments.get("pairs_as_rows") or i.rows))
         lengths = [r.target for r in rows if r.kind == "norm" and not r.amplitude]
         half, before = half_width(cell, w.pbc), half_width(w.cell, w.pbc)
         grown = any(before > a >= half for a in lengths)
-        return max(w.nearness(w.x, cell), 2.0 if grown else 0.0)
+        # Where images hang on the positions, a cell may change by a tenth at once.
+        jump = np.abs(np.linalg.solve(w.cell, cell) - np.eye(3)).max() > 0.1
+        # The tree of shortest links was found at the start, so that any two atoms of a row may have been linked.
+        here = w.nearness(w.x if x is None else x, cell, every=x is not None)
+        return max(w.nearness(w.x, cell), here, 2.0 if grown or jump else 0.0)
 
     def new_cell(self) -> None:
         """set_cell, then everything once more; or a cell that is too small, and the old one still in use."""
@@ -443,8 +520,12 @@ class Judge:
         positions = w.stored(cell=cell) if too_small or self._loose() or rng.random() < 0.5 else None
         given = [] if positions is None else [positions]
         if rng.random() < 0.3 and link < 1:
-            self.held.with_cell(cell, w.pbc)  # barostats may as well tell the set
-            accepted: Any = True
+            # Barostats may as well tell the set.
+            def tell() -> bool:
+                self.held.with_cell(cell, w.pbc)
+                return True
+
+            accepted = self.attempt("with_cell", tell, [], self._cell_link(cell))
         else:
 
             def change() -> bool:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cell_judge import OUTCOMES, Case, judge
+from cell_judge import ANOTHER, OUTCOMES, Case, judge
 
 
 def summary(cases: list[Case]) -> dict[str, Any]:
@@ -70,6 +70,7 @@ def summary(cases: list[Case]) -> dict[str, Any]:
         "operations": {k: {o: c[o] for o in OUTCOMES} for k, c in sorted(operations.items())},
         "refusals": dict(refusals.most_common(30)),
         "allowed": {"median": float(np.median(allowed)), "largest": float(max(allowed))} if allowed else {},
+        "other solutions": sum(any(v.why == ANOTHER for v in c.verdicts) for c in cases),
         "faults": dict(sorted(faults.items(), key=lambda kv: -kv[1]["count"])),
     }
 
