@@ -19,7 +19,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
-from kcons.images import find_images, image_error, minimum_image
+from kcons.images import find_images, in_one_piece, image_error, minimum_image
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
@@ -108,15 +108,15 @@ class ConstraintSet:
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
-        home = x if self.lattice is None else x - np.floor(x @ self.lattice[1]) @ self.lattice[0]
+        together = in_one_piece(weighted, x, self.lattice)
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)
             item.check(r, time, int(start))
             if item.target is None:
-                # Not where atoms are stored far away: lengths of one body would miss each other by that rounding.
-                near = r if self.lattice is None or not item.relative else self._gather(item, home, self.whole(home))
-                item = item.with_target(item.measure(near, time) if item.holonomic else np.zeros(item.n_rows))
+                item = item.with_target(
+                    item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
+                )
             bound.append(item)
         self.constraints = tuple(bound)
         refuse_contradictions(self.constraints, self.starts, time)
@@ -429,6 +429,16 @@ class ConstraintSet:
         if item.windings is not None:
             r[item.whole] += item.windings[item.whole] @ self.lattice[0]
         return r
+
+    def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
+        """`r` of open rows from positions in one piece, where these mean the same images."""
+        if self.lattice is None or not item.relative:
+            return r
+        near = together[item.atoms]
+        same = ~np.round(np.diff(near, axis=1) @ self.lattice[1]).any(axis=(1, 2))
+        if item.whole is not None:
+            same &= ~item.whole
+        return np.where(same[:, None, None], near, r)
 
     def target(self, time: float = 0.0) -> FloatArray:
         """What each row is held at, shape (n_rows,)."""

@@ -110,9 +110,7 @@ class Rescuers:
         np.copyto(x, saved[0])
         if velocities is not None and saved[1] is not None:
             np.copyto(velocities, saved[1])
-        raise error or diagnosis.positions_failed(
-            self._local, self._numbers, task.x_ref, outcome, solver, self._plan
-        )
+        raise error or diagnosis.positions_failed(self._local, self._numbers, task.x_ref, outcome, solver, self._plan)
 
     def _damped(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""

@@ -199,6 +199,31 @@ def find_images(
     return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep], images.longest)
 
 
+def in_one_piece(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
+    """Positions in which what open rows tie together is not cut by the boundary; `x` itself where nothing is.
+
+    Each atom is rounded once, so that lengths and angles of one body fit each other to rounding wherever its atoms are
+    stored. Rows that close through the boundary still do.
+    """
+    pairs = [
+        np.stack([c.atoms[:, :-1], c.atoms[:, 1:]], axis=-1).reshape(-1, 2)
+        for c in constraints
+        if c.relative and c.target is None
+    ]
+    if lattice is None or not pairs:
+        return x
+    links = np.concatenate(pairs)
+    if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
+        return x
+    ends = np.concatenate([links, links[:, ::-1]])
+    start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=len(x)))])
+    neighbours = ends[np.argsort(ends[:, 0], kind="stable"), 1]
+    atoms, parents, _ = _breadth_first(np.arange(len(x)), start, neighbours, neighbours, len(x))
+    y = x.copy()
+    _make_whole(y, atoms, parents, lattice)
+    return y
+
+
 class _Links:
     """The links that the rows of one constraint offer, between neighbours in the list and others.
 

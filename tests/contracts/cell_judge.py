@@ -270,8 +270,10 @@ class Judge:
             self.in_place(label, moved, images, here, t, links)
         if found is not None and not solvable:
             self.say(label + "project_positions", "refused", "no verdict")
-        elif found is not None and self.other(found - images @ w.cell, exact, moved, w.x, t, _top(new, here)) and (
-            float(np.abs(found - images @ w.cell - exact).max()) > allowed
+        elif (
+            found is not None
+            and self.other(found - images @ w.cell, exact, moved, w.x, t, _top(new, here))
+            and (float(np.abs(found - images @ w.cell - exact).max()) > allowed)
         ):
             self.say(label + "project_positions", "right", ANOTHER)
         elif found is not None and self.compare(label + "project_positions", found - images @ w.cell, exact, allowed):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import platform
 import re
 import subprocess
@@ -23,7 +24,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,16 +84,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--open", action="store_true", help="the same molecules without a cell")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--workers", type=int, default=1, help="processes that work side by side")
     parser.add_argument("--show", action="store_true", help="print the verdicts of each case that is not right")
     chosen = parser.parse_args(arguments)
     start = time.perf_counter()
-    cases = []
-    for seed in range(chosen.first, chosen.first + chosen.cases):
-        cases.append(judge(seed, not chosen.open))
-        if chosen.show and cases[-1].outcome in OUTCOMES[2:]:
-            print(json.dumps(asdict(cases[-1])))
-        if len(cases) % 500 == 0:
-            print(f"{len(cases)} cases, {time.perf_counter() - start:.0f} s", file=sys.stderr)
+    cases: list[Case] = []
+    with multiprocessing.get_context("spawn").Pool(chosen.workers) if chosen.workers > 1 else nullcontext() as pool:
+        seeds = range(chosen.first, chosen.first + chosen.cases)
+        one = partial(judge, periodic=not chosen.open)
+        for case in map(one, seeds) if pool is None else pool.imap(one, seeds, chunksize=20):
+            cases.append(case)
+            if chosen.show and case.outcome in OUTCOMES[2:]:
+                print(json.dumps(asdict(case)))
+            if len(cases) % 500 == 0:
+                print(f"{len(cases)} cases, {time.perf_counter() - start:.0f} s", file=sys.stderr)
     result = summary(cases)
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     result |= {
