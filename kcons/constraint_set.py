@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.arrays import numbers
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.contradictions import refuse_contradictions
+from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
-from kcons.images import find_images, in_one_piece, image_error, minimum_image
+from kcons.images import find_images, image_error, in_one_piece, minimum_image
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
@@ -118,8 +118,8 @@ class ConstraintSet:
                     item.measure(self._one_piece(item, r, together), time) if item.holonomic else np.zeros(item.n_rows)
                 )
             bound.append(item)
-        self.constraints = tuple(bound)
-        refuse_contradictions(self.constraints, self.starts, time)
+        refuse_contradictions(bound, self.starts, time)
+        self.constraints = tuple(found_as_given(bound, [item.target is None for item in marked], time))
         self._set_scale(x, time)
 
     # -- construction ---------------------------------------------------------------------------

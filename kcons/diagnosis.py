@@ -277,14 +277,11 @@ def _nearly_straight(constraint_set: ConstraintSet, numbers: IntArray | None, x:
             u, w = legs[first], legs[first + 1]
             bend = float(np.arctan2(np.linalg.norm(np.cross(u, w)), abs(u @ w)))
             if bend < least:
-                three = ", ".join(str(a) for a in _named(numbers, item.atoms[k][first : first + 3]))
-                least, found = (
-                    bend,
-                    (
-                        f"Atoms {three} of row {_row_label(constraint_set, numbers, row)[0]} are {np.degrees(bend):.2g} "
-                        "degrees from one line, where a dihedral angle is undefined: the motion cannot go through it with "
-                        "any time step. Hold their angle too, or leave this dihedral free"
-                    ),
+                least, three = bend, ", ".join(str(a) for a in _named(numbers, item.atoms[k][first : first + 3]))
+                found = (
+                    f"Atoms {three} of row {_row_label(constraint_set, numbers, row)[0]} are {np.degrees(bend):.2g} "
+                    "degrees from one line, where a dihedral angle is undefined: the motion cannot go through it with "
+                    "any time step. Hold their angle too, or leave this dihedral free"
                 )
     return found
 

@@ -54,6 +54,42 @@ def refuse_contradictions(items: Sequence[Constraint], starts: IntArray, time: f
             _refuse_impossible_triangles(atoms, rows, target)
 
 
+def found_as_given(items: Sequence[Constraint], found: Sequence[bool], time: float) -> list[Constraint]:
+    """Lengths that were found from positions, as given where another row gives the same one.
+
+    They differ by the rounding of positions, by which both could not be held.
+
+    Parameters
+    ----------
+    items : sequence of Constraint
+        With their targets resolved, and free of contradictions.
+    found : sequence of bool
+        Whose targets come from positions.
+    time : float
+    """
+    result = list(items)
+    numbers = [n for n, item in enumerate(items) if item.family == "Distance" and not item.moving]
+    if not any(found[n] for n in numbers) or all(found[n] for n in numbers):
+        return result
+    pairs = np.concatenate([np.sort(items[n].atoms, axis=1) for n in numbers])
+    width = int(pairs.max(initial=0)) + 1
+    key = pairs[:, 0] * width + pairs[:, 1]
+    length = np.concatenate([items[n].target_at(time) for n in numbers])
+    open_ = np.concatenate([np.full(items[n].n_rows, found[n]) for n in numbers])
+    given, first = np.unique(key[~open_], return_index=True)
+    if not len(given):
+        return result
+    place = np.minimum(np.searchsorted(given, key), len(given) - 1)
+    same = open_ & (given[place] == key)
+    if same.any():
+        length[same] = length[~open_][first][place[same]]
+        ends = np.cumsum([items[n].n_rows for n in numbers])
+        for n, part in zip(numbers, np.split(length, ends[:-1]), strict=True):
+            if found[n]:
+                result[n] = items[n].with_target(part)
+    return result
+
+
 def _refuse_two_targets(atoms: IntArray, rows: IntArray, target: FloatArray, period: float | None) -> None:
     repeated = np.flatnonzero((atoms[1:] == atoms[:-1]).all(axis=1))
     difference = target[repeated + 1] - target[repeated]
