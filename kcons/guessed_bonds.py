@@ -233,4 +233,4 @@ def wrapped_into(
     inverse = np.linalg.inv(full)
     fractional = x @ inverse
     fractional[:, axes] -= np.floor(fractional[:, axes])
-    return fractional, fractional @ full, full, inverse
+    return fractional, fractional @ full, full, np.asarray(inverse)
