@@ -14,6 +14,7 @@ from kcons.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.solvers.outcome import Outcome
+from kcons.steppers import State, System, run
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -197,3 +198,35 @@ def test_wide_rows_are_cut_short() -> None:
     error = diagnosis.positions_failed(whole, None, x, Outcome(False, 1.0, 1, 0), motion.plan.solvers[0], motion.plan)
     assert "RadiusOfGyration(0, 1, 2, 3, 4, 5, ...)" in str(error)
     assert isinstance(error, ConvergenceError) and error.atoms == tuple(range(9))
+
+
+@pytest.mark.parametrize("numbers", [None, np.array([10, 11, 12, 13, 14])])
+def test_a_dihedral_that_becomes_straight_is_named(numbers) -> None:
+    """No time step goes through the line; at another bend, the step is too large."""
+    for degrees, singular in ((2.0, True), (20.0, False)):
+        bend = np.radians(degrees)
+        x = np.array([[0, 1.0, 0], [0, 0, 0], [1.0, 0, 0], [1.0 + np.cos(bend), 0, np.sin(bend)], [5.0, 5, 5]])
+        whole = ConstraintSet([held.Distance([0, 1]), held.Dihedral([[0, 1, 2, 3]])], x, np.ones(5))
+        motion = Motion(whole, x)
+        error = diagnosis.positions_failed(
+            whole, numbers, x, Outcome(False, 0.25, 7, 0), motion.plan.solvers[0], motion.plan
+        )
+        assert isinstance(error, ConvergenceError) and error.singular == singular
+        names = "1, 2, 3" if numbers is None else "11, 12, 13"
+        assert (f"Atoms {names} of row #1 Dihedral" in str(error)) == singular
+        assert ("smaller time step" in str(error)) != singular
+
+
+def test_a_run_that_ends_where_a_dihedral_is_straight_names_no_time_step() -> None:
+    """Free flight of a chain whose end folds into the line: it ends at the same time with any step."""
+    x = np.array([[0, 1.0, 0], [0, 0, 0], [1.0, 0, 0], [1.8, 0, 0.6]])
+    pairs = [[0, 1], [1, 2], [2, 3]]
+    motion = Motion(ConstraintSet([held.Distance(pairs), held.Dihedral([[0, 1, 2, 3]])], x, np.ones(4)), x)
+    v = motion.project_velocities(x, np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.6, 0, -0.8]]))
+    ends = []
+    for dt in (0.02, 0.005):
+        with pytest.raises(ConvergenceError, match="a held dihedral becomes undefined") as info:
+            run(System(motion, lambda x, t: np.zeros_like(x)), State(x, v), dt, int(4 / dt))
+        assert info.value.singular and "time step too large" not in str(info.value)
+        ends.append(info.value.step * dt)
+    assert abs(ends[0] - ends[1]) < 0.1

@@ -236,3 +236,43 @@ def test_conversions_are_visible():
     assert str(body) == "atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows"
     assert f"converted: {body}" in str(motion.report(x))
     assert Motion(ConstraintSet(Distance([[0, 1]]), x, np.ones(4)), x).conversions == ()
+
+
+def test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell():
+    """The vectors that stand for them are any two normals, which jump where the periodic one turns a little."""
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        cell = rng.normal(size=(3, 3)) + 9 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        rows = ConstraintSet(ROWS["relation"], CHAIN, MASSES, cell=cell, pbc=(True, False, False))
+        rows.with_cell(cell @ (np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3))), (True, False, False))
+
+
+def far_body(images):
+    """All ten distances of five atoms, each atom stored `images` cells away or in the cell itself."""
+    cell = np.array([[7.9, 0, 0], [-0.5, 8.4, 0], [-0.5, -1.8, 8.6]])
+    x = CHAIN[:5] * 0.8
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    shift = np.random.default_rng(1).integers(-images, images + 1, (5, 3)) @ cell
+    return x, x + shift, cell, pairs
+
+
+def test_lengths_found_far_away_can_be_held_near_the_origin():
+    """Stored at 3000 Å, positions are rounded to 5e-13, and so would be ten lengths of rank nine, each on its own."""
+    x, far, cell, pairs = far_body(400)
+    rows = ConstraintSet(Distance(pairs), far, MASSES[:5], cell=cell)
+    exact = ConstraintSet(Distance(pairs), x, MASSES[:5]).target()
+    assert 0 < np.abs(rows.target() - exact).max() < 400 * 3 * 8.6 * 4e-16
+    motion = Motion(rows, far)
+    found = motion.restore_positions(x)
+    # Ten lengths of one shape in space fit each other: the oracle needs no cell.
+    assert np.abs(rows.value(found)).max() < 4e-15
+    state = run(System(motion, lambda x, t: -x), State(found, motion.project_velocities(found, x[:, ::-1])), 0.01, 20)
+    assert np.abs(rows.value(state.positions)).max() < 3e-14
+
+
+def test_a_length_found_and_the_same_one_given():
+    x, far, cell, _ = far_body(40)
+    given = float(np.linalg.norm(x[1] - x[0]))
+    rows = ConstraintSet([Distance([[1, 2], [1, 0]]), Distance([[0, 1]], given)], far, MASSES[:5], cell=cell)
+    assert rows.target()[1] == rows.target()[2] == given
+    assert rows.target()[0] == pytest.approx(np.linalg.norm(x[2] - x[1]), abs=1e-12)

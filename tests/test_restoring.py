@@ -6,6 +6,7 @@ Bonds and angles are measured here from the molecules' own tables, apart from th
 from __future__ import annotations
 
 import time as clock
+import tracemalloc
 from itertools import combinations
 
 import numpy as np
@@ -326,6 +327,25 @@ def test_bonds_by_distances_alone_are_those_by_elements(name: str, unit: float) 
     every = np.arange(len(atoms))
     found = bonds_without_elements(unit * atoms.positions, None, every, every >= 0)
     assert [tuple(b) for b in found.tolist()] == sorted(bond_table(atoms))
+
+
+def test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored() -> None:
+    """With the nearest neighbours as they are stored, 60 cells away, images of the whole cell took 24 GB."""
+    atoms = molecule("CH3CH2OH")
+    every = np.arange(len(atoms))
+    cell = np.array([[7.0, 0, 0], [1.0, 6.5, 0], [-0.8, 1.0, 7.5]])
+    lattice = np.stack([cell, np.linalg.inv(cell)])
+    shifts = np.random.default_rng(2).integers(-60, 61, (len(atoms), 3)) @ cell
+    tracemalloc.start()
+    found = bonds_without_elements(atoms.positions + shifts, lattice, every, every >= 0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert [tuple(b) for b in found.tolist()] == sorted(bond_table(atoms))
+    assert peak < 5e6
+    # Two atoms in a flat cell: nothing is nearer than images of the atom itself.
+    flat = np.diag([1.0, 90.0, 90.0])
+    two = np.array([[0.0, 0, 0], [0.2, 44.0, 44.0]])
+    assert len(bonds_without_elements(two, np.stack([flat, np.linalg.inv(flat)]), every[:2], every[:2] >= 0)) == 0
 
 
 def test_no_bonds_are_guessed_where_there_are_no_molecules() -> None:
