@@ -215,7 +215,7 @@ class Judge:
             self.motion = build()
         except Exception as error:  # judged below
             unknown = [i for i in w.items if i.family == "Distance" and i.how == "open"]
-            if TO_GIVE in str(error) and unknown and "winding" in w.kinds:
+            if TO_GIVE in str(error) and unknown:
                 for item in unknown:
                     item.how = "given"
                 self.say("set-up", "refused", TO_GIVE)
