@@ -33,8 +33,8 @@ from rich.console import Console
 import kcons
 from kcons import State, System, compare, measuring
 from kcons.ase import constrain
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.plan import DistanceClusters, make_plan
 from kcons.scenes.openmm_host import system_of

@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import compare, methods, scenes
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion import Motion
 from kcons.steppers import ProjectedRungeKutta4, ProjectedVerlet, State, Stepper, System, run

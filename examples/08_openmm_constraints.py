@@ -30,8 +30,8 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons import compare, measuring
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.hard_cases.rings import ring
 from kcons.motion import Motion

@@ -31,8 +31,8 @@ from rich.table import Table
 
 from kcons import compare
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.scenes import fluid
 from kcons.scenes.lennard_jones import LennardJones

@@ -22,9 +22,9 @@ import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons import Motion
-from kcons.held_rows import HeldRows, held_rows
 from kcons.scenes.any_file import read
 from kcons.topology import Snapshot, Topology
+from kcons.topology.rows_by_name import HeldRows, held_rows
 
 VILLIN = Path(app.__file__).parent / "data" / "test.pdb"
 KINDS = ("hbonds", "allbonds", "hangles")

@@ -4,7 +4,7 @@ The names here are those of the core; the hosts are imported by name: ``from kco
 """
 
 from kcons import constraints, errors
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import Rattle, State, System, run
 

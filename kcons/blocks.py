@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 
 _GROUND = -1
 

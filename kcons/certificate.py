@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError
 

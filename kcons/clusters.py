@@ -11,8 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray, RowKind
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 
 #: Largest cluster, in rows, that goes through the lanes.

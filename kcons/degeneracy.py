@@ -23,8 +23,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from kcons.blocks import fixed_atoms, row_blocks
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
 from kcons.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies

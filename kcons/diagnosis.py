@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from kcons.conditioning import worst_condition
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
 from kcons.plan import Plan

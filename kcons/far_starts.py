@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kcons import diagnosis
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.plan import ClusterSolver, LongChains, Plan, sparse_distances

@@ -12,8 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget

@@ -8,16 +8,16 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.images import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.guessed_bonds import NEAREST, across, bonds_without_elements
-from kcons.images import minimum_image
 from kcons.pieces import Pieces
-from kcons.topology import BoolArray, bond_angles, connected, sorted_pairs
+from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
+from kcons.topology.topology import BoolArray, bond_angles, connected, sorted_pairs
 
 #: Other bonds may change by this part of their length (0.02 angstrom for C-C), other angles by this much in radian.
 BOND_KEPT, ANGLE_KEPT = 0.0125, np.radians(2.0)

@@ -16,8 +16,8 @@ from scipy.integrate import DOP853
 
 from kcons import steppers
 from kcons.ase import Constraints
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.motion import Motion

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons import diagnosis
-from kcons.arrays import as_array, check_multipliers, check_out, check_pairs
 from kcons.certificate import certify
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.arguments import as_array, check_multipliers, check_out, check_pairs
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError, KconsError

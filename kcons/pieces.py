@@ -10,7 +10,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
-from kcons.topology import connected, sorted_pairs
+from kcons.topology.topology import connected, sorted_pairs
 
 #: Origin and unit axis of a motion at given positions; None where they are undefined.
 Frame = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]

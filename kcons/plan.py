@@ -9,11 +9,11 @@ from typing import Protocol
 import numpy as np
 
 from kcons.clusters import Shape, classify, cluster_labels
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.images import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
-from kcons.images import BoolArray
 from kcons.rank import rank_of_small, ranked, small_enough
 from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances, lengths_resolved
@@ -104,7 +104,7 @@ class Plan:
     late : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
-        For each solver, whether it takes positions that were made whole, without a cell (see `kcons.images`).
+        For each solver, whether it takes positions that were made whole, without a cell (see `kcons.constraints.images`).
     """
 
     constraint_set: ConstraintSet

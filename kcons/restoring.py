@@ -23,8 +23,8 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.linalg import qr
 
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.scenes import Scene
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcons.blocks import fixed_atoms
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 
 BoolArray = NDArray[np.bool_]

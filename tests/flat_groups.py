@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.degeneracy import without_second_order_rows
 
 Array = NDArray[np.float64]

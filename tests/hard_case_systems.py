@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion import Motion
 from kcons.steppers import State, System

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 TRIANGLE = list(combinations(range(3), 2))

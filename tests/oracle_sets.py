@@ -11,7 +11,7 @@ from hypothesis import assume
 
 from kcons import constraints as held
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 EPS = float(np.finfo(float).eps)

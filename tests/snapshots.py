@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.topology import Snapshot, Topology, sorted_pairs
+from kcons.topology.topology import Snapshot, Topology, sorted_pairs
 
 HOH = np.radians(104.52)
 #: O, H, H in angstrom.

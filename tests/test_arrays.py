@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.arrays import as_array, lent, numbers
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
     Custom,
     CustomVelocity,
@@ -19,6 +17,8 @@ from kcons.constraints import (
     Plane,
     Sphere,
 )
+from kcons.constraints.arguments import as_array, lent, numbers
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.steppers import (

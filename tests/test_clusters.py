@@ -9,7 +9,7 @@ import pytest
 
 from kcons import constraints as held
 from kcons.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.plan import make_plan
 
 NONE = np.zeros(0, np.int64)

@@ -10,7 +10,7 @@ import pytest
 from kcons import conditioning
 from kcons import constraints as held
 from kcons.conditioning import worst_condition
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 

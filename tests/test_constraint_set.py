@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from constraints.cases import CASES, MASSES, N_ATOMS, TIME, scattered
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance, FixedAtoms, LinearCombination, Plane, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConstraintError, InputError
 
 TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])

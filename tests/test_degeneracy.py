@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from flat_groups import BENZENE, CO2, CONVERTED, FORMATE, Array, converted, counts, pairs_of, rank_of, ring, turned
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
     Angle,
     Constraint,
@@ -23,6 +22,7 @@ from kcons.constraints import (
     Plane,
     Sphere,
 )
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.degeneracy import without_second_order_rows
 from kcons.errors import SingularGeometryError
 from kcons.motion import Motion

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from flat_groups import CO2, CONVERTED, Array, converted, counts, pairs_of, rank_of, ring, turned
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 # -- what the converted rows do ---------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 from kcons import constraints as held
 from kcons import diagnosis
 from kcons.cli import main
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.solvers.outcome import Outcome

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from kcons import cli, projection
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 ROOT = Path(__file__).parent.parent

@@ -9,7 +9,7 @@ import pytest
 
 from kcons import constraints as held
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
 

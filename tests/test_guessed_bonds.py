@@ -7,7 +7,7 @@ import pytest
 from snapshots import WATER, rotations, snapshot
 
 from kcons.errors import InputError
-from kcons.guessed_bonds import guess_bonds
+from kcons.topology.guessed_bonds import guess_bonds
 
 
 def test_water_has_two_bonds():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hard_case_systems import TRIANGLE, Array, chain, motion_of, pairs_of, refused, system_of
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, FixedAtoms, LinearCombination, Plane
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, NonFiniteError, OverdeterminedError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.steppers import State, System, run

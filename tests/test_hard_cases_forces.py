@@ -21,8 +21,8 @@ from hard_case_systems import (
 )
 from reference import cases
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Distance, FixedAtoms, LinearRelation
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError, ConvergenceError, InputError, KconsError
 from kcons.steppers import Rattle, State, System, run
 

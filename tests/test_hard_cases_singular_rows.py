@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from reference import cases
 from scipy.integrate import solve_ivp
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.steppers import Rattle, System, run

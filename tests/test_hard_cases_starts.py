@@ -21,8 +21,8 @@ from hard_case_systems import (
     worst_residual,
 )
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError
 from kcons.motion import Motion
 from kcons.steppers import Rattle, State, System, run

@@ -12,8 +12,8 @@ from snapshots import WATER, snapshot
 
 from kcons.constraints import CenterOfMass
 from kcons.errors import InputError
-from kcons.held_rows import bond_angles, held_rows
 from kcons.motion import Motion
+from kcons.topology.rows_by_name import bond_angles, held_rows
 
 # Ethanol, C C O H(O) and five H, and a water.
 ETHANOL = np.array(

@@ -7,7 +7,7 @@ import pytest
 from motion_systems import TRIANGLE, WATER, steps, system
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import (
     ContradictionError,
     ConvergenceError,

@@ -9,7 +9,7 @@ import pytest
 from motion_systems import ATOMS, steps, system
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import Motion
 

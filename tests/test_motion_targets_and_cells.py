@@ -8,7 +8,7 @@ from motion_systems import TRIANGLE, WATER, ZIGZAG, steps
 
 from kcons import constraints as held
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 

@@ -26,7 +26,7 @@ from oracle_sets import (
 
 from kcons import constraints as held
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 PROPERTY = settings(max_examples=40, deadline=None)

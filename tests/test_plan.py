@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.motion import Motion
 from kcons.plan import make_plan

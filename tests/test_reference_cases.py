@@ -11,7 +11,7 @@ from reference import cases
 from reference.cases import Case, Snapshot
 
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, System, run
 

@@ -16,7 +16,7 @@ from reference import cases
 from reference.cases import Case, Snapshot
 from steppers.systems import EVERY
 
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, State, Stepper, System, run

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kcons import constraints as c
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import UnsupportedError
-from kcons.rescaled import rescaled
+from kcons.topology.other_units import rescaled
 
 X = np.array([[0.1, 0.2, 0.3], [1.2, 0.1, -0.2], [1.9, 1.1, 0.4], [0.7, 2.0, 1.3]])
 MASSES = np.array([1.0, 2.0, 3.0, 4.0])

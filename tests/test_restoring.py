@@ -16,12 +16,12 @@ from ase.build import molecule
 from ase.neighborlist import natural_cutoffs, neighbor_list
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, KconsError
-from kcons.guessed_bonds import bonds_without_elements
 from kcons.kept_geometry import bonds_of
 from kcons.motion import Motion
 from kcons.pieces import Pieces
+from kcons.topology.guessed_bonds import bonds_without_elements
 
 #: What may change: angstrom, degrees.
 BOND, ANGLE = 0.02, 2.0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from snapshots import WATER, rotations, snapshot
 
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.rigid_groups import body_rows, find_waters, listed_bodies, residue_bodies
+from kcons.topology.rigid_groups import body_rows, find_waters, listed_bodies, residue_bodies
 
 RNG = np.random.default_rng(11)
 SHAPES = {

@@ -7,7 +7,15 @@ import pytest
 from snapshots import WATER, snapshot
 
 from kcons.errors import InputError
-from kcons.topology import Snapshot, as_written, connected, elements_of, near_misses, sorted_pairs, split_residues
+from kcons.topology.topology import (
+    Snapshot,
+    as_written,
+    connected,
+    elements_of,
+    near_misses,
+    sorted_pairs,
+    split_residues,
+)
 
 
 @pytest.mark.parametrize(

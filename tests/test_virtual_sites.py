@@ -6,7 +6,7 @@ import numpy as np
 import openmm
 from snapshots import WATER
 
-from kcons.virtual_sites import VirtualSites, fitted
+from kcons.topology.virtual_sites import VirtualSites, fitted
 
 RNG = np.random.default_rng(7)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from snapshots import snapshot
 
-from kcons.whole import minimum_image, whole_molecules
+from kcons.topology.whole_molecules import minimum_image, whole_molecules
 
 CELLS = [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])]
 

@@ -12,10 +12,10 @@ import numpy as np
 from ase import Atoms
 from numpy.typing import NDArray
 
-from kcons.arrays import numbers
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion

@@ -10,10 +10,10 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
-from kcons.arrays import numbers
 from kcons.ase.constraint import Constraints
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.

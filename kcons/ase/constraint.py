@@ -12,15 +12,15 @@ from ase import Atoms
 from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
-from kcons.arrays import numbers
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.host import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.certificate import CHECK_EVERY
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.diagnosis import Report
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError

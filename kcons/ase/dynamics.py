@@ -15,13 +15,13 @@ from ase import Atoms, units
 from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
-from kcons.arrays import numbers
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
 from kcons.ase.host import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.certificate import checked_every
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
-from kcons.guessed_bonds import guess_bonds
-from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import (
+from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology.topology import (
     MASSES,
     Snapshot,
     Topology,
@@ -59,7 +59,7 @@ def constraints_of(
     ----------
     atoms : ase.Atoms
     constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
-        See `kcons.held_rows.held_rows`.
+        See `kcons.topology.rows_by_name.held_rows`.
     on : mapping, optional
         Tuples of atoms -> callable that makes a row of them.
     select : 'all', mask or atoms

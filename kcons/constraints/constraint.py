@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.errors import ConstraintError, InputError
 
@@ -73,7 +73,7 @@ class Constraint(ABC):
     #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
     masses: FloatArray | None = None
     #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
-    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.images`.
+    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.images`.
     whole: NDArray[np.bool_] | None = None
     windings: IntArray | None = None
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import FloatArray, Target

@@ -9,8 +9,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import FloatArray as FloatArray
-from kcons.arrays import numbers
+from kcons.constraints.arguments import FloatArray as FloatArray
+from kcons.constraints.arguments import numbers
 from kcons.constraints.differences import first_derivative, second_derivative
 from kcons.errors import InputError
 

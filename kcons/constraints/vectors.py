@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.differences import first_derivative_4
 from kcons.constraints.target import FloatArray, Target

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.stability import Classification, classify

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.errors import ConvergenceError, InputError
 
 FloatArray = NDArray[np.float64]

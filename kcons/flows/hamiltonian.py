@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.errors import ConvergenceError, InputError
 from kcons.flows.flow import FloatArray, Flow, jacobian_by_differences
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow, phase_volume
 

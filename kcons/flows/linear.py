@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_form
 from kcons.flows.spectrum import square_matrix

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ellipj, ellipkinc
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray, Flow
 from kcons.flows.hamiltonian import HamiltonianFlow

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.flows.flow import FloatArray
 

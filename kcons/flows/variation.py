@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import ConvergenceError
 from kcons.flows.flow import FloatArray, jacobian_by_differences
 

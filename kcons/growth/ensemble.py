@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import DOP853
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.growth.compensated_sums import two_sum
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import BudgetError, InputError
 from kcons.growth.compensated_sums import compensated_sum
 from kcons.growth.mixture import Mixture

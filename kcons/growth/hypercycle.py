@@ -24,7 +24,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.growth.model import FloatArray, Populations, positive_populations

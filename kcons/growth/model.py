@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import lent, numbers
+from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError, NonFiniteError
 
 FloatArray = NDArray[np.float64]

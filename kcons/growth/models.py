@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.growth.model import FloatArray, GrowthModel
 

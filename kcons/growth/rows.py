@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.errors import ConstraintError, InputError
 from kcons.growth.model import FloatArray, OfState, Populations, evaluate
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 
 Array = NDArray[np.float64]
 Pairs = Sequence[tuple[int, int]]

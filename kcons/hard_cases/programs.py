@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.hard_cases.case import CannotExpressError
 from kcons.hard_cases.problem import Array, Problem

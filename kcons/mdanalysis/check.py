@@ -13,8 +13,8 @@ from MDAnalysis.analysis.results import Results, ResultsGroup
 from MDAnalysis.lib.log import ProgressBar
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.compiling import compiled_elsewhere, frame_of, look_once, sample_of

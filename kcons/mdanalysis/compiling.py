@@ -23,8 +23,8 @@ import scipy.sparse as sp
 from numba.core import event
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.mdanalysis.dcd import Block
 from kcons.mdanalysis.deviations import Deviations

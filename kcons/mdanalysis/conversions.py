@@ -15,17 +15,17 @@ import MDAnalysis
 import numpy as np
 from MDAnalysis.lib.mdamath import triclinic_box
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
-from kcons.held_rows import HeldRows
 from kcons.mdanalysis.universe import snapshot_of
 from kcons.motion import Motion
-from kcons.rescaled import all_rescaled
-from kcons.topology import Snapshot
-from kcons.virtual_sites import VirtualSites
-from kcons.whole import whole_molecules
+from kcons.topology.other_units import all_rescaled
+from kcons.topology.rows_by_name import HeldRows
+from kcons.topology.topology import Snapshot
+from kcons.topology.virtual_sites import VirtualSites
+from kcons.topology.whole_molecules import whole_molecules
 
 if TYPE_CHECKING:
     import ase

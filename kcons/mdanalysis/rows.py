@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.dcd import Block, look_at

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
-from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import Snapshot, Topology, as_written, elements_of, listed, near_misses, sorted_pairs
+from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology.topology import Snapshot, Topology, as_written, elements_of, listed, near_misses, sorted_pairs
 
 __all__ = ["constraints_of", "selected", "snapshot_of"]
 

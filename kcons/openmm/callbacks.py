@@ -25,9 +25,9 @@ import numpy as np
 import openmm
 from openmm import unit
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion import Motion

@@ -10,9 +10,9 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 

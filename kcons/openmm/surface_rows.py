@@ -10,8 +10,8 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion

@@ -14,8 +14,8 @@ import openmm
 from numpy.typing import NDArray
 from openmm import unit
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.plan import make_plan

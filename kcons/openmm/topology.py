@@ -13,8 +13,8 @@ from openmm import unit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.held_rows import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology import Snapshot, Topology, selected_atoms, selected_numbers, sorted_pairs
+from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology.topology import Snapshot, Topology, selected_atoms, selected_numbers, sorted_pairs
 
 __all__ = ["constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -47,7 +47,7 @@ def constraints_of(
     positions : Quantity or array_like, shape (n_atoms, 3)
         Plain numbers are in nm.
     constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
-        See `kcons.held_rows.held_rows`.
+        See `kcons.topology.rows_by_name.held_rows`.
     system : openmm.System, optional
         Where the masses are taken from; otherwise they are those of the elements.
     on : mapping, optional

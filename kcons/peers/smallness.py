@@ -8,8 +8,8 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.runs import independent_rows
 from kcons.scenes import Scene

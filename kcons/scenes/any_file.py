@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from ase import units
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.motion import Motion
 from kcons.scenes.openmm_host import ASE_LENGTH, OpenMMHost, place
 from kcons.scenes.potential import Potential, of_calculator
 from kcons.scenes.scene import Scene, thermal_velocities
-from kcons.whole import whole_molecules
+from kcons.topology.whole_molecules import whole_molecules
 
 if TYPE_CHECKING:
-    from kcons.held_rows import HeldRows
+    from kcons.topology.rows_by_name import HeldRows
 
 TEMPERATURE = 300.0
 #: Forces by name, beside those of OpenMM and what ASE knows.

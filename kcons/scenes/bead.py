@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Ellipsoid, ImplicitSurface, Plane, Torus
 from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.scenes.minimal import integrated, single

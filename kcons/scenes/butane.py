@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.scenes.minimal import integrated, single, spin, turned
 from kcons.scenes.potential import Potential

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion

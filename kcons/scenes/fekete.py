@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.scenes.potential import Potential

@@ -12,9 +12,9 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.neighborlist import natural_cutoffs, neighbor_list
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.scenes.potential import Potential, of_calculator

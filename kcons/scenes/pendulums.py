@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ellipj
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, Sphere
 from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.scenes.minimal import integrated, single
 from kcons.scenes.potential import Evaluate, Potential

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from ase import Atoms, units
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion

@@ -9,8 +9,8 @@ from ase import units
 from ase.build import fcc111
 from ase.calculators.emt import EMT
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.scenes.potential import of_calculator

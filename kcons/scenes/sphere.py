@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.scenes.openmm_host import OpenMMHost, system_of

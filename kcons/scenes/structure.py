@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion

@@ -11,9 +11,9 @@ import numpy as np
 from ase import Atoms, units
 from ase.calculators.tip3p import TIP3P
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion import Motion

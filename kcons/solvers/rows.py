@@ -10,8 +10,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.solvers.coordinates import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
 from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples

@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms, Plane, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.hard_cases.problem import Array
 from kcons.motion import Motion

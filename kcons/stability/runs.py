@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.hard_cases.case import CannotExpressError
 from kcons.hard_cases.long_runs import secular_drift
 from kcons.hard_cases.problem import Array, Problem

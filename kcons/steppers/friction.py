@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import FloatArray, numbers
+from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
 from kcons.motion import Motion
 

@@ -16,8 +16,8 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import as_array, lent, numbers
 from kcons.certificate import Schedule
+from kcons.constraints.arguments import as_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.arrays import as_array
+from kcons.constraints.arguments import as_array
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import System

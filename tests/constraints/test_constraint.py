@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import FAMILIES, Distance, FixedAtoms, MovingTarget, Sphere, from_dict
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 
 from .cases import CASES, MASSES, N_ATOMS, TIME, scattered

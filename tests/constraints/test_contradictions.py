@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.contradictions import _triangles
 from kcons.errors import ContradictionError, InfeasibleError
 

@@ -8,8 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Dihedral, Distance, from_dict
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
 
 POINTS = arrays(np.float64, (4, 3), elements=st.floats(-5, 5, allow_subnormal=False, width=32))

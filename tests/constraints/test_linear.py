@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import FixedAtoms, LinearCombination, LinearRelation, RowKind
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 
 from .cases import MASSES, scattered

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Cylinder, Ellipsoid, Line, Plane, RowKind, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
 
 ONE = np.ones(1)

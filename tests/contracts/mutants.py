@@ -431,32 +431,32 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_a_full_disk_leaves_nothing_behind",
     ),
     (
-        "arrays.py",
+        "constraints/arguments.py",
         'if array.dtype.kind == "c":',
         "if False:",
         "tests/test_arrays.py::test_what_is_no_real_number_is_refused",
     ),
     # -- images and certificates --
     (
-        "images.py",
+        "constraints/images.py",
         "| (self.item.kind == RowKind.LINEAR)",
         "",
         "tests/test_images.py::test_atoms_in_any_image_are_held_as_whole_ones",
     ),
     (
-        "images.py",
+        "constraints/images.py",
         "_HALF = 0.5 - 1e-9",
         "_HALF = 0.6",
         "tests/test_images.py::test_atoms_that_nothing_ties_raise_before_their_image_flips",
     ),
     (
-        "images.py",
+        "constraints/images.py",
         "cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])",
         "cells = -np.round(step @ lattice[1])",
         "tests/test_images.py::test_atoms_in_any_image_are_held_as_whole_ones",
     ),
     (
-        "images.py",
+        "constraints/images.py",
         "BOND_LIKE = 1.5",
         "BOND_LIKE = 0.5",
         "tests/test_images.py::test_a_polymer_that_closes_through_the_boundary",
@@ -475,7 +475,7 @@ MUTANTS = [
         "tests/test_certificate.py::test_rows_that_were_converted_are_looked_at_as_they_were_given",
     ),
     (
-        "constraint_set.py",
+        "constraints/constraint_set.py",
         "np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps",
         "np.maximum(1e-8 * self.scale, 8 * np.finfo(float).eps",
         "tests/test_certificate.py::test_what_is_allowed_scales_with_rounding",

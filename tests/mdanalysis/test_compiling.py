@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import water_files as files
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.mdanalysis import compiling
 from kcons.mdanalysis.compiling import Frame, compiled_elsewhere, sample_of
 from kcons.mdanalysis.precision import FilePrecision

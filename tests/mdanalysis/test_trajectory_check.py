@@ -295,7 +295,7 @@ def test_processes_that_are_not_forked_get_all_of_it(water, monkeypatch):
 
 def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
     """Velocities drawn for rigid water: the mean over many molecules is the temperature, by 6 a molecule."""
-    from kcons.constraint_set import ConstraintSet
+    from kcons.constraints.constraint_set import ConstraintSet
     from kcons.motion import Motion
 
     n, frames = 300, 8

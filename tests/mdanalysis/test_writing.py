@@ -11,8 +11,8 @@ import pytest
 import water_files as files
 from water_files import mda
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis import ASE_UNITS, ConstraintCheck, OpenMMReporter, TrajectoryWriter, load_trajectory, write_ase
 from kcons.motion import Motion

@@ -7,8 +7,8 @@ import openmm
 from openmm import unit
 from openmm_systems import context_of
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm.implicit_rows import ExpressionSurface
 from kcons.openmm.surface import SurfaceIntegrator

@@ -22,8 +22,8 @@ from openmm_systems import (
 )
 
 from kcons import projection
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.schemes import SCHEMES

@@ -7,7 +7,6 @@ import openmm
 import pytest
 from carried_systems import context_of, free, peptide, pull, start, state_of
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
     Angle,
     CenterDistance,
@@ -22,6 +21,7 @@ from kcons.constraints import (
     RadiusOfGyration,
     Sphere,
 )
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator

@@ -24,8 +24,8 @@ from surface_cases import (
     worst,
 )
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Cylinder, Distance, Ellipsoid, Line, MovingTarget, Plane, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.solvers.general import GeneralClusters
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, FixedAtoms
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError
 from kcons.motion import Motion
 from kcons.solvers.packed import Packed, packed_positions, packed_tangents, set_lattice

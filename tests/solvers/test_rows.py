@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.solvers.rows import SparseRows
 
 CONSTRAINTS = [

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, MovingTarget
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import (
     Baumgarte,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget, Plane
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion import MANY_ITERATIONS, Motion
 from kcons.steppers import (

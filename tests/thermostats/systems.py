@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Constraint, Distance
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, System
 from kcons.thermostats import Isokinetic

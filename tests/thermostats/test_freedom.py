@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import (
     CenterOfMass,
     Cylinder,
@@ -18,6 +17,7 @@ from kcons.constraints import (
     Plane,
     Sphere,
 )
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.scenes.lennard_jones import LennardJones
 from kcons.steppers import State

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from reference import cases
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Distance, Ellipsoid, KnifeEdge, Plane, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, System, run
 from kcons.thermostats import Isokinetic, thermal_velocities

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.motion import Motion
 from kcons.steppers import State, System

@@ -8,7 +8,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.topology import Snapshot, connected
+from kcons.topology.topology import Snapshot, connected
 
 
 def minimum_image(snapshot: Snapshot, d: FloatArray) -> FloatArray:

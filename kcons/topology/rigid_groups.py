@@ -19,9 +19,9 @@ from kcons.constraints import Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, SingularGeometryError
-from kcons.topology import Snapshot, listed, near_misses
-from kcons.virtual_sites import VirtualSites, fitted
-from kcons.whole import whole_groups
+from kcons.topology.topology import Snapshot, listed, near_misses
+from kcons.topology.virtual_sites import VirtualSites, fitted
+from kcons.topology.whole_molecules import whole_groups
 
 #: Residues that are water, and the molecule when there are no residues.
 WATER = frozenset(

@@ -14,12 +14,12 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.arrays import numbers
+from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
+from kcons.constraints.images import find_images, image_error, in_one_piece, minimum_image
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
-from kcons.images import find_images, image_error, in_one_piece, minimum_image
 
 #: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
 MOST_STRAIN = 0.1
@@ -401,7 +401,7 @@ class ConstraintSet:
     # -- sigma, A, b ----------------------------------------------------------------------------
 
     def whole(self, x: FloatArray) -> FloatArray:
-        """Positions in which atoms of whole rows stand in the images that these rows mean; see `kcons.images`.
+        """Positions in which atoms of whole rows stand in the images that these rows mean; see `kcons.constraints.images`.
 
         `x` itself where all rows are plain.
         """

@@ -14,12 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kcons.constraint_set import ConstraintSet
 from kcons.constraints import Angle, Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.guessed_bonds import guess_bonds
-from kcons.rigid_groups import (
+from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.rigid_groups import (
     FLAT,
     GEOMETRIES,
     WATER,
@@ -29,9 +29,9 @@ from kcons.rigid_groups import (
     listed_bodies,
     residue_bodies,
 )
-from kcons.topology import BoolArray, Snapshot, Topology, bond_angles, near_misses, sorted_pairs
-from kcons.virtual_sites import VirtualSites
-from kcons.whole import minimum_image
+from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, near_misses, sorted_pairs
+from kcons.topology.virtual_sites import VirtualSites
+from kcons.topology.whole_molecules import minimum_image
 
 #: What can be held by name, and what that means.
 CONSTRAIN: dict[str, str] = {
@@ -140,7 +140,7 @@ def held_rows(
         Whether bonds are guessed: 'missing' where atoms have none, with a warning; True all of them anew; False
         never.
     flat : float
-        See `kcons.rigid_groups.body_rows`.
+        See `kcons.topology.rigid_groups.body_rows`.
     remedy : str
         What the error about missing bonds recommends.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.images import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.images import minimum_image
-from kcons.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
+from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
 
 #: Covalent radii in angstrom of elements that form bonds that could be held. Cordero et al., Dalton Trans. 2832 (2008).
 RADII: dict[str, float] = {

@@ -1,0 +1,14 @@
+"""What a file says about a system, and the rows that follow from it.
+
+- `topology`: atoms, residues, bonds and masses, the same for every MD engine
+- `whole_molecules`: groups and molecules made whole across the faces of the cell
+- `guessed_bonds`: bonds for systems that come without
+- `rigid_groups`: rigid groups of atoms as rows
+- `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water
+- `virtual_sites`: massless sites that are placed by three atoms
+- `other_units`: constraints in another unit of length
+"""
+
+from kcons.topology.topology import Snapshot, Topology
+
+__all__ = ["Snapshot", "Topology"]
