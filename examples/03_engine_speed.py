@@ -36,7 +36,7 @@ from kcons.ase import constrain
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.plan import DistanceClusters, make_plan
+from kcons.plan.plan import DistanceClusters, make_plan
 from kcons.scenes.openmm_host import system_of
 from kcons.solvers.distances import SparseDistances
 

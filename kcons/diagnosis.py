@@ -13,7 +13,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
-from kcons.plan import Plan
+from kcons.plan.plan import Plan
 from kcons.solvers.outcome import Outcome
 
 #: Conversions that a printed report names.

@@ -12,7 +12,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.plan import ClusterSolver, LongChains, Plan, sparse_distances
+from kcons.plan.plan import ClusterSolver, LongChains, Plan, sparse_distances
 from kcons.solvers.general import GeneralClusters
 from kcons.solvers.outcome import Outcome
 

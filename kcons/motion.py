@@ -20,12 +20,12 @@ from kcons.constraints.arguments import as_array, check_multipliers, check_out, 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.degeneracy import without_second_order_rows
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.far_starts import FarStart, Rescuers, Task, Work
-from kcons.flat_bodies import MISFIT, FlatBody
 from kcons.kept_geometry import Bonds
-from kcons.plan import Plan, make_plan
+from kcons.plan.plan import Plan, make_plan
+from kcons.plan.second_order.conversion import without_second_order_rows
+from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody
 from kcons.restoring import restored
 
 #: More Newton iterations than a time step of any use takes: the start was far off.

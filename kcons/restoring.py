@@ -30,7 +30,7 @@ from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
 from kcons.kept_geometry import OFF, Bonds, Geometry, shortest_image
 from kcons.pieces import Move, bend, free_motions, stretch, torsion
-from kcons.plan import Plan
+from kcons.plan.plan import Plan
 
 #: What pieces may leave to the search for the nearest point, in the same unit.
 NEAR = 0.25

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.degeneracy import without_second_order_rows
+from kcons.plan.second_order.conversion import without_second_order_rows
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.plan import make_plan
+from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
 
 NONE = np.zeros(0, np.int64)
 TRIANGLE = list(combinations(range(3), 2))

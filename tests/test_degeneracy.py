@@ -23,9 +23,9 @@ from kcons.constraints import (
     Sphere,
 )
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.degeneracy import without_second_order_rows
 from kcons.errors import SingularGeometryError
 from kcons.motion import Motion
+from kcons.plan.second_order.conversion import without_second_order_rows
 
 TETRAHEDRON = 0.63 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 METHANE = np.vstack([np.zeros((1, 3)), TETRAHEDRON])

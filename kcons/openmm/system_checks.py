@@ -18,7 +18,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.plan import make_plan
+from kcons.plan.plan import make_plan
 
 IntArray = NDArray[np.int64]
 

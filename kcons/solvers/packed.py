@@ -167,7 +167,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
                 return -1
             most = max(most, iterations)
         if chains is not None and turn == 0:
-            # As `kcons.plan.LongChains` does it.
+            # As `kcons.plan.plan.LongChains` does it.
             for again in range(_MAX_ROUNDS + 1):
                 landed, _, iterations, _ = project(
                     x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),

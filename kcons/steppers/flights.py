@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.motion import MANY_ITERATIONS, Motion
-from kcons.plan import DistanceClusters
+from kcons.plan.plan import DistanceClusters
 from kcons.solvers.borrowed import piece
 from kcons.solvers.chain import Chains
 from kcons.solvers.packed import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice

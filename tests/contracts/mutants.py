@@ -461,7 +461,12 @@ MUTANTS = [
         "BOND_LIKE = 0.5",
         "tests/test_images.py::test_a_polymer_that_closes_through_the_boundary",
     ),
-    ("rank.py", "late[rows[order]] = left_over", "pass", "tests/test_plan.py::test_dependent_rows_are_eliminated_last"),
+    (
+        "plan/rank.py",
+        "late[rows[order]] = left_over",
+        "pass",
+        "tests/test_plan.py::test_dependent_rows_are_eliminated_last",
+    ),
     (
         "certificate.py",
         "SPEED = 10.0",

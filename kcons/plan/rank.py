@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.clusters import Shape
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.images import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
+from kcons.plan.clusters import Shape
 from kcons.solvers.general import RANK_TOLERANCE
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.

@@ -22,13 +22,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.blocks import fixed_atoms, row_blocks
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
-from kcons.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies
-from kcons.second_order import DISPLACEMENT, RANK_TOLERANCE, BoolArray, LocalRows, unsolvable
+from kcons.plan.independent_blocks import fixed_atoms, row_blocks
+from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies
+from kcons.plan.second_order.singular_rows import DISPLACEMENT, RANK_TOLERANCE, BoolArray, LocalRows, unsolvable
 
 #: Larger blocks are first reduced to their internal coordinates, then to their distances, and what is
 #: still larger is tested by sparse inertia counts.

@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
-from kcons.clusters import Shape, classify, cluster_labels
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.images import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
-from kcons.rank import rank_of_small, ranked, small_enough
+from kcons.plan.clusters import Shape, classify, cluster_labels
+from kcons.plan.rank import rank_of_small, ranked, small_enough
 from kcons.solvers.chain import Chains
 from kcons.solvers.distances import SparseDistances, lengths_resolved
 from kcons.solvers.general import GeneralClusters

@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.blocks import fixed_atoms
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
+from kcons.plan.independent_blocks import fixed_atoms
 
 BoolArray = NDArray[np.bool_]
 
