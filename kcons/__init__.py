@@ -5,7 +5,7 @@ The names here are those of the core; the hosts are imported by name: ``from kco
 
 from kcons import constraints, errors
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, System, run
 
 __version__ = "0.1.0"

@@ -86,7 +86,7 @@ class Engine(_OnArrays):
 
     def __init__(self, system: BareSystem, tolerance: float) -> None:
         super().__init__(system, tolerance)
-        from kcons.motion import Motion
+        from kcons.motion.motion import Motion
 
         self.motion = Motion(system.constraint_set(), system.positions)
 

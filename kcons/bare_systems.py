@@ -13,7 +13,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 
 #: 300 K in u Å²/fs², and a usual time step in fs.
 THERMAL_ENERGY = 2.494e-4

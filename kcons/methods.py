@@ -20,7 +20,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.openmm_methods import OPENMM_METHODS
 from kcons.peers import PEERS
 from kcons.runs import ENGINE_CALLS, Method, Run, independent_rows, matched_steps

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons import diagnosis
 from kcons.cli import main
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
+from kcons.motion import report as diagnosis
 from kcons.solvers.outcome import Outcome
 from kcons.steppers import State, System, run
 

@@ -18,9 +18,9 @@ from ase.neighborlist import natural_cutoffs, neighbor_list
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, KconsError
-from kcons.kept_geometry import bonds_of
 from kcons.motion import Motion
-from kcons.pieces import Pieces
+from kcons.motion.restoring.kept_geometry import bonds_of
+from kcons.motion.restoring.rigid_pieces import Pieces
 from kcons.topology.guessed_bonds import bonds_without_elements
 
 #: What may change: angstrom, degrees.

@@ -18,7 +18,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 
 #: Arrays up to this length are compared fastest as bytes.
 _SHORT = 4096

@@ -16,15 +16,15 @@ from kcons.ase.binding import Binding, applied_forces, bind, check_company, touc
 from kcons.ase.host import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
 from kcons.ase.virial import VOIGT, constraint_virial
-from kcons.certificate import CHECK_EVERY
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.diagnosis import Report
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.certificate import CHECK_EVERY
+from kcons.motion.motion import Motion
+from kcons.motion.report import Report
 
 __all__ = ["Constraints", "constrain"]
 

@@ -19,12 +19,12 @@ from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraint import Constraints
 from kcons.ase.host import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
-from kcons.certificate import checked_every
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.certificate import checked_every
+from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 
 #: Places of the Voigt components xx, yy, zz, yz, xz, xy in a 3 x 3 matrix.
 VOIGT = ((0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1))

@@ -17,7 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.hard_cases.case import CannotExpressError
 from kcons.hard_cases.problem import Array, Problem
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 
 

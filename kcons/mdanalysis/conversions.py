@@ -20,7 +20,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
 from kcons.mdanalysis.universe import snapshot_of
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
 from kcons.topology.topology import Snapshot

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 
 #: Rows of one piece; a larger cluster is a piece of its own.
 PIECE = 6_000
@@ -21,7 +21,7 @@ def rank_of(constraint_set: ConstraintSet, positions: FloatArray) -> int:
     Raises
     ------
     KconsError
-        What `kcons.motion.Motion` refuses.
+        What `kcons.motion.motion.Motion` refuses.
     """
     n = constraint_set.n_rows
     if n <= PIECE:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.mdanalysis.loading import quiet
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.steppers import State
 
 #: Rows up to which an XVG file has a column for each multiplier.

@@ -30,7 +30,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.openmm.system_checks import ROW_NAME
 from kcons.steppers.drifts import NonholonomicFlight
 from kcons.steppers.summation import Point

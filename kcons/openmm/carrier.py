@@ -15,9 +15,9 @@ from openmm import unit
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.diagnosis import Report
 from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
+from kcons.motion.report import Report
 from kcons.openmm.callbacks import (
     CARRY_SCALE,
     LIVE,

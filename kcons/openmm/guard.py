@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import openmm
 
-from kcons.certificate import MOST, SHARE
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
+from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.part import Miss
 from kcons.openmm.system_checks import (
     SystemRows,

@@ -14,7 +14,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.openmm.part import Miss
 from kcons.openmm.program import Program
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.peers.smallness import dense_rows, one_thread, plain_set, too_much
 from kcons.runs import Method, Run
 from kcons.scenes import Scene

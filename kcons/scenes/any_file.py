@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.openmm_host import ASE_LENGTH, OpenMMHost, place
 from kcons.scenes.potential import Potential, of_calculator
 from kcons.scenes.scene import Scene, thermal_velocities

@@ -12,7 +12,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.openmm_host import ASE_LENGTH, ASE_TIME, OpenMMHost, system_of
 from kcons.scenes.potential import Evaluate, Potential
 from kcons.scenes.scene import Scene, thermal_velocities

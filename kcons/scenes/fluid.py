@@ -19,7 +19,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.lennard_jones import LennardJones
 from kcons.scenes.scene import ASE_UNITS, Units
 from kcons.steppers import System

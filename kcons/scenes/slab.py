@@ -12,7 +12,7 @@ from ase.calculators.emt import EMT
 from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.potential import of_calculator
 from kcons.scenes.scene import Scene, thermal_velocities
 

@@ -19,7 +19,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.minimal import single
 from kcons.scenes.openmm_host import ASE_LENGTH, OpenMMHost, place, properties
 from kcons.scenes.scene import Scene, thermal_velocities

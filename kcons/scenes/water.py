@@ -16,7 +16,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.scenes.openmm_host import ASE_LENGTH, OpenMMHost
 from kcons.scenes.potential import Potential, of_calculator
 from kcons.scenes.scene import Scene, thermal_velocities

@@ -17,7 +17,7 @@ from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms,
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.hard_cases.problem import Array
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.stability.scenes import every_pair, separated
 from kcons.steppers import (
     BlanesMoan4,

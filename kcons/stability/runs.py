@@ -14,7 +14,7 @@ from kcons.hard_cases.case import CannotExpressError
 from kcons.hard_cases.long_runs import secular_drift
 from kcons.hard_cases.problem import Array, Problem
 from kcons.hard_cases.programs import Core, Frame, NotIntactError, PlainAse, PlainOpenMM, Program
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.stability.scenes import SCENES
 from kcons.steppers import (
     BlanesMoan4,

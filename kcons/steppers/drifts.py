@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.steppers.summation import Point
 
 _MAX_ITERATIONS = 50

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.motion import MANY_ITERATIONS, Motion
+from kcons.motion.motion import MANY_ITERATIONS, Motion
 from kcons.plan.plan import DistanceClusters
 from kcons.solvers.borrowed import piece
 from kcons.solvers.chain import Chains

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 
 _EPS = float(np.finfo(float).eps)
 #: Largest rate times length of a drift; exponentials of it are still numbers.

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcons.certificate import checked_every
 from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
+from kcons.motion.certificate import checked_every
 from kcons.solvers.packed import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights

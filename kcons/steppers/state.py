@@ -16,13 +16,13 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.certificate import Schedule
 from kcons.constraints.arguments import as_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
 from kcons.files import in_one_piece
-from kcons.motion import Motion
+from kcons.motion.certificate import Schedule
+from kcons.motion.motion import Motion
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.flights import Flights
 from kcons.steppers.friction import Friction

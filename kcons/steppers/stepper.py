@@ -9,8 +9,8 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from kcons.certificate import checked_every
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
+from kcons.motion.certificate import checked_every
 from kcons.steppers.state import KICK_ROUNDING, State, System
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.motion import Motion
+from kcons.motion.motion import Motion
 from kcons.steppers import State, System
 
 Momentum = Literal["auto", "conserved", "free"]

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.motion import MANY_ITERATIONS
+from kcons.motion.motion import MANY_ITERATIONS
 from kcons.solvers.borrowed import piece
 from kcons.solvers.packed import MORE, Packed, packed_positions, packed_tangents, set_lattice
 from kcons.steppers import System

@@ -341,7 +341,7 @@ MUTANTS = [
     ("projection.py", "rtol)].conj().T)", "rtol)].T)", "tests/test_projection.py::test_complex_matrices"),
     # -- steppers, thermostats, arrays --
     (
-        "motion.py",
+        "motion/motion.py",
         "np.copyto(velocities, saved[1])",
         "pass",
         "tests/test_motion.py::test_velocities_are_put_back_when_a_later_solver_fails",
@@ -468,13 +468,13 @@ MUTANTS = [
         "tests/test_plan.py::test_dependent_rows_are_eliminated_last",
     ),
     (
-        "certificate.py",
+        "motion/certificate.py",
         "SPEED = 10.0",
         "SPEED = 1e10",
         "tests/test_certificate.py::test_a_solver_that_is_wrong_without_knowing_is_found_in_the_first_step",
     ),
     (
-        "motion.py",
+        "motion/motion.py",
         "            certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)",
         "            pass",
         "tests/test_certificate.py::test_rows_that_were_converted_are_looked_at_as_they_were_given",

@@ -128,5 +128,5 @@ def test_the_mutant_is_killed(mutant, tmp_path):
 
 def test_modules_that_took_in_a_function_are_found():
     names = {str(path.relative_to(PACKAGE)) for path in users(PACKAGE, "solvers/narrow.py")}
-    assert {"solvers/narrow.py", "solvers/distances.py", "solvers/packed.py", "motion.py"} <= names
+    assert {"solvers/narrow.py", "solvers/distances.py", "solvers/packed.py", "motion/motion.py"} <= names
     assert "errors.py" not in names

@@ -8,7 +8,7 @@ import pytest
 from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget, Plane
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
-from kcons.motion import MANY_ITERATIONS, Motion
+from kcons.motion.motion import MANY_ITERATIONS, Motion
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,

@@ -15,7 +15,7 @@ from kcons.constraints.images import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
-from kcons.pieces import Pieces
+from kcons.motion.restoring.rigid_pieces import Pieces
 from kcons.topology.guessed_bonds import NEAREST, across, bonds_without_elements
 from kcons.topology.topology import BoolArray, bond_angles, connected, sorted_pairs
 

@@ -14,19 +14,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons import diagnosis
-from kcons.certificate import certify
 from kcons.constraints.arguments import as_array, check_multipliers, check_out, check_pairs
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
-from kcons.far_starts import FarStart, Rescuers, Task, Work
-from kcons.kept_geometry import Bonds
+from kcons.motion import report as diagnosis
+from kcons.motion.certificate import certify
+from kcons.motion.restoring.kept_geometry import Bonds
+from kcons.motion.restoring.moved_groups import restored
+from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Task, Work
 from kcons.plan.plan import Plan, make_plan
 from kcons.plan.second_order.conversion import without_second_order_rows
 from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody
-from kcons.restoring import restored
 
 #: More Newton iterations than a time step of any use takes: the start was far off.
 MANY_ITERATIONS = 6
@@ -341,7 +341,7 @@ class Motion:
 
         For initial positions, not for time steps. Near starts go to the nearest point in the mass metric, where
         x - x_0 = M^-1 A(x)^T Lambda. Where that would change other bonds or angles, and for far starts, groups move
-        as rigid pieces first: see `kcons.restoring`.
+        as rigid pieces first: see `kcons.motion.restoring.moved_groups`.
 
         Parameters
         ----------

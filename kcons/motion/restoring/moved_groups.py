@@ -28,8 +28,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
-from kcons.kept_geometry import OFF, Bonds, Geometry, shortest_image
-from kcons.pieces import Move, bend, free_motions, stretch, torsion
+from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry, shortest_image
+from kcons.motion.restoring.rigid_pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan.plan import Plan
 
 #: What pieces may leave to the search for the nearest point, in the same unit.
@@ -65,7 +65,7 @@ def restored(
     x : ndarray, shape (n_atoms, 3)
     time : float
     bonds : callable or None
-        Gives the bonds, shape (n, 2). None: see `kcons.kept_geometry.bonds_of`. Where it gives none, other lengths and
+        Gives the bonds, shape (n, 2). None: see `kcons.motion.restoring.kept_geometry.bonds_of`. Where it gives none, other lengths and
         angles may change.
     nearest : callable
         Gives the nearest point on the rows, or raises.

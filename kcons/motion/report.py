@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from kcons.conditioning import worst_condition
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
+from kcons.motion.condition import worst_condition
 from kcons.plan.plan import Plan
 from kcons.solvers.outcome import Outcome
 
@@ -29,7 +29,7 @@ class KindReport:
     solver : str
     clusters, rows, rank : int
     condition : float
-        Of the worst cluster, see `kcons.conditioning`; NaN where it was not asked for or is out of reach.
+        Of the worst cluster, see `kcons.motion.condition`; NaN where it was not asked for or is out of reach.
     iterations : int
         Newton iterations of the worst cluster in the last position projection; 0 before the first.
     example : str

@@ -1,0 +1,12 @@
+"""The engine: what constraints do to positions, velocities, accelerations and forces.
+
+- `motion`: `Motion`, the engine itself
+- `certificate`: results checked by the constraints as they were given
+- `report`: what is held, and how well
+- `condition`: condition numbers of clusters
+- `restoring`: positions that are off, brought onto the constraints
+"""
+
+from kcons.motion.motion import Motion
+
+__all__ = ["Motion"]
