@@ -38,7 +38,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.plan.plan import DistanceClusters, make_plan
 from kcons.scenes.openmm_host import system_of
-from kcons.solvers.distances import SparseDistances
+from kcons.solvers.sparse.distances import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
 STEP = 2.0  # fs

@@ -12,7 +12,7 @@ from kcons import ConstraintSet, Motion, State, System, run
 from kcons.ase import ConstrainedDynamics, constrain
 from kcons.constraints import Angle, Distance, Sphere
 from kcons.errors import CertificateError, InputError
-from kcons.solvers.outcome import Outcome
+from kcons.solvers.cluster_solver import Outcome
 from kcons.steppers import Baumgarte, ProjectedVerlet, Rattle, Suzuki4
 
 X = np.array([[0.9, 0, -0.4], [1.5, 0, 0.1], [2.0, 0.3, -0.2]])

@@ -13,7 +13,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion
 from kcons.motion import report as diagnosis
-from kcons.solvers.outcome import Outcome
+from kcons.solvers.cluster_solver import Outcome
 from kcons.steppers import State, System, run
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])

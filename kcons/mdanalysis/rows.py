@@ -28,7 +28,7 @@ from kcons.solvers.frames import (
     powers_below,
     triangles,
 )
-from kcons.solvers.lattice import NO_LATTICE
+from kcons.solvers.kernels.nearest_image import NO_LATTICE
 
 #: What second order adds to the error of rows other than distances, at most.
 SECOND_ORDER = 1.1

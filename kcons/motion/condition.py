@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.general import RANK_TOLERANCE
+from kcons.solvers.general_clusters import RANK_TOLERANCE
 
 #: Largest cluster, in rows, that goes through dense singular values.
 DENSE_ROWS = 300

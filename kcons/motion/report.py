@@ -14,7 +14,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, KconsError, SingularGeometryError
 from kcons.motion.condition import worst_condition
 from kcons.plan.plan import Plan
-from kcons.solvers.outcome import Outcome
+from kcons.solvers.cluster_solver import Outcome
 
 #: Conversions that a printed report names.
 SHOWN = 4

@@ -15,13 +15,13 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import rank_of_small, ranked, small_enough
-from kcons.solvers.chain import Chains
-from kcons.solvers.distances import SparseDistances, lengths_resolved
-from kcons.solvers.general import GeneralClusters
-from kcons.solvers.lanes import SmallClusters
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.rows import SparseRows
-from kcons.solvers.water import RigidTriangles
+from kcons.solvers.chains.chains import Chains
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.small_clusters import SmallClusters
+from kcons.solvers.sparse.distances import SparseDistances, lengths_resolved
+from kcons.solvers.sparse.mixed_rows import SparseRows
 
 #: Rounds of Newton that a chain may take until its stored positions show the lengths.
 MAX_ROUNDS = 4

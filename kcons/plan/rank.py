@@ -9,7 +9,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.images import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
-from kcons.solvers.general import RANK_TOLERANCE
+from kcons.solvers.general_clusters import RANK_TOLERANCE
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
 ORDERED_ROWS = 400

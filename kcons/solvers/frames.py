@@ -20,8 +20,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from kcons.solvers.lattice import nearest_image
-from kcons.solvers.narrow import lane, load_quad, quad, quad_type, store_quad
+from kcons.solvers.kernels.nearest_image import nearest_image
+from kcons.solvers.kernels.two_and_four_wide import lane, load_quad, quad, quad_type, store_quad
 
 #: Rows a block; what needs care is done again by blocks.
 BLOCK = 256

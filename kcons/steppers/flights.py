@@ -18,10 +18,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import MANY_ITERATIONS, Motion
 from kcons.plan.plan import DistanceClusters
-from kcons.solvers.borrowed import piece
-from kcons.solvers.chain import Chains
-from kcons.solvers.packed import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
-from kcons.solvers.water import RigidTriangles
+from kcons.solvers.chains.chains import Chains
+from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.kernels.array_views import piece
+from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.steppers.summation import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
@@ -60,7 +60,7 @@ class Flights:
     ----------
     motion : Motion
     found : tuple
-        All its rows, from `kcons.solvers.packed`, 1/m for each coordinate, the atoms that show whether the system is
+        All its rows, from `kcons.solvers.fused_distances`, 1/m for each coordinate, the atoms that show whether the system is
         far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
     """
 

@@ -17,7 +17,7 @@ from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.motion.certificate import checked_every
-from kcons.solvers.packed import Packed
+from kcons.solvers.fused_distances import Packed
 from kcons.steppers.drifts import Drift
 from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
 from kcons.steppers.friction import Friction

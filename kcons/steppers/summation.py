@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.borrowed import bits, flat
+from kcons.solvers.kernels.array_views import bits, flat
 
 #: Stands for the work arrays where a step adds up nothing.
 NO_WORK = np.empty((0, 0, 3))

@@ -12,8 +12,8 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import MANY_ITERATIONS
-from kcons.solvers.borrowed import piece
-from kcons.solvers.packed import MORE, Packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.kernels.array_views import piece
 from kcons.steppers import System
 from kcons.steppers.flights import packed_rows
 from kcons.steppers.summation import all_finite
@@ -33,7 +33,7 @@ class IsokineticStages:
     ----------
     system : System
     found : tuple
-        All its rows, from `kcons.solvers.packed`; then 1/m for each coordinate, the masses of the thermostatted atoms,
+        All its rows, from `kcons.solvers.fused_distances`; then 1/m for each coordinate, the masses of the thermostatted atoms,
         and whether others move.
     """
 

@@ -16,7 +16,7 @@ from ase.md.velocitydistribution import thermalize_momenta
 
 from kcons.ase import Constraints, constrain, rigid_water
 from kcons.constraints import Angle, Distance
-from kcons.solvers.groups import POSITION_TOLERANCE
+from kcons.solvers.kernels.groups_of_eight import POSITION_TOLERANCE
 
 FS = units.fs
 TEMPERATURE = 300.0

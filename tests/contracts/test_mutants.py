@@ -127,6 +127,11 @@ def test_the_mutant_is_killed(mutant, tmp_path):
 
 
 def test_modules_that_took_in_a_function_are_found():
-    names = {str(path.relative_to(PACKAGE)) for path in users(PACKAGE, "solvers/narrow.py")}
-    assert {"solvers/narrow.py", "solvers/distances.py", "solvers/packed.py", "motion/motion.py"} <= names
+    names = {str(path.relative_to(PACKAGE)) for path in users(PACKAGE, "solvers/kernels/two_and_four_wide.py")}
+    assert {
+        "solvers/kernels/two_and_four_wide.py",
+        "solvers/sparse/distances.py",
+        "solvers/fused_distances.py",
+        "motion/motion.py",
+    } <= names
     assert "errors.py" not in names

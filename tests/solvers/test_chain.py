@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.chain import Chains
-from kcons.solvers.strips import SHORT
+from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.strips import SHORT
 
 
 def steps(shape, n, rng):

@@ -5,8 +5,8 @@ import pytest
 
 from kcons.constraints import Angle, Cylinder, Dihedral, Distance, LinearCombination, Plane, RowKind, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.solvers.coordinates import DIHEDRAL, evaluate, miss
-from kcons.solvers.rows import SparseRows
+from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.row_values import DIHEDRAL, evaluate, miss
 
 KINDS = {
     RowKind.DISTANCE: Distance([[3, 1], [7, 2]]),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_lanes import CELLS, dense_positions, dense_tangents, jacobian, lattice_of
 
-from kcons.solvers.distances import SparseDistances
+from kcons.solvers.sparse.distances import SparseDistances
 
 GRAPHS = {
     "comb": [(k, k + 1) for k in range(6)] + [(k, 7 + k) for k in range(7)],

@@ -8,9 +8,9 @@ import pytest
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance
 from kcons.errors import UnsupportedError
-from kcons.solvers import elimination
-from kcons.solvers.elimination import make_pattern, make_small_pattern
-from kcons.solvers.linear import backward, factor, forward
+from kcons.solvers.sparse import elimination
+from kcons.solvers.sparse.elimination import make_pattern, make_small_pattern
+from kcons.solvers.sparse.substitution import backward, factor, forward
 
 
 def pattern_of(pairs, n_atoms):

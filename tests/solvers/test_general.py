@@ -8,7 +8,7 @@ import pytest
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.solvers.general import GeneralClusters
+from kcons.solvers.general_clusters import GeneralClusters
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.lanes import SmallClusters
+from kcons.solvers.small_clusters import SmallClusters
 
 CONNECTIONS = {
     "bond": [(0, 1)],

@@ -5,7 +5,7 @@ import pytest
 
 from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.solvers.rows import SparseRows
+from kcons.solvers.sparse.mixed_rows import SparseRows
 
 CONSTRAINTS = [
     Distance([[0, 1], [1, 2], [2, 3], [3, 4], [6, 7]]),

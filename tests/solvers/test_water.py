@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.water import PAIRS, RigidTriangles
+from kcons.solvers.rigid_triangles import PAIRS, RigidTriangles
 
 I, J = np.array(PAIRS).T
 

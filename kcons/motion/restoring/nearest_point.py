@@ -13,8 +13,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import report
 from kcons.plan.plan import ClusterSolver, LongChains, Plan, sparse_distances
-from kcons.solvers.general import GeneralClusters
-from kcons.solvers.outcome import Outcome
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.general_clusters import GeneralClusters
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400

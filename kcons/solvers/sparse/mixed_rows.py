@@ -1,7 +1,7 @@
 """Rows of mixed kinds, coupled in any way: sparse elimination with general gradients.
 
-The counterpart of `kcons.solvers.distances` for clusters that also hold angles, dihedrals, planes and other
-compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.coordinates` says.
+The counterpart of `kcons.solvers.sparse.distances` for clusters that also hold angles, dihedrals, planes and other
+compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.sparse.row_values` says.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.coordinates import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
-from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
-from kcons.solvers.lattice import NO_LATTICE
-from kcons.solvers.linear import update
-from kcons.solvers.narrow import (
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.kernels.nearest_image import NO_LATTICE
+from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
     entry,
@@ -37,8 +36,9 @@ from kcons.solvers.narrow import (
     store_quad,
     swapped,
 )
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.storage import aligned
+from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
+from kcons.solvers.sparse.row_values import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
+from kcons.solvers.sparse.substitution import update
 
 MAX_ITERATIONS = 50
 #: Halvings of one Newton step by the step control.
@@ -101,7 +101,7 @@ class SparseRows:
         n = len(rows)
         self._lines = aligned(8 * int(slots[-1]))
         self._lines[6::8] = w[slot_atoms]
-        # By row: accumulated change of the pivot and right-hand side; by entry as in `kcons.solvers.linear`.
+        # By row: accumulated change of the pivot and right-hand side; by entry as in `kcons.solvers.sparse.substitution`.
         self._state, self._entries = aligned(2 * n), aligned(4 * len(pattern.columns))
         self._pivots, self._values, self._floor = np.zeros(n), np.zeros(n), np.zeros(n)
         self._base, self._moves = aligned(4 * len(self._atoms)), aligned(4 * len(self._atoms))
@@ -211,7 +211,7 @@ def _factor(  # type: ignore[no-untyped-def]
 ):
     """Assemble and eliminate rows first to last, with forward substitution, in one sweep.
 
-    Entries are stored as in `kcons.solvers.linear`; accumulated changes are left at zero.
+    Entries are stored as in `kcons.solvers.sparse.substitution`; accumulated changes are left at zero.
     """
     begin, t, slot = entry(links, 4 * first), entry(links, 4 * first + 1), 8 * entry(links, 4 * first + 2)
     for k in range(first, last):

@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from kcons.solvers.simd import FASTMATH, WIDTH, load_triple, nearest, scatter_points
+from kcons.solvers.kernels.eight_wide import FASTMATH, WIDTH, load_triple, nearest, scatter_points
 
 MAX_ITERATIONS = 50
 POSITION_TOLERANCE = 4e-15

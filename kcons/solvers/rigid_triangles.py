@@ -12,7 +12,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.groups import (
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.kernels.eight_wide import (
+    FASTMATH,
+    WIDTH,
+    absolute,
+    all_within,
+    gather_differences,
+    gather_points,
+    keep_points,
+    not_positive,
+    scatter_points,
+    splat,
+    square_root,
+    store,
+)
+from kcons.solvers.kernels.groups_of_eight import (
     MAX_ITERATIONS,
     NO_NUMBERS,
     NO_POINTS,
@@ -29,22 +45,6 @@ from kcons.solvers.groups import (
     restore_points,
     worst_row,
 )
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.simd import (
-    FASTMATH,
-    WIDTH,
-    absolute,
-    all_within,
-    gather_differences,
-    gather_points,
-    keep_points,
-    not_positive,
-    scatter_points,
-    splat,
-    square_root,
-    store,
-)
-from kcons.solvers.storage import aligned
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Order of the three rows of a triangle, in local atoms."""

@@ -15,8 +15,7 @@ opposite direction: a Newton step reads the chain once.
 import numpy as np
 from numba import njit
 
-from kcons.solvers.groups import MAX_ITERATIONS, OPEN, POSITION_TOLERANCE, TINY, dot, lattice_numbers, minimum_image
-from kcons.solvers.simd import (
+from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
     absolute,
@@ -35,6 +34,15 @@ from kcons.solvers.simd import (
     store_triple,
     where_greater,
     where_zero,
+)
+from kcons.solvers.kernels.groups_of_eight import (
+    MAX_ITERATIONS,
+    OPEN,
+    POSITION_TOLERANCE,
+    TINY,
+    dot,
+    lattice_numbers,
+    minimum_image,
 )
 
 TANGENT_TOLERANCE = 2e-15

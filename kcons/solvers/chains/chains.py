@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.groups import NO_NUMBERS, NO_POINTS, lattice_kind
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.simd import WIDTH
-from kcons.solvers.storage import aligned
-from kcons.solvers.strips import SHORT, long_strip, short_strip, whole_slots
-from kcons.solvers.sweeps import SLOT, project
+from kcons.solvers.chains.strips import SHORT, long_strip, short_strip, whole_slots
+from kcons.solvers.chains.sweeps import SLOT, project
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.kernels.eight_wide import WIDTH
+from kcons.solvers.kernels.groups_of_eight import NO_NUMBERS, NO_POINTS, lattice_kind
 
 
 class Chains:

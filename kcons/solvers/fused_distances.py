@@ -2,8 +2,8 @@
 
 A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
 compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
-time (`kcons.solvers.water`), long chains (`kcons.solvers.chain`), and whatever else is held by sparse elimination
-(`kcons.solvers.distances`), which knows every shape and is the fastest for few rows of many shapes.
+time (`kcons.solvers.rigid_triangles`), long chains (`kcons.solvers.chains.chains`), and whatever else is held by sparse elimination
+(`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers import distances
-from kcons.solvers.borrowed import piece
-from kcons.solvers.chain import Chains
-from kcons.solvers.distances import SparseDistances
-from kcons.solvers.groups import NO_LATTICE, OPEN, lattice_kind, restore_points
-from kcons.solvers.simd import WIDTH
-from kcons.solvers.storage import LINE, aligned
-from kcons.solvers.sweeps import project
-from kcons.solvers.water import RigidTriangles, triangle_positions, triangle_tangents
+from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.sweeps import project
+from kcons.solvers.kernels.aligned_memory import LINE, aligned
+from kcons.solvers.kernels.array_views import piece
+from kcons.solvers.kernels.eight_wide import WIDTH
+from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, OPEN, lattice_kind, restore_points
+from kcons.solvers.rigid_triangles import RigidTriangles, triangle_positions, triangle_tangents
+from kcons.solvers.sparse import distances
+from kcons.solvers.sparse.distances import SparseDistances
 
 #: Rounds from where the last one ended, until the lengths are what the positions resolve.
 _MAX_ROUNDS = 4
@@ -72,7 +72,7 @@ def packed(
     numbers : ndarray of int, optional
         What the atoms that `chains` knows are called here; None where they are called the same.
     late : ndarray of bool, shape (n_rows,), optional
-        Which of `pairs` depend on others, see `kcons.solvers.elimination.make_pattern`.
+        Which of `pairs` depend on others, see `kcons.solvers.sparse.elimination.make_pattern`.
 
     Returns
     -------

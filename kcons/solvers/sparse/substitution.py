@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numba as nb
 
-from kcons.solvers.elimination import FAST, PIVOT_TOLERANCE
-from kcons.solvers.narrow import (
+from kcons.solvers.kernels.two_and_four_wide import (
     entry,
     lane,
     load_pair,
@@ -26,6 +25,7 @@ from kcons.solvers.narrow import (
     store_quad,
     swapped,
 )
+from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE
 
 #: Places of the two last numbers in a row's line.
 CHANGE, RIGHT = 6, 7

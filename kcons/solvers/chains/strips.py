@@ -8,7 +8,7 @@ slot; of short chains, each takes a lane.
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.solvers.simd import WIDTH
+from kcons.solvers.kernels.eight_wide import WIDTH
 
 SHORT = 32
 """Atoms of the longest chain that gets one lane instead of eight."""

@@ -15,8 +15,8 @@ import numba as nb
 import numpy as np
 
 from kcons.constraints.constraint import RowKind
-from kcons.solvers.elimination import FAST
-from kcons.solvers.narrow import dot, entry, lane, load_quad, number, put, quad
+from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad
+from kcons.solvers.sparse.elimination import FAST
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)

@@ -12,25 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.groups import (
-    MAX_ITERATIONS,
-    NO_NUMBERS,
-    NO_POINTS,
-    OPEN,
-    POSITION_TOLERANCE,
-    SAVED,
-    TANGENT_TOLERANCE,
-    TINY,
-    dot,
-    lane_tables,
-    lattice_kind,
-    lattice_numbers,
-    minimum_image,
-    restore_points,
-    worst_row,
-)
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.simd import (
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
     absolute,
@@ -48,7 +32,23 @@ from kcons.solvers.simd import (
     stack,
     store,
 )
-from kcons.solvers.storage import aligned
+from kcons.solvers.kernels.groups_of_eight import (
+    MAX_ITERATIONS,
+    NO_NUMBERS,
+    NO_POINTS,
+    OPEN,
+    POSITION_TOLERANCE,
+    SAVED,
+    TANGENT_TOLERANCE,
+    TINY,
+    dot,
+    lane_tables,
+    lattice_kind,
+    lattice_numbers,
+    minimum_image,
+    restore_points,
+    worst_row,
+)
 
 LARGEST = 6
 """Rows of the largest cluster; its matrix of 36 vectors stays in the first cache."""

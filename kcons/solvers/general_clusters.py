@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.outcome import Outcome
+from kcons.solvers.cluster_solver import Outcome
 
 #: Singular values of the row-normalised, mass-weighted matrix below this part of the largest are redundant.
 RANK_TOLERANCE = 1e-8

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.elimination import FAST, UIntArray, make_pattern, make_small_pattern
-from kcons.solvers.lattice import NO_LATTICE, nearest_image
-from kcons.solvers.linear import RIGHT, backward, factor, factor_symmetric, forward
-from kcons.solvers.narrow import (
+from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
     entry,
@@ -34,8 +34,8 @@ from kcons.solvers.narrow import (
     store_line,
     store_quad,
 )
-from kcons.solvers.outcome import Outcome
-from kcons.solvers.storage import aligned
+from kcons.solvers.sparse.elimination import FAST, UIntArray, make_pattern, make_small_pattern
+from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 
 #: Newton stops at this relative error of a length in relative coordinates (a few roundings).
 LENGTH_TOLERANCE = 4e-15

@@ -1,0 +1,9 @@
+"""What compiled kernels are made of.
+
+- `aligned_memory`: memory for the kernels
+- `array_views`: views of arrays that are not counted
+- `nearest_image`: minimum images
+- `eight_wide`: a number eight doubles wide
+- `two_and_four_wide`: numbers two and four doubles wide
+- `groups_of_eight`: clusters eight at a time
+"""

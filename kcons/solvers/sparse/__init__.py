@@ -1,0 +1,8 @@
+"""Clusters of any connectivity, by sparse elimination of A M^-1 A^T.
+
+- `elimination`: order and pattern, found once
+- `substitution`: the sweeps over one cluster
+- `row_values`: values and gradients of compiled rows
+- `distances`: held distances
+- `mixed_rows`: rows of mixed kinds
+"""
