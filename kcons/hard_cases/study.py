@@ -12,9 +12,9 @@ from typing import Any
 from kcons import __version__
 from kcons.compare import Watcher, environment
 from kcons.errors import InputError
-from kcons.files import in_one_piece
 from kcons.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.hard_cases.worker import Worker
+from kcons.steppers.files import in_one_piece
 
 FORMAT = "kcons-hard-cases-1"
 #: Seconds after which a program that has not answered is given up: quick and full.

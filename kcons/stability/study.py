@@ -11,10 +11,10 @@ from typing import Any
 from kcons import __version__
 from kcons.compare import Watcher, environment
 from kcons.errors import InputError
-from kcons.files import in_one_piece
 from kcons.hard_cases.study import fingerprint
 from kcons.stability import fuzz, runs
 from kcons.stability.scenes import SCENES
+from kcons.steppers.files import in_one_piece
 
 FORMAT = "kcons-stability-1"
 PARTS = ("steps", "drift", "reversal", "fuzz")

@@ -18,12 +18,12 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.motion.certificate import checked_every
 from kcons.solvers.fused_distances import Packed
+from kcons.steppers.compensated_steps import NO_WORK, Point
 from kcons.steppers.drifts import Drift
-from kcons.steppers.flights import BOTH, FLY, UNENDED, Flights
 from kcons.steppers.friction import Friction
+from kcons.steppers.fused_stages import BOTH, FLY, UNENDED, Flights
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
-from kcons.steppers.summation import NO_WORK, Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)

@@ -20,13 +20,13 @@ from kcons.constraints.arguments import as_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
-from kcons.files import in_one_piece
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
+from kcons.steppers.compensated_steps import all_finite, beyond
 from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
-from kcons.steppers.flights import Flights
+from kcons.steppers.files import in_one_piece
 from kcons.steppers.friction import Friction
-from kcons.steppers.summation import all_finite, beyond
+from kcons.steppers.fused_stages import Flights
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0

@@ -19,7 +19,7 @@ from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.summation import Point
+from kcons.steppers.compensated_steps import Point
 from kcons.thermostats.isokinetic_step import paced
 from kcons.thermostats.velocities import thermal_velocities
 

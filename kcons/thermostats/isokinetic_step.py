@@ -12,9 +12,9 @@ from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
+from kcons.steppers.compensated_steps import Point
 from kcons.steppers.splitting import Stage
 from kcons.steppers.state import check_finite
-from kcons.steppers.summation import Point
 from kcons.thermostats import kick as closed_form
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic_stages import (

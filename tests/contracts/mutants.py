@@ -425,7 +425,7 @@ MUTANTS = [
         "tests/steppers/test_state.py::test_a_damaged_byte_is_noticed",
     ),
     (
-        "files.py",
+        "steppers/files.py",
         "unfinished.unlink(missing_ok=True)",
         "pass",
         "tests/steppers/test_state.py::test_a_full_disk_leaves_nothing_behind",

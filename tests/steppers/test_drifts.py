@@ -15,8 +15,8 @@ from kcons.constraints import (
     Sphere,
 )
 from kcons.errors import ConvergenceError
+from kcons.steppers.compensated_steps import Point
 from kcons.steppers.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
-from kcons.steppers.summation import Point
 from steppers.systems import growing_rod, rotor, skate, system_of
 
 
