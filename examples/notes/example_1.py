@@ -6,7 +6,7 @@ python examples/notes/example_1.py        writes example_1.png and example_1.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import HarmonicOscillator
+from kcons.models.flows import HarmonicOscillator
 
 omega = 2.0
 flow = HarmonicOscillator(omega)

@@ -9,7 +9,7 @@ python examples/notes/example_2.py        writes example_2.png and example_2.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import DampedOscillator, phase_volume
+from kcons.models.flows import DampedOscillator, phase_volume
 
 t = np.linspace(0, 15, 400)
 fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")

@@ -6,7 +6,7 @@ python examples/notes/example_3.py        writes example_3.png and example_3.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import HamiltonianFlow, Pendulum, hamiltonian, lagrange_residual, momentum
+from kcons.models.flows import HamiltonianFlow, Pendulum, hamiltonian, lagrange_residual, momentum
 
 m, length, g = 1.5, 0.8, 9.81  # kg, m, m/s^2
 omega = np.sqrt(g / length)

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from kcons import projection
-from kcons.flows import ParticleOnSphere
+from kcons.models.flows import ParticleOnSphere
 
 R, m = 1.0, 2.0  # m, kg
 gravity = np.array([0.0, 0.0, -m * 9.81])

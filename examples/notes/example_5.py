@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from kcons.flows import Thermostat
+from kcons.models.flows import Thermostat
 
 masses = np.array([1.0, 1.0, 2.5, 2.5])  # two particles in a plane
 stiffness = np.array([1.0, 2.0, 1.5, 0.7])

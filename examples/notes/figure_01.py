@@ -6,7 +6,7 @@ python examples/notes/figure_01.py        writes figure_01.png and figure_01.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import HarmonicOscillator
+from kcons.models.flows import HarmonicOscillator
 
 oscillator = HarmonicOscillator(omega=1.0)
 

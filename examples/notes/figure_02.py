@@ -6,7 +6,7 @@ python examples/notes/figure_02.py        writes figure_02.png and figure_02.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import DampedOscillator
+from kcons.models.flows import DampedOscillator
 
 oscillator = DampedOscillator(omega=1.0, eta=0.2)
 

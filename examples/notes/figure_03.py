@@ -8,7 +8,7 @@ python examples/notes/figure_03.py        writes figure_03.png and figure_03.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import Pendulum, action
+from kcons.models.flows import Pendulum, action
 
 
 def lagrangian(q, v, t):

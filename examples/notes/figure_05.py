@@ -6,7 +6,7 @@ python examples/notes/figure_05.py        writes figure_05.png and figure_05.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import HarmonicOscillator, Pendulum
+from kcons.models.flows import HarmonicOscillator, Pendulum
 
 linear, pendulum = HarmonicOscillator(1.0), Pendulum(1.0)
 t = np.linspace(0, 20, 600)

@@ -9,7 +9,7 @@ python examples/notes/figure_06.py        writes figure_06.png and figure_06.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import Pendulum, Stability, find_equilibria
+from kcons.models.flows import Pendulum, Stability, find_equilibria
 
 pendulum = Pendulum(1.0)
 fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", width_ratios=[3, 2])

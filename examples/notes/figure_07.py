@@ -6,7 +6,7 @@ python examples/notes/figure_07.py        writes figure_07.png and figure_07.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.growth import ConstrainedGrowth, Logistic, solve
+from kcons.models.growth import ConstrainedGrowth, Logistic, solve
 
 model = Logistic(alpha=1.0, beta=0.1)
 t = np.linspace(0, 10, 200)

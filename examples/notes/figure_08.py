@@ -6,7 +6,7 @@ python examples/notes/figure_08.py        writes figure_08.png and figure_08.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.growth import ConstrainedGrowth, LotkaVolterra, solve
+from kcons.models.growth import ConstrainedGrowth, LotkaVolterra, solve
 
 model = LotkaVolterra(alpha1=1, beta1=1, alpha2=1, beta2=2)
 start = [1.0, 0.5]  # not given in the notes

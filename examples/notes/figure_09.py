@@ -8,8 +8,8 @@ python examples/notes/figure_09.py        writes figure_09.png and figure_09.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.flows import Flow, Stability, find_equilibria
-from kcons.growth import LotkaVolterra
+from kcons.models.flows import Flow, Stability, find_equilibria
+from kcons.models.growth import LotkaVolterra
 
 model = LotkaVolterra(alpha1=1, beta1=1, alpha2=1, beta2=2)
 fig, panels = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")

@@ -17,7 +17,7 @@ python examples/notes/figure_11.py        writes figure_11.png and figure_11.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons.growth import Hypercycle, Populations, solve
+from kcons.models.growth import Hypercycle, Populations, solve
 
 model = Hypercycle(n=5, k_h=3.0)
 x0 = [0.75, 0.0625, 0.0625, 0.0625, 0.0625]

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from kcons import compare
-from kcons.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
+from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
 MEANING = {"a": "fixed total", "b": "entropy produced", "c": "none produced"}

@@ -48,7 +48,7 @@ def _excess(log_x: Array, total: float = 1.0) -> float:
 )
 def near_equilibrium(program: Program, quick: bool) -> Outcome:
     _need("growth")
-    from kcons.growth import Hypercycle, solve
+    from kcons.models.growth import Hypercycle, solve
 
     times = [300.0, 600.0, 900.0]
     found = solve(Hypercycle().with_entropy_production(TAU), (0.0, 900.0), START, t_eval=times)
@@ -62,7 +62,7 @@ def near_equilibrium(program: Program, quick: bool) -> Outcome:
 @case("H34", "Entropy budget 10 % and 50 % too large, 10 % too small", "refused before the start", "raise", hosts=NONE)
 def wrong_budget(program: Program, quick: bool) -> Outcome:
     _need("growth")
-    from kcons.growth import Hypercycle, solve
+    from kcons.models.growth import Hypercycle, solve
 
     def run(factor: float) -> float:
         system = Hypercycle().with_entropy_production(TAU, factor * EXCESS)
@@ -79,7 +79,7 @@ def wrong_budget(program: Program, quick: bool) -> Outcome:
 )
 def near_extinction(program: Program, quick: bool) -> Outcome:
     _need("growth")
-    from kcons.growth import Hypercycle, solve
+    from kcons.models.growth import Hypercycle, solve
 
     known = {
         4.0: [-0.42732377304907165, -2543.817392006705, -2761.201209194897, -2688.0424044343267, -1.0562781665592944],
@@ -106,7 +106,7 @@ def near_extinction(program: Program, quick: bool) -> Outcome:
 )
 def at_equilibrium(program: Program, quick: bool) -> Outcome:
     _need("growth")
-    from kcons.growth import Hypercycle, solve
+    from kcons.models.growth import Hypercycle, solve
 
     x_eq = _equilibrium()
     found = solve(Hypercycle().with_entropy_production(TAU), (0.0, 10.0), x_eq)
@@ -116,7 +116,7 @@ def at_equilibrium(program: Program, quick: bool) -> Outcome:
 @case("H37", "Populations that sum to 2", "x at t = 10 as found with 45 digits, to 1e-7", hosts=NONE)
 def sum_of_two(program: Program, quick: bool) -> Outcome:
     _need("growth")
-    from kcons.growth import Hypercycle, solve
+    from kcons.models.growth import Hypercycle, solve
 
     known = np.array(
         [0.23903300228620136, 0.3961302107295643, 0.6148242353159383, 0.4702890991184972, 0.2797234525497988]
@@ -129,7 +129,7 @@ def sum_of_two(program: Program, quick: bool) -> Outcome:
 @case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", hosts=NONE)
 def defective(program: Program, quick: bool) -> Outcome:
     _need("flows")
-    from kcons.flows import LinearFlow
+    from kcons.models.flows import LinearFlow
 
     w, start = 2.0, np.array([1.0, 0.5])
     checks: list[tuple[str, float, float]] = []

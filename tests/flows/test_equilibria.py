@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.flows import Flow, Kind, Pendulum, Stability, equilibrium_at, find_equilibria
-from kcons.growth import Hypercycle, Logistic, LotkaVolterra
+from kcons.models.flows import Flow, Kind, Pendulum, Stability, equilibrium_at, find_equilibria
+from kcons.models.growth import Hypercycle, Logistic, LotkaVolterra
 
 
 def test_pendulum_alternates_between_stable_and_unstable():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.flows import (
+from kcons.models.flows import (
     DampedOscillator,
     Flow,
     ParticleOnSphere,
@@ -16,7 +16,7 @@ from kcons.flows import (
     momentum,
     phase_volume,
 )
-from kcons.growth import LotkaVolterra
+from kcons.models.growth import LotkaVolterra
 
 
 def lorenz(t, X):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import ConvergenceError, InputError
-from kcons.flows import DampedOscillator, Flow, HamiltonianFlow, Pendulum, hamiltonian, phase_volume
+from kcons.models.flows import DampedOscillator, Flow, HamiltonianFlow, Pendulum, hamiltonian, phase_volume
 
 J = np.array([[0.0, 1.0], [-1.0, 0.0]])
 

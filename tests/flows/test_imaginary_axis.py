@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 
 from flows.exact_counts import in_skew_basis, left_axis_right
-from kcons.flows.imaginary_axis import LARGEST, OnAxis, on_axis
+from kcons.models.flows.imaginary_axis import LARGEST, OnAxis, on_axis
 
 R = np.array([[0.0, 1.0], [-1.0, 0.0]])
 RESONANT = np.block([[R, np.eye(2)], [np.zeros((2, 2)), R]])

@@ -5,7 +5,7 @@ import pytest
 
 from flows.reference_cases import case
 from kcons.errors import InputError
-from kcons.flows import Thermostat
+from kcons.models.flows import Thermostat
 
 
 def quartic(x):

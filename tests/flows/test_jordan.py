@@ -6,7 +6,7 @@ import scipy.linalg
 
 from flows.exact_counts import in_skew_basis
 from kcons.errors import InputError
-from kcons.flows import LinearFlow, jordan_block, jordan_blocks, jordan_form
+from kcons.models.flows import LinearFlow, jordan_block, jordan_blocks, jordan_form
 
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.3, -0.5, 1.0]])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flows.reference_cases import case
-from kcons.flows import Kind, LinearFlow, Stability, jordan_block, jordan_block_propagator
+from kcons.models.flows import Kind, LinearFlow, Stability, jordan_block, jordan_block_propagator
 
 CASES = ["A12_linear_generic", "A12_linear_jordan3", "A12_linear_nilpotent", "A12_linear_stiff"]
 

@@ -8,7 +8,15 @@ import pytest
 from flows.reference_cases import case
 from kcons import projection
 from kcons.errors import InputError
-from kcons.flows import DampedOscillator, HarmonicOscillator, Kind, ParticleOnSphere, Pendulum, Stability, jordan_form
+from kcons.models.flows import (
+    DampedOscillator,
+    HarmonicOscillator,
+    Kind,
+    ParticleOnSphere,
+    Pendulum,
+    Stability,
+    jordan_form,
+)
 
 REGIMES = case("A12_damped_oscillator")["regimes"]
 

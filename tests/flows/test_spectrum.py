@@ -5,7 +5,7 @@ import pytest
 
 from flows.exact_counts import in_skew_basis, unimodular
 from kcons.errors import InputError
-from kcons.flows.spectrum import spectrum
+from kcons.models.flows.spectrum import spectrum
 
 
 def off(found, known):

@@ -6,7 +6,7 @@ import scipy.linalg
 
 from flows.exact_counts import in_skew_basis, left_axis_right
 from kcons.errors import InputError
-from kcons.flows import Flow, HamiltonianFlow, Kind, Pendulum, Stability, classify, equilibrium_at, jordan_block
+from kcons.models.flows import Flow, HamiltonianFlow, Kind, Pendulum, Stability, classify, equilibrium_at, jordan_block
 
 R = np.array([[0.0, 1.0], [-1.0, 0.0]])
 

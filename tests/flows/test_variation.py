@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import ConvergenceError
-from kcons.flows import Pendulum, action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
+from kcons.models.flows import Pendulum, action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
 
 M, LENGTH, G = 1.3, 0.8, 9.81
 

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from kcons.growth import ConstrainedHypercycle, Hypercycle
+from kcons.models.growth import ConstrainedHypercycle, Hypercycle
 
 DATA = Path(__file__).parent / "data"
 

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from kcons.growth.compensated_sums import compensated_sum, two_sum
+from kcons.models.growth.compensated_sums import compensated_sum, two_sum
 
 
 def test_two_sum_is_exact():

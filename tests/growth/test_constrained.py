@@ -5,7 +5,7 @@ import pytest
 
 from kcons import projection
 from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError
-from kcons.growth import (
+from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
     HolonomicRow,

@@ -5,7 +5,15 @@ import pytest
 
 from growth.exact_mixture import exact_energies
 from kcons.errors import BudgetError, ConstraintError, InputError
-from kcons.growth import ConstrainedGrowth, GrowthModel, Hypercycle, Populations, TotalPopulation, solve, solve_ensemble
+from kcons.models.growth import (
+    ConstrainedGrowth,
+    GrowthModel,
+    Hypercycle,
+    Populations,
+    TotalPopulation,
+    solve,
+    solve_ensemble,
+)
 
 TIMES = [0.0, 1.0, 6.0]
 

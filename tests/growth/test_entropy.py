@@ -5,7 +5,15 @@ import pytest
 from scipy.integrate import simpson
 
 from kcons.errors import BudgetError, InputError
-from kcons.growth import Hypercycle, NoProduction, Populations, PrescribedProduction, Relaxation, entropy_balance, solve
+from kcons.models.growth import (
+    Hypercycle,
+    NoProduction,
+    Populations,
+    PrescribedProduction,
+    Relaxation,
+    entropy_balance,
+    solve,
+)
 
 X0 = np.array([0.6, 0.1, 0.1, 0.1, 0.1])
 BUDGET = 0.3344071481541323

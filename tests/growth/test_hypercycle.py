@@ -5,7 +5,7 @@ import pytest
 
 from growth.reference_cases import case, system
 from kcons.errors import BudgetError, InputError
-from kcons.growth import Hypercycle, Populations, solve, solve_ensemble
+from kcons.models.growth import Hypercycle, Populations, solve, solve_ensemble
 
 STARTS = ("IC1", "IC2", "IC3sum2")
 CASES = [f"A11_hypercycle_{start}_{letter}" for start in STARTS for letter in "abc"]

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
-from kcons.growth import (
+from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
     Hypercycle,

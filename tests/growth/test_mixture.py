@@ -9,8 +9,8 @@ from scipy.special import rel_entr
 from growth.exact_mixture import exact_energies
 from growth.reference_cases import case
 from kcons.errors import InputError
-from kcons.growth import Mixture, Populations
-from kcons.growth.mixture import entropy_function
+from kcons.models.growth import Mixture, Populations
+from kcons.models.growth.mixture import entropy_function
 
 MU0 = np.array([0.15, 0.2, 0.25, 0.3, 0.35])
 CASES = ["A11_hypercycle_IC1_b", "A11_hypercycle_IC2_b", "A11_hypercycle_IC3sum2_b"]

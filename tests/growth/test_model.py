@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError, NonFiniteError
-from kcons.growth import ConstrainedGrowth, GrowthModel, Populations, solve
+from kcons.models.growth import ConstrainedGrowth, GrowthModel, Populations, solve
 
 
 def test_drift_is_the_equation_of_the_notes():

@@ -5,7 +5,7 @@ import pytest
 
 from growth.reference_cases import case
 from kcons.errors import InputError
-from kcons.growth import ConstrainedGrowth, HolonomicRow, Logistic, LotkaVolterra, solve
+from kcons.models.growth import ConstrainedGrowth, HolonomicRow, Logistic, LotkaVolterra, solve
 
 
 def test_logistic_reference():

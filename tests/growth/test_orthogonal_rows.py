@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import ContradictionError
-from kcons.growth import ConstrainedGrowth, GrowthModel, TotalPopulation, VelocityRow, orthogonal_rows
+from kcons.models.growth import ConstrainedGrowth, GrowthModel, TotalPopulation, VelocityRow, orthogonal_rows
 
 
 def exact(x, rows, right, drift):

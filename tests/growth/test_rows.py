@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import ConstraintError, InputError
-from kcons.growth import (
+from kcons.models.growth import (
     ConstrainedGrowth,
     GrowthModel,
     HolonomicRow,
@@ -14,7 +14,7 @@ from kcons.growth import (
     VelocityRow,
     solve,
 )
-from kcons.growth.rows import relative_differences
+from kcons.models.growth.rows import relative_differences
 
 P = Populations.from_values(0.3, [0.5, 1.5, 2.5])
 MANY = Populations.from_values(np.array([0.3, 0.7]), [[0.5, 1.0], [1.5, 2.0], [2.5, 0.2]])

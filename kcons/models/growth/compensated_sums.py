@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from kcons.growth.model import FloatArray
+from kcons.models.growth.model import FloatArray
 
 
 def two_sum(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -26,11 +26,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
-from kcons.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
-from kcons.growth.mixture import Mixture
-from kcons.growth.model import FloatArray, GrowthModel, Populations
-from kcons.growth.rows import Row, TotalPopulation
+from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
+from kcons.models.growth.entropy import EntropyLaw, EntropyRow, NoProduction, Relaxation
+from kcons.models.growth.mixture import Mixture
+from kcons.models.growth.model import FloatArray, GrowthModel, Populations
+from kcons.models.growth.rows import Row, TotalPopulation
 
 #: Largest turning time of the direction, in parts of the other times, at which motion may count as settled.
 SLOWNESS = 0.3

@@ -10,10 +10,10 @@ from scipy.special import ellipj, ellipkinc
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError
-from kcons.flows.flow import FloatArray, Flow
-from kcons.flows.hamiltonian import HamiltonianFlow
-from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_block
-from kcons.flows.linear import LinearFlow
+from kcons.models.flows.flow import FloatArray, Flow
+from kcons.models.flows.hamiltonian import HamiltonianFlow
+from kcons.models.flows.jordan import JordanBlocks, JordanForm, jordan_block
+from kcons.models.flows.linear import LinearFlow
 
 
 class DampedOscillator(LinearFlow):

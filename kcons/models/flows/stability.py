@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.flows.flow import FloatArray
-from kcons.flows.imaginary_axis import on_axis
-from kcons.flows.jordan import clusters, jordan_blocks
-from kcons.flows.spectrum import ComplexArray, spectrum, square_matrix
+from kcons.models.flows.flow import FloatArray
+from kcons.models.flows.imaginary_axis import on_axis
+from kcons.models.flows.jordan import clusters, jordan_blocks
+from kcons.models.flows.spectrum import ComplexArray, spectrum, square_matrix
 
 
 class Kind(Enum):

@@ -1,6 +1,6 @@
 """Many trajectories of one model at once, each with time steps of its own.
 
-The same scheme as `kcons.growth.integration`: logarithms, the Runge-Kutta method of order 8 of Dormand and Prince, a
+The same scheme as `kcons.models.growth.integration`: logarithms, the Runge-Kutta method of order 8 of Dormand and Prince, a
 projection on the holonomic rows after each step. All trajectories of a batch take a step together, as columns of
 arrays; each accepts or rejects it for itself, and those that have arrived leave the batch.
 """
@@ -16,9 +16,9 @@ from scipy.integrate import DOP853
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.growth.compensated_sums import two_sum
-from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
-from kcons.growth.model import FloatArray, Populations, positive_populations
+from kcons.models.growth.compensated_sums import two_sum
+from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
+from kcons.models.growth.model import FloatArray, Populations, positive_populations
 
 #: Trajectories that take their steps together.
 BATCH = 2048

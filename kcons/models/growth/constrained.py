@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons import projection
 from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError, SingularGeometryError
-from kcons.growth import orthogonal_rows
-from kcons.growth.model import FloatArray, GrowthModel, Populations
-from kcons.growth.rows import EPSILON, Row
+from kcons.models.growth import orthogonal_rows
+from kcons.models.growth.model import FloatArray, GrowthModel, Populations
+from kcons.models.growth.rows import EPSILON, Row
 
 #: Newton iterations of a projection at most.
 MOST_ITERATIONS = 25
@@ -54,7 +54,7 @@ class ConstrainedGrowth:
 
     Examples
     --------
-    >>> from kcons.growth import ConstrainedGrowth, GrowthModel, TotalPopulation
+    >>> from kcons.models.growth import ConstrainedGrowth, GrowthModel, TotalPopulation
     >>> model = GrowthModel(lambda t, x: [1.0, 2.0], n=2)
     >>> system = ConstrainedGrowth(model, [TotalPopulation(2)])
     >>> system.velocity(0.0, [0.5, 0.5]).tolist()

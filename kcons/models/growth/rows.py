@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import ConstraintError, InputError
-from kcons.growth.model import FloatArray, OfState, Populations, evaluate
+from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10

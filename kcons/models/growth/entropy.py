@@ -19,13 +19,13 @@ from scipy.integrate import quad
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import BudgetError, InputError
-from kcons.growth.compensated_sums import compensated_sum
-from kcons.growth.mixture import Mixture
-from kcons.growth.model import FloatArray, Populations
-from kcons.growth.rows import EPSILON, Row
+from kcons.models.growth.compensated_sums import compensated_sum
+from kcons.models.growth.mixture import Mixture
+from kcons.models.growth.model import FloatArray, Populations
+from kcons.models.growth.rows import EPSILON, Row
 
 if TYPE_CHECKING:
-    from kcons.growth.integration import GrowthSolution
+    from kcons.models.growth.integration import GrowthSolution
 
 #: A budget is consistent with the start where it differs by no more than this part.
 BUDGET_TOLERANCE = 1e-9

@@ -19,8 +19,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.flows.flow import FloatArray
-from kcons.flows.spectrum import EPSILON, ComplexArray, Spectrum, spectrum
+from kcons.models.flows.flow import FloatArray
+from kcons.models.flows.spectrum import EPSILON, ComplexArray, Spectrum, spectrum
 
 #: Singular values below this many times the noise of a block count as zero.
 NULL = 100.0

@@ -13,7 +13,7 @@ from scipy.optimize import root
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import ConvergenceError
-from kcons.flows.flow import FloatArray, jacobian_by_differences
+from kcons.models.flows.flow import FloatArray, jacobian_by_differences
 
 Lagrangian = Callable[[FloatArray, FloatArray, float], float]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.errors import ConvergenceError, InputError
-from kcons.flows.flow import FloatArray, Flow, jacobian_by_differences
+from kcons.models.flows.flow import FloatArray, Flow, jacobian_by_differences
 
 #: (q, p) -> float, or (q, p, t) -> float where H depends on time.
 Energy = Callable[..., float]

@@ -7,10 +7,10 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers
-from kcons.flows.flow import FloatArray, Flow
-from kcons.flows.jordan import JordanBlocks, JordanForm, jordan_form
-from kcons.flows.spectrum import square_matrix
-from kcons.flows.stability import Classification, classify
+from kcons.models.flows.flow import FloatArray, Flow
+from kcons.models.flows.jordan import JordanBlocks, JordanForm, jordan_form
+from kcons.models.flows.spectrum import square_matrix
+from kcons.models.flows.stability import Classification, classify
 
 
 class LinearFlow(Flow):

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.growth.model import FloatArray, GrowthModel
+from kcons.models.growth.model import FloatArray, GrowthModel
 
 
 class Logistic(GrowthModel):

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError
-from kcons.flows.flow import FloatArray, Flow, phase_volume
+from kcons.models.flows.flow import FloatArray, Flow, phase_volume
 
 
 class Compression(NamedTuple):

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.growth.compensated_sums import compensated_sum, two_sum
-from kcons.growth.model import FloatArray, Populations
+from kcons.models.growth.compensated_sums import compensated_sum, two_sum
+from kcons.models.growth.model import FloatArray, Populations
 
 #: Below this |ln x/x_eq| the excess of a species is summed as a power series.
 NEAR = 0.2

@@ -10,8 +10,8 @@ from scipy.optimize import root
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.flows.flow import FloatArray, Flow
-from kcons.flows.stability import Classification, classify
+from kcons.models.flows.flow import FloatArray, Flow
+from kcons.models.flows.stability import Classification, classify
 
 #: Equilibria closer than this, in parts of the size of the box, are one.
 SAME = 1e-6

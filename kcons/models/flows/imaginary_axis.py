@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.flows.flow import FloatArray
+from kcons.models.flows.flow import FloatArray
 
 #: Variables up to which the polynomials are worth their time.
 LARGEST = 24

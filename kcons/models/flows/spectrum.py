@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
-from kcons.flows.flow import FloatArray
+from kcons.models.flows.flow import FloatArray
 
 EPSILON = float(np.finfo(np.float64).eps)
 

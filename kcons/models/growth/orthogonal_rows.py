@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kcons.growth.model import FloatArray
+from kcons.models.growth.model import FloatArray
 
 #: A row counts as dependent on those before it where less than this part of its length is its own.
 RANK_TOLERANCE = 1e-12

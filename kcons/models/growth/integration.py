@@ -18,8 +18,8 @@ from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
-from kcons.growth.constrained import ACCEPTED, ConstrainedGrowth
-from kcons.growth.model import FloatArray, Populations, positive_populations
+from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
+from kcons.models.growth.model import FloatArray, Populations, positive_populations
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 Event = Callable[[float, FloatArray], float]

@@ -1,10 +1,10 @@
 """Dynamical systems as flows (notes sections 1 to 3)."""
 
-from kcons.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
-from kcons.flows.flow import Flow, PhaseVolume, jacobian_by_differences, phase_volume
-from kcons.flows.hamiltonian import HamiltonianFlow, SymplecticTrajectory
-from kcons.flows.isokinetic import Compression, Thermostat
-from kcons.flows.jordan import (
+from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
+from kcons.models.flows.flow import Flow, PhaseVolume, jacobian_by_differences, phase_volume
+from kcons.models.flows.hamiltonian import HamiltonianFlow, SymplecticTrajectory
+from kcons.models.flows.isokinetic import Compression, Thermostat
+from kcons.models.flows.jordan import (
     JordanBlocks,
     JordanForm,
     jordan_block,
@@ -12,10 +12,10 @@ from kcons.flows.jordan import (
     jordan_blocks,
     jordan_form,
 )
-from kcons.flows.linear import LinearFlow
-from kcons.flows.models import DampedOscillator, HarmonicOscillator, ParticleOnSphere, Pendulum
-from kcons.flows.stability import Classification, Kind, Stability, classify
-from kcons.flows.variation import action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
+from kcons.models.flows.linear import LinearFlow
+from kcons.models.flows.models import DampedOscillator, HarmonicOscillator, ParticleOnSphere, Pendulum
+from kcons.models.flows.stability import Classification, Kind, Stability, classify
+from kcons.models.flows.variation import action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
 
 __all__ = [
     "Classification",

@@ -1,0 +1,36 @@
+"""Populations that grow under constraints (notes sections 3 and 4.3)."""
+
+from kcons.models.growth.constrained import ConstrainedGrowth
+from kcons.models.growth.ensemble import EnsembleSolution, solve_ensemble
+from kcons.models.growth.entropy import EntropyRow, NoProduction, PrescribedProduction, Relaxation, entropy_balance
+from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
+from kcons.models.growth.integration import GrowthSolution, solve
+from kcons.models.growth.mixture import Mixture
+from kcons.models.growth.model import GrowthModel, Populations
+from kcons.models.growth.models import Logistic, LotkaVolterra
+from kcons.models.growth.rows import HolonomicRow, LinearRow, Row, TotalPopulation, VelocityRow
+
+__all__ = [
+    "ConstrainedGrowth",
+    "ConstrainedHypercycle",
+    "EnsembleSolution",
+    "EntropyRow",
+    "GrowthModel",
+    "GrowthSolution",
+    "HolonomicRow",
+    "Hypercycle",
+    "LinearRow",
+    "Logistic",
+    "LotkaVolterra",
+    "Mixture",
+    "NoProduction",
+    "Populations",
+    "PrescribedProduction",
+    "Relaxation",
+    "Row",
+    "TotalPopulation",
+    "VelocityRow",
+    "entropy_balance",
+    "solve",
+    "solve_ensemble",
+]
