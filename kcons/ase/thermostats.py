@@ -19,7 +19,7 @@ from kcons.errors import InputError
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import Momentum, open_directions, positive
-from kcons.thermostats.isokinetic import Convention
+from kcons.thermostats.isokinetic.isokinetic import Convention
 
 
 class ThermostattedDynamics(ConstrainedDynamics):

@@ -40,7 +40,7 @@ class Isokinetic(Value):
 
     Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
     with a mass, less the rank of all constraints, less three where total momentum is conserved. A kick at fixed
-    positions has the closed form of `kcons.thermostats.kick` with F = M_par^+ f.
+    positions has the closed form of `kcons.thermostats.isokinetic.kick` with F = M_par^+ f.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class Isokinetic(Value):
     def kick(
         self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
     ) -> None:
-        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.kick`.
+        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
         """

@@ -16,7 +16,7 @@ from kcons.steppers import (
     Yoshida4,
 )
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.isokinetic import SCHEMES as ISOKINETIC
+from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
 
 
 def _any_flows(order: int) -> Splitting:

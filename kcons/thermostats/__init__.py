@@ -1,11 +1,16 @@
 """Thermostats on constraints. Each is a stepper: a pure function from one state to the next."""
 
-from kcons.thermostats.configurational import Estimate, configurational_sample, configurational_temperature, mean
+from kcons.thermostats.configurational_temperature import (
+    Estimate,
+    configurational_sample,
+    configurational_temperature,
+    mean,
+)
 from kcons.thermostats.freedom import Freedom, freedom
-from kcons.thermostats.isokinetic import Isokinetic
+from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
-from kcons.thermostats.velocities import thermal_velocities
+from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
     "Estimate",

@@ -13,7 +13,7 @@ from kcons.errors import ConvergenceError, NonFiniteError
 from kcons.motion import Motion
 from kcons.steppers import State, System
 from kcons.thermostats import Isokinetic
-from kcons.thermostats.isokinetic_stages import DONE, ENGINE, FORCE, KICK, POSITION, IsokineticStages
+from kcons.thermostats.isokinetic.fused_step import DONE, ENGINE, FORCE, KICK, POSITION, IsokineticStages
 from thermostats.systems import ROWS, distance, molecules, springs, thermostats
 
 ORDERS = pytest.mark.parametrize("order", [2, 4, 6])

@@ -10,7 +10,7 @@ import pytest
 from kcons.errors import NonFiniteError
 from kcons.steppers import run
 from kcons.thermostats import Isokinetic
-from kcons.thermostats.isokinetic_stages import ENGINE, KICK
+from kcons.thermostats.isokinetic.fused_step import ENGINE, KICK
 from thermostats.systems import ROWS, distance, molecules, springs, thermostats
 
 ORDERS = pytest.mark.parametrize("order", [2, 4, 6])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kcons.thermostats import kick
+from kcons.thermostats.isokinetic import kick
 
 RNG = np.random.default_rng(5)
 MASSES = np.repeat(RNG.uniform(0.5, 3.0, (4, 1)), 3, axis=1)

@@ -17,7 +17,7 @@ from kcons.solvers.kernels.array_views import piece
 from kcons.steppers import System
 from kcons.steppers.compensated_steps import all_finite
 from kcons.steppers.fused_stages import packed_rows
-from kcons.thermostats.kick import after_drift, before_drift
+from kcons.thermostats.isokinetic.kick import after_drift, before_drift
 
 #: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
 MANY = 1e4

@@ -18,7 +18,6 @@ from kcons.errors import ConvergenceError, InputError, OverdeterminedError, Unsu
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.stepper import explained, stays
-from kcons.thermostats import kick as closed_form
 from kcons.thermostats.freedom import (
     Freedom,
     Momentum,
@@ -28,7 +27,8 @@ from kcons.thermostats.freedom import (
     refuse_friction,
     warn_of_conserved_momenta,
 )
-from kcons.thermostats.isokinetic_step import SMALLEST, IsokineticStep, Share, compiled_step, left_for, split
+from kcons.thermostats.isokinetic import kick as closed_form
+from kcons.thermostats.isokinetic.step import SMALLEST, IsokineticStep, Share, compiled_step, left_for, split
 
 Convention = Literal["exact", "notes"]
 

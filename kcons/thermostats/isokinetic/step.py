@@ -15,9 +15,9 @@ from kcons.steppers import State, System
 from kcons.steppers.compensated_steps import Point
 from kcons.steppers.splitting import Stage
 from kcons.steppers.state import check_finite
-from kcons.thermostats import kick as closed_form
 from kcons.thermostats.freedom import atom_numbers
-from kcons.thermostats.isokinetic_stages import (
+from kcons.thermostats.isokinetic import kick as closed_form
+from kcons.thermostats.isokinetic.fused_step import (
     DONE,
     ENGINE,
     FORCE,

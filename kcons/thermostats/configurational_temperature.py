@@ -20,8 +20,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
 from kcons.steppers.compensated_steps import Point
-from kcons.thermostats.isokinetic_step import paced
-from kcons.thermostats.velocities import thermal_velocities
+from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.thermal_velocities import thermal_velocities
 
 #: Fewest blocks that errors are taken from.
 BLOCKS = 16
