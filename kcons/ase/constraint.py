@@ -13,7 +13,7 @@ from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
-from kcons.ase.host import Watch, require_on_surface
+from kcons.ase.respect import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraints import Constraint
