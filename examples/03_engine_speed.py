@@ -252,7 +252,7 @@ def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance
     import openmm
     from openmm import unit
 
-    from kcons.openmm.guard import positions_of, velocities_of
+    from kcons.openmm.integrator.guard import positions_of, velocities_of
 
     table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     pairs = [(i, j) for i, j, _ in table]

@@ -26,7 +26,7 @@ from rich.console import Console
 
 from kcons import compare, measuring
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.schemes import SCHEMES
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 TOLERANCE = 1e-10

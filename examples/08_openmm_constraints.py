@@ -36,10 +36,10 @@ from kcons.errors import KconsError
 from kcons.hard_cases.rings import ring
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carrier import CarriedConstraints
-from kcons.openmm.guard import positions_of, velocities_of
-from kcons.openmm.requirements import masses_of
-from kcons.openmm.transfer import hold, take_constraints
+from kcons.openmm.carried.carried_constraints import CarriedConstraints
+from kcons.openmm.carried.hold import hold, take_constraints
+from kcons.openmm.carried.requirements import masses_of
+from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.scenes.openmm_host import system_of
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

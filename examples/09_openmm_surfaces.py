@@ -28,7 +28,7 @@ from rich.table import Table
 from kcons import compare
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm import ExpressionSurface, SurfaceIntegrator
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.schemes import SCHEMES
 
 CUTOFFS = (0.85, 1.0, 1.2)  # nm; 2.5 sigma, OpenMM's default, 3.5 sigma
 SPHERE = "sqrt((x-a)^2+(y-b)^2+(z-c)^2)-0.5"

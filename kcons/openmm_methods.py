@@ -291,7 +291,7 @@ class Projected(OpenMMMethod):
 
     @property
     def _evaluations(self) -> int:
-        from kcons.openmm.schemes import to_scheme
+        from kcons.openmm.integrator.schemes import to_scheme
 
         scheme = to_scheme(self.scheme)
         return 1 if scheme is None else scheme.force_evaluations
@@ -344,7 +344,7 @@ class Held(Projected):
 
     def start(self, scene: Scene, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator, hold
-        from kcons.openmm.transfer import take_constraints
+        from kcons.openmm.carried.hold import take_constraints
 
         host, system = _host(scene), _host(scene).copy()
         only_water = not host.surfaces and not take_constraints(host.copy())

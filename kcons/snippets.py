@@ -175,7 +175,7 @@ def _scipy(rtol: float) -> list[str]:
 
 def _only_water(scene: Scene) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.transfer import take_constraints
+    from kcons.openmm.carried.hold import take_constraints
 
     assert scene.openmm is not None
     return not scene.openmm.surfaces and not take_constraints(scene.openmm.copy())

@@ -4,17 +4,17 @@ Swap the integrator of a Simulation, and what the System constrains is held to o
 collective variables, surfaces and the constraint objects of kcons.
 """
 
-from kcons.openmm.carrier import CarriedConstraints
-from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.compiled import RattleIntegrator
-from kcons.openmm.implicit_rows import ExpressionSurface
-from kcons.openmm.isokinetic import Isokinetic
-from kcons.openmm.langevin import Langevin
-from kcons.openmm.projected import ProjectedIntegrator
-from kcons.openmm.row_forces import Row, each_term
-from kcons.openmm.surface import SurfaceIntegrator, surface_parts
+from kcons.openmm.carried.carried_constraints import CarriedConstraints
+from kcons.openmm.carried.hold import hold, take_constraints
+from kcons.openmm.collective.collective_rows import CollectiveRows
+from kcons.openmm.collective.row_forces import Row, each_term
+from kcons.openmm.ensembles.isokinetic import Isokinetic
+from kcons.openmm.ensembles.langevin import Langevin
+from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.rattle import RattleIntegrator
+from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 from kcons.openmm.topology import constraints_of
-from kcons.openmm.transfer import hold, take_constraints
 
 __all__ = [
     "CarriedConstraints",

@@ -280,7 +280,7 @@ def _scene(
 ) -> Scene:
     from openmm import app
 
-    from kcons.openmm.system_checks import SystemRows
+    from kcons.openmm.integrator.system_checks import SystemRows
 
     if constrain not in CONSTRAIN:
         raise InputError(f"cannot constrain {constrain!r}; there are {', '.join(CONSTRAIN)}", item="constrain")

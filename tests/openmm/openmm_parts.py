@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.errors import ConvergenceError, InputError
-from kcons.openmm.guard import positions_of, velocities_of
-from kcons.openmm.part import Miss
+from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.part import Miss
 
 
 class HeldCoordinates:

@@ -11,7 +11,7 @@ import openmm
 from openmm import app, unit
 from openmm_parts import HeldCoordinates
 
-from kcons.openmm.guard import positions_of, velocities_of
+from kcons.openmm.integrator.guard import positions_of, velocities_of
 
 DATA = Path(__file__).resolve().parent.parent / "data"
 #: What every test that is parametrised by platform runs on: they carry exact doubles and are on every machine.

@@ -26,7 +26,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.steppers import State
 from kcons.steppers import System as CoreSystem
 

@@ -11,7 +11,7 @@ from openmm import app, unit
 from kcons.constraints import Distance, FixedAtoms, Sphere
 from kcons.errors import ConvergenceError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.transfer import hold
+from kcons.openmm.carried.hold import hold
 from kcons.steppers import BlanesMoan6, Rattle, System, run
 
 # -- exactness ------------------------------------------------------------------------------------

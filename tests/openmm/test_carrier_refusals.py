@@ -13,9 +13,9 @@ from carried_systems import context_of, free, peptide, state_of
 from kcons.constraints import Custom, Distance
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carrier import CarriedConstraints
-from kcons.openmm.requirements import refuse_single_precision
-from kcons.openmm.transfer import hold
+from kcons.openmm.carried.carried_constraints import CarriedConstraints
+from kcons.openmm.carried.hold import hold
+from kcons.openmm.carried.requirements import refuse_single_precision
 
 # -- failure --------------------------------------------------------------------------------------
 

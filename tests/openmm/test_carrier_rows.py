@@ -25,7 +25,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.transfer import hold
+from kcons.openmm.carried.hold import hold
 from kcons.steppers import System
 
 # -- kinds of rows --------------------------------------------------------------------------------

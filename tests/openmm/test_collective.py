@@ -35,7 +35,7 @@ from kcons.errors import ConstraintError, ConvergenceError, InputError, Singular
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.row_forces import Row, each_term
+from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.steppers import Rattle, System, run
 
 # -- held to rounding -----------------------------------------------------------------------------------

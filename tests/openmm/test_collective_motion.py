@@ -26,7 +26,7 @@ from openmm_systems import PLATFORMS
 from kcons.errors import ConstraintError, ConvergenceError, InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.row_forces import Row
+from kcons.openmm.collective.row_forces import Row
 
 # -- multipliers ----------------------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator, RattleIntegrator
-from kcons.openmm.guard import Guard
+from kcons.openmm.integrator.guard import Guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 

@@ -19,7 +19,8 @@ from openmm_systems import (
 )
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, RattleIntegrator, guard
+from kcons.openmm import ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.integrator import guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 kinds = pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])

@@ -13,7 +13,7 @@ from test_collective import bond
 from kcons.constraints import KnifeEdge, Plane
 from kcons.errors import ConvergenceError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
-from kcons.openmm.transfer import hold
+from kcons.openmm.carried.hold import hold
 
 KINDS = [
     "part",

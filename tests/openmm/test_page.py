@@ -8,7 +8,7 @@ import statistics
 from pathlib import Path
 
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.schemes import SCHEMES
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "openmm.md").read_text(encoding="utf-8")

@@ -6,8 +6,8 @@ import openmm
 from openmm_systems import context_of, holding, state_of
 
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.program import Program
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import SCHEMES
 
 
 def test_computations_and_listing_go_together():

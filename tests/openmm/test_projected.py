@@ -26,8 +26,8 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.copies import program_of
-from kcons.openmm.system_checks import refuse_barostat
+from kcons.openmm.integrator.copies import program_of
+from kcons.openmm.integrator.system_checks import refuse_barostat
 from kcons.steppers import Geodesic
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)

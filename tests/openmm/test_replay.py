@@ -11,7 +11,7 @@ import pytest
 from openmm_systems import PLATFORMS, context_of, state_of, total_energy
 
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.schemes import SCHEMES
+from kcons.openmm.integrator.schemes import SCHEMES
 
 ALL = [*SCHEMES, "leapfrog"]
 #: Orders beyond 2 cost several force evaluations: fewer steps show as much.

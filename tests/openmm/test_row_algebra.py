@@ -6,8 +6,8 @@ import numpy as np
 import openmm
 import pytest
 
-from kcons.openmm.program import Program
-from kcons.openmm.row_algebra import Block, blocks
+from kcons.openmm.collective.small_algebra import Block, blocks
+from kcons.openmm.integrator.program import Program
 
 _KEPT = []
 

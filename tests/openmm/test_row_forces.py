@@ -12,7 +12,7 @@ from openmm import unit
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.collective import CollectiveRows
-from kcons.openmm.row_forces import (
+from kcons.openmm.collective.row_forces import (
     Rigid,
     Row,
     atoms_of,

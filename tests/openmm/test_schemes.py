@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.openmm.schemes import SCHEMES, stages_of, to_scheme
+from kcons.openmm.integrator.schemes import SCHEMES, stages_of, to_scheme
 from kcons.steppers import Rattle
 
 

@@ -13,11 +13,11 @@ from test_collective import bond
 
 from kcons.constraints import Distance, Plane, Sphere
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, SurfaceIntegrator
-from kcons.openmm.callbacks import Engine
-from kcons.openmm.program import Program
-from kcons.openmm.schemes import SCHEMES
-from kcons.openmm.step_counts import count_step
-from kcons.openmm.transfer import hold
+from kcons.openmm.carried.callbacks import Engine
+from kcons.openmm.carried.hold import hold
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.integrator.step_counts import count_step
 
 
 class Spring:

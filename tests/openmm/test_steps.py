@@ -23,7 +23,7 @@ from openmm_systems import (
 
 from kcons.errors import ConvergenceError, InputError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.ensemble import ConstantEnergy
+from kcons.openmm.integrator.ensemble import ConstantEnergy
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 PS = unit.picosecond

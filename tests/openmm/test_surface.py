@@ -29,8 +29,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.implicit_rows import ExpressionSurface
-from kcons.openmm.surface import SurfaceIntegrator, surface_parts
+from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 
 # -- what is refused --------------------------------------------------------------------------------
 

@@ -24,9 +24,9 @@ from surface_cases import (
 )
 
 from kcons.constraints import Ellipsoid, Plane, Sphere, Torus
-from kcons.openmm.implicit_rows import ExpressionSurface
-from kcons.openmm.schemes import SCHEMES
-from kcons.openmm.surface import SurfaceIntegrator
+from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.surfaces.formulas import ExpressionSurface
+from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
 
 #: Order, and numbers of steps in TIME where the leading error rules and rounding does not.
 ORDERS = {

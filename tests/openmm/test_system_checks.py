@@ -18,8 +18,8 @@ from openmm_systems import (
 
 from kcons.errors import UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.schemes import SCHEMES
-from kcons.openmm.system_checks import SystemRows, refuse_motion_remover
+from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
 

@@ -1,0 +1,7 @@
+"""Constraints of the core carried into OpenMM by callbacks on the CPU.
+
+- `requirements`: what a Context must offer
+- `callbacks`: the functions that OpenMM calls
+- `carried_constraints`: the part of an integrator that holds them
+- `hold`: constraints taken out of a System and carried
+"""

@@ -1,0 +1,359 @@
+"""The constraint objects of kcons in OpenMM: PythonForces that carry positions to the engine and corrections back.
+
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
+them, each in a force group of its own, serve one set of rows:
+
+* `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
+  last drift has ended there for sure.
+* `land`: positions after free flight. Its 'force' is the change that brings them onto the rows, x = x + f.
+* `project`: positions x + v/1024 ps. Its 'force' is the change of v that makes it tangent to the rows at x. What
+  rounding takes from v on this way follows in a second call, except for thermostats.
+
+Each returns an 'energy' of 0, or 1 where the engine raised an error: nothing may be raised through OpenMM, so the
+error is kept and the integrator told to take the step back. Outside of steps all three return nothing to speak of:
+rows that are fulfilled need no correction.
+"""
+
+from __future__ import annotations
+
+import pickle
+import weakref
+from collections.abc import Callable
+from typing import Any, Literal, cast
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError, KconsError
+from kcons.motion.motion import Motion
+from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.steppers.compensated_steps import Point
+from kcons.steppers.drifts import NonholonomicFlight
+
+#: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
+#: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
+#: no digit.
+SPEED_SCALE = 1024.0
+#: What that takes from v is carried after it, multiplied by this: less than a thousandth of a nanometer at 100 nm from
+#: the origin.
+LOW_SCALE = 2.0**27
+#: Corrections are carried multiplied by this: on GPUs forces are whole multiples of 2^-32.
+CARRY_SCALE = 2.0**20
+
+PHASES = ("remember", "land", "project")
+PREFIX = f"{ROW_NAME}s"
+LIVE: weakref.WeakValueDictionary[str, Engine] = weakref.WeakValueDictionary()
+
+
+class Engine:
+    """What the three callbacks share: the engine, where the particles are, and how far the step is."""
+
+    def __init__(
+        self,
+        key: str,
+        constraints: tuple[Constraint, ...],
+        positions: FloatArray,
+        masses: FloatArray,
+        cell: FloatArray | None,
+        degenerate: Literal["convert", "raise"],
+        time: float,
+    ) -> None:
+        self.key = key
+        held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
+        self.motion = Motion(held, positions, degenerate=degenerate, time=time)
+        self.masses, self.cell = masses, cell
+        #: What it takes to build this again; targets taken from the positions are in the set.
+        self.recipe = (held.constraints, positions, masses, cell, degenerate, time)
+        self.atoms: IntArray = held.touched
+        self.whole = len(self.atoms) == len(masses)
+        n, local = masses.shape[0], (len(self.atoms), 3)
+        self._nothing = np.zeros(local)
+        #: Positions where a drift starts, free positions, velocities; of all particles, as the engine takes them.
+        self._start, self._there, self._v = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+        self._moved = np.zeros((n, 3))
+        #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
+        self._x, self._read = np.zeros(local), np.zeros(local)
+        rows = self.motion.constraint_set.n_rows
+        self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
+        #: Whether the time of a drift matters.
+        self.timed = self.motion.constraint_set.moving
+        resting = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
+        fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
+        #: Which of the carried particles do not move.
+        self._fixed = np.searchsorted(self.atoms, fixed)
+        self._flight: NonholonomicFlight | None = None
+        if not self.motion.constraint_set.holonomic.all():
+            with np.errstate(divide="ignore"):
+                weights = (1 / masses)[:, None]
+            weights[fixed] = 0.0
+            self._flight = NonholonomicFlight(self.motion, weights)
+            self._weights = np.repeat(weights, 3, axis=1)
+            self.timed = True
+        self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
+        self._lean = False
+        self._fractions: tuple[float, ...] = (1.0,)
+        self._nodes: tuple[float, ...] = (0.0, 1.0)
+        #: Whether velocities are projected between the drifts of a step, too.
+        self._within = False
+        self._error: BaseException | None = None
+        self._between_steps, self._began, self._stage = True, (0.0, 0), 0
+        #: Whether what is lost in carrying v is carried after it, and whether that comes next.
+        self.carries_rest, self._rest_to_come = False, False
+        #: Whether it is known where the drift begins.
+        self._begun = False
+        #: Free positions of the drift and what brings them onto the rows.
+        self._landing: tuple[FloatArray, FloatArray] | None = None
+        LIVE[key] = self
+
+    def follow(self, integrator: openmm.CustomIntegrator, lean: bool = False) -> None:
+        """Take times and step sizes from this integrator; `lean` as for parts."""
+        self._lean = lean
+        self._integrator = weakref.ref(integrator)
+        self.carries_rest = not getattr(integrator, "thermostatted", False)
+        scheme = getattr(integrator, "scheme", None)
+        if scheme is not None:
+            ensemble = getattr(integrator, "ensemble", None)
+            self._within = ensemble is not None and ensemble.halves
+            self._fractions = (0.5, 0.5) if self._within else tuple(a * w for a in scheme.drifts for w in scheme.flight)
+            sums = np.cumsum(self._fractions)[:-1].tolist()
+            self._nodes = (0.0, *sums, 1.0)
+
+    def begin_run(self) -> None:
+        """Whatever was asked between steps, the next call belongs to the beginning of one."""
+        self._between_steps, self._rest_to_come = True, False
+
+    # -- callbacks ------------------------------------------------------------------------------
+
+    def remember(self, state: openmm.State) -> FloatArray:
+        began = _time(state), state.getStepCount()
+        if self._between_steps or began != self._began:
+            self._between_steps, self._began, self._stage, self._error = False, began, -1, None
+            if self.cell is not None:
+                self.follow_cell(state)
+        self._stage += 1
+        _positions(state, self._x)
+        self._begin_drift()
+        return self._nothing
+
+    def _begin_drift(self) -> None:
+        self._landing = None
+        self._begun = True
+        if self.whole:
+            np.copyto(self._start, self._x)
+        else:
+            self._start[self.atoms] = self._x
+
+    def land(self, state: openmm.State) -> FloatArray:
+        there, read = self._there, self._read
+        _positions(state, read)
+        if self._landing is not None and np.array_equal(read, self._landing[0]):
+            return self._landing[1]  # force and energy are asked for one by one
+        if not self.timed and np.array_equal(read, self._x):
+            return self._nothing  # at rest, or forces are asked for between steps
+        if not self._begun:
+            self._begin_drift()  # where the last drift ended: nobody has moved x since
+        self._begun = False
+        if self.whole:
+            np.copyto(there, read)
+        else:
+            there[self.atoms] = read
+        then, now, h = self._times(self._stage)
+        if self._flight is None:
+            impulse = self._impulse if len(self._fractions) == 1 else None
+            # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+            moved = self._moved
+            moved.fill(0.0)
+            self.motion.project_positions(
+                there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, out=there,
+                multipliers=impulse,
+            )  # fmt: skip
+            change = moved.copy() if self.whole else moved[self.atoms]
+            fixed = self._fixed
+            change[fixed] = there[self.atoms[fixed]] - read[fixed]
+        else:
+            point = Point(self._start.copy(), (there - self._start) / h, self._weights, exact=False)
+            self._flight.move(point, there, then, now, h)
+            change = (there if self.whole else there[self.atoms]) - read
+        # What the velocity stage before found belongs to the same positions as this impulse.
+        self._push, self._push_before = self._push_before, self._push
+        self._push.fill(0.0)
+        np.add(read, change, out=self._x)
+        change *= CARRY_SCALE
+        self._landing = (read.copy(), change)
+        return change
+
+    def project(self, state: openmm.State) -> FloatArray:
+        read = self._read
+        _positions(state, read)
+        read -= self._x
+        if self._rest_to_come:
+            self._rest_to_come = False
+            return self._project_rest(read) if read.any() else self._nothing
+        # Thermostats project within a step, too.
+        self._between_steps = not self._within or self._stage >= len(self._fractions) - 1
+        if not self.timed and not read.any():
+            return self._nothing
+        self._rest_to_come = self.carries_rest
+        read *= SPEED_SCALE
+        push = self._push if len(self._fractions) == 1 else None
+        change = self._tangent(read, push) - read
+        change *= CARRY_SCALE
+        return change
+
+    def _project_rest(self, read: FloatArray) -> FloatArray:
+        """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
+        read *= SPEED_SCALE
+        change = self._tangent(read, None) - read
+        if self.motion.plan.driven:
+            # The rate that the rows demand is in v already.
+            change -= self._tangent(np.zeros_like(read), None)
+        change *= CARRY_SCALE
+        return change
+
+    def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
+        """Velocities of the carried particles, projected."""
+        v = self._v
+        if self.whole:
+            np.copyto(v, read)
+            x = self._x
+        else:
+            v[self.atoms] = read
+            x = self._start
+            x[self.atoms] = self._x
+        now = self._times(self._stage if self._within else len(self._nodes) - 2)[1]
+        self.motion.project_velocities(x, v, time=now, out=v, multipliers=multipliers)
+        return v.copy() if self.whole else v[self.atoms]
+
+    def _times(self, stage: int) -> tuple[float, float, float]:
+        """Beginning, end and length of a drift."""
+        if not self.timed:
+            return 0.0, 0.0, 0.0
+        integrator = self._integrator()
+        dt = 0.0 if integrator is None else _number(integrator.getStepSize())
+        start = self._began[0]
+        stage = min(max(stage, 0), len(self._fractions) - 1)
+        return start + self._nodes[stage] * dt, start + self._nodes[stage + 1] * dt, self._fractions[stage] * dt
+
+    def follow_cell(self, state: openmm.State) -> None:
+        cell = cell_of(state.getPeriodicBoxVectors())
+        if self.cell is None or not np.array_equal(cell, self.cell):
+            self.motion.set_cell(cell)
+            self.cell = cell
+
+    def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
+        """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
+        try:
+            change = self.remember(state) if phase == "remember" else None
+            if self._error is None:
+                if phase == "land":
+                    change = self.land(state)
+                elif phase == "project":
+                    change = self.project(state)
+            elif phase == "project":
+                self._between_steps, self._rest_to_come = True, False
+        except BaseException as error:
+            self._error, change = error, None
+        return (0.0 if self._error is None else 1.0), (self._nothing if change is None else change)
+
+    # -- afterwards -----------------------------------------------------------------------------
+
+    def step_multipliers(self) -> FloatArray:
+        integrator = self._integrator()
+        # A drift of velocities that were not made tangent has pushed for that as well.
+        whole = self._lean and integrator is not None and integrator.getGlobalVariableByName("led") != 0
+        mixed = getattr(integrator, "thermostatted", False)
+        unknown = len(self._fractions) != 1 or (np.isnan(self._push_before).any() and not whole)
+        if integrator is None or mixed or unknown:
+            raise InputError(
+                "multipliers of a step need two steps of a scheme with one drift, at constant energy; "
+                "multipliers(context) gives those of any state",
+                item="scheme",
+            )
+        dt = _number(integrator.getStepSize())
+        return np.asarray(self._impulse / dt**2 - (0.0 if whole else self._push_before / dt))
+
+    def explained_error(self, step: int) -> KconsError:
+        error = self._error
+        self._error = None
+        if error is None:
+            return ConvergenceError(f"step {step}: the carried rows failed without saying why", step=step)
+        cause = ""
+        if isinstance(error, ConvergenceError):
+            cause = f"{self._cause()}. "
+        if isinstance(error, KconsError):
+            error.args = (f"step {step}: {cause}{error}", *error.args[1:])
+            error.step = step  # type: ignore[attr-defined]
+        elif isinstance(error, Exception):
+            error.add_note(f"in step {step}, from the function of a constraint; the step was taken back")
+        return cast(KconsError, error)
+
+    def _cause(self) -> str:
+        held = self.motion.constraint_set
+        time = self._times(self._stage)[0]
+        miss = np.abs(held.value(self._start, time))
+        allowed = np.maximum(1e-6 * held.scale, 4 * held.tolerance(self._start, time))
+        off = np.flatnonzero(~(miss <= allowed))
+        if not len(off):
+            return "time step too large"
+        row = int(off[np.argmax(miss[off])])
+        return (
+            f"the state before it was already off row {held.row_name(row)} by {miss[row]:.3g}; "
+            "call apply_positions(context) first"
+        )
+
+
+class Callback:
+    """The function of one PythonForce; survives pickling together with its engine."""
+
+    def __init__(self, engine: Engine, phase: str) -> None:
+        self.engine, self.phase = engine, phase
+
+    def __call__(self, state: openmm.State) -> tuple[float, FloatArray]:
+        return self.engine.answer(self.phase, state)
+
+    def __reduce__(self) -> tuple[Callable[..., Callback], tuple[Any, ...]]:
+        # The first of the three brings the engine along; the others find it by its key.
+        recipe = self.engine.recipe if self.phase == PHASES[0] else None
+        return _restored, (self.engine.key, self.phase, recipe)
+
+
+def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
+    engine = LIVE.get(key) if recipe is None else Engine(key, *recipe)
+    if engine is None:
+        raise pickle.UnpicklingError(f"the force '{force_name(PHASES[0], key)}' must be read first")
+    return Callback(engine, phase)
+
+
+# -- what OpenMM gives ----------------------------------------------------------------------------
+
+
+def _positions(state: openmm.State, out: FloatArray) -> None:
+    # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
+    state._getVectorAsNumpy(openmm.State.Positions, out)
+
+
+def _number(quantity: unit.Quantity) -> float:
+    return float(quantity.value_in_unit(unit.picosecond))
+
+
+def _time(state: openmm.State) -> float:
+    return _number(state.getTime())
+
+
+def cell_of(vectors: Any) -> FloatArray:
+    """Box vectors of a State (a Quantity) or of a System (a list of them), nm, shape (3, 3)."""
+    plain = (
+        vectors.value_in_unit(unit.nanometer)
+        if unit.is_quantity(vectors)
+        else [edge.value_in_unit(unit.nanometer) for edge in vectors]
+    )
+    return np.array([[edge[0], edge[1], edge[2]] for edge in plain], dtype=np.float64)
+
+
+def force_name(phase: str, key: str) -> str:
+    return f"{PREFIX}: {phase} {key}"

@@ -1,0 +1,436 @@
+"""The constraint objects of kcons in OpenMM, carried to the engine by PythonForces (see `kcons.openmm.carried.callbacks`)."""
+
+from __future__ import annotations
+
+import uuid
+import warnings
+from collections.abc import Iterable
+from typing import Literal
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.constraints import Constraint
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.motion.report import Report
+from kcons.openmm.carried.callbacks import (
+    CARRY_SCALE,
+    LIVE,
+    LOW_SCALE,
+    PHASES,
+    PREFIX,
+    SPEED_SCALE,
+    Callback,
+    Engine,
+    cell_of,
+    force_name,
+)
+from kcons.openmm.carried.requirements import (
+    bonds_of,
+    free_groups,
+    masses_of,
+    nanometers,
+    refuse_agents,
+    refuse_single_precision,
+    refuse_virtual_sites,
+    with_massless_atoms,
+)
+from kcons.openmm.integrator.guard import NEAR
+from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.program import Program
+from kcons.steppers.state import START_TOLERANCE
+
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
+
+
+class CarriedConstraints:
+    """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
+
+    Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Masses and periodicity are taken from it; it is not changed before `add_to`. Particles without mass stay
+        where they are.
+    constraints : Constraint or iterable of Constraint
+        What is held: lengths in nm, times in ps, masses in dalton.
+    positions : Quantity or array_like, shape (n_particles, 3)
+        On or near the constraints, in nm if without unit.
+    periodic : bool, optional
+        Whether rows take minimum images; by default if the System is periodic. Turn it off for rows longer than
+        half the box among molecules that are never cut.
+    degenerate : {'convert', 'raise'}
+        As for `Motion`.
+    time : float
+        Time of `positions` in ps, for targets that move.
+
+    Raises
+    ------
+    KconsError
+        What `ConstraintSet` and `Motion` raise; virtual sites; no free force groups.
+
+    Notes
+    -----
+    Pickling a System, or writing it to XML, takes the rows along if all of their functions can be pickled;
+    `CarriedConstraints.of` then finds them.
+    """
+
+    evaluates = True
+    meets_system = False
+    solves_alone = False
+    lean = False
+    #: Whether the System had no constraints of its own when the forces were added.
+    alone = False
+    _told = False
+    #: Sizes of the gradients, where velocities were looked at first.
+    _slopes: FloatArray | None = None
+
+    def __init__(
+        self,
+        system: openmm.System,
+        constraints: Constraint | Iterable[Constraint],
+        positions: unit.Quantity | ArrayLike,
+        *,
+        periodic: bool | None = None,
+        degenerate: Literal["convert", "raise"] = "convert",
+        time: float = 0.0,
+    ) -> None:
+        given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        if sum(c.n_rows for c in given if isinstance(c, Constraint)) == 0 and all(
+            isinstance(c, Constraint) for c in given
+        ):
+            raise InputError("there are no rows to hold", item="constraints")
+        masses = masses_of(system)
+        x = nanometers(positions, len(masses))
+        wraps = system.usesPeriodicBoundaryConditions() if periodic is None else periodic
+        cell = cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None
+        engine = Engine(uuid.uuid4().hex, with_massless_atoms(given, masses), x, masses, cell, degenerate, time)
+        refuse_virtual_sites(system, engine.atoms, masses)
+        self._bind(engine, free_groups(system, len(PHASES)))
+
+    def _bind(self, engine: Engine, groups: list[int]) -> None:
+        self.code = 0
+        self._engine = engine
+        self._groups = dict(zip(PHASES, groups, strict=True))
+        self.groups = frozenset(groups)
+
+    @classmethod
+    def of(cls, system: openmm.System) -> CarriedConstraints:
+        """The rows that a System brings along which was read from XML or copied.
+
+        Raises
+        ------
+        InputError
+            It has none.
+        """
+        found = {force.getName(): force for force in system.getForces() if isinstance(force, openmm.PythonForce)}
+        keys = sorted({name.split()[-1] for name in found if name.startswith(PREFIX)})
+        keys = [key for key in keys if key in LIVE]
+        if len(keys) != 1:
+            raise InputError(
+                f"the System carries {len(keys) or 'no'} sets of rows of kcons; expected one", item="system"
+            )
+        part = object.__new__(cls)
+        part._bind(LIVE[keys[0]], [found[force_name(phase, keys[0])].getForceGroup() for phase in PHASES])
+        part.alone = system.getNumConstraints() == 0
+        return part
+
+    def forces(self) -> list[openmm.PythonForce]:
+        """The forces that carry the rows; `add_to` puts them into the System."""
+        forces = []
+        engine = self._engine
+        for phase in PHASES:
+            force = openmm.PythonForce(Callback(engine, phase))
+            if not engine.whole:
+                force.setParticles(engine.atoms.tolist())
+            force.setUsesPeriodicBoundaryConditions(engine.cell is not None)
+            force.setForceGroup(self._groups[phase])
+            force.setName(force_name(phase, engine.key))
+            forces.append(force)
+        return forces
+
+    def add_to(self, system: openmm.System) -> None:
+        """Put the forces into the System; before the Context is made."""
+        for force in self.forces():
+            system.addForce(force)
+        self.alone = system.getNumConstraints() == 0
+
+    # -- what is held ---------------------------------------------------------------------------
+
+    @property
+    def motion(self) -> Motion:
+        """The engine; its `constraint_set` has all rows, with the numbers of the System's particles."""
+        return self._engine.motion
+
+    @property
+    def driven(self) -> bool:
+        """Whether rows demand velocities that are not zero."""
+        return self.motion.plan.driven
+
+    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray]:
+        """The engine, and the positions it takes."""
+        return self.motion, self._state(context)[0]
+
+    @property
+    def atoms(self) -> IntArray:
+        """Particles that a row touches."""
+        return self._engine.atoms
+
+    def rank(self, context: openmm.Context | None = None) -> int:
+        """Degrees of freedom that the rows take; particles without mass never had any."""
+        fixed = int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
+        return self.motion.rank - 3 * fixed
+
+    # -- the program ----------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        self._engine.follow(program.integrator, self.lean)
+        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
+        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
+
+    def begin_early(self, program: Program) -> None:
+        """Where x is not where the last step ended, and velocities are projected before the first drift."""
+        self.remember(program)
+
+    def _guard(self, program: Program, phase: str, words: str) -> None:
+        group = self._groups[phase]
+        program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
+
+    def begin_run(self) -> None:
+        """Called before steps are made."""
+        self._engine.begin_run()
+
+    def remember(self, program: Program) -> None:
+        words = "carried rows: positions whose gradients are taken"
+        if not self.lean or self._engine.timed:
+            self._guard(program, "remember", words)
+            return
+        with program.when("looked+moving != 0", "x need not be where the last drift ended"):
+            self._guard(program, "remember", words)
+
+    def land(self, program: Program, h: str) -> None:
+        # Where a computation changes x by a force, OpenMM does not take force and energy from one evaluation: the
+        # second call gets what the first has found. Or failures wait for the next call of the other phases.
+        if self._early:
+            self._guard(program, "land", "carried rows: try to solve for positions")
+        change = f"f{self._groups['land']}"
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: solve for positions")
+
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
+        group = self._groups["land"]
+        program.each("x", f"x+{h}*{u}", "move freely (drift)")
+        self._guard(program, "land", "carried rows: solve for positions")
+        # Force and energy come from one evaluation, for this moves no x.
+        program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
+
+    def project(self, program: Program) -> None:
+        change = f"f{self._groups['project']}"
+        # Thermostats stir more than rounding does.
+        rest = self._engine.carries_rest
+        program.each("xu", "x", "to come back to")
+        program.each("x", f"x+{1 / SPEED_SCALE!r}*v", "carries v, exactly as far as it can be told from x")
+        self._guard(program, "project", "carried rows: solve for velocities")
+        carried = f"(x-xu)*{SPEED_SCALE!r}"
+        if rest:
+            program.vector("v_low", "what of v was too small to be carried together with x")
+            program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
+        program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
+        if rest:
+            program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
+            self._guard(program, "project", "carried rows: the same for the rest")
+            program.each("v", f"v+v_low+{1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)!r}*{change}", "tangent, all of it")
+        program.each("x", "xu", "back")
+
+    # -- in a context ---------------------------------------------------------------------------
+
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
+
+        Raises
+        ------
+        InputError
+            Positions or velocities off the rows; forces that were not added; masses that have changed.
+        UnsupportedError
+            Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
+        """
+        system = context.getSystem()
+        refuse_single_precision(context)
+        self._check_system(system)
+        refuse_agents(system, self.motion.constraint_set, context.getMolecules)
+        x, v, time = self._state(context)
+        self._tell_of_rounding(x)
+        miss = self._worst(x, None, time)
+        if miss is not None:
+            raise InputError(
+                f"{miss}; bring them onto the rows by apply_positions(context), or correct them",
+                item="positions",
+                atoms=miss.atoms,
+            )
+        tangent = self.motion.project_velocities(x, v, time=time)
+        away = np.abs(tangent - v)
+        if away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+            atom = int(np.argmax(away.max(axis=1)))
+            raise InputError(
+                f"velocities violate the rows: atom {atom} moves off them with {away[atom].max():.6g} nm/ps; "
+                "remove that part by apply_velocities(context)",
+                item="velocities",
+                atoms=[atom],
+            )
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v of the constraints that were given, from the positions and velocities of the context."""
+        x, v, time = self._state(context)
+        return self._worst(x, v if velocities else None, time)
+
+    def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
+        held = self.motion.sources[0]
+        found = held.residuals(x, v, time)
+        allowed = np.maximum(START_TOLERANCE * held.scale, found.allowed)
+        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        if miss is not None or found.rates is None or found.speeds is None:
+            return miss
+        if self._slopes is None:
+            gradients = held.jacobian(x, time)
+            self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+        size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
+        # What is taken from v where it is carried together with x: all there is of a body at rest.
+        lost = 4 * SPEED_SCALE * np.spacing(np.abs(x[held.touched]).max(initial=0.0)) * self._slopes
+        return Miss.worst("velocities", found.rates, START_TOLERANCE * size + lost, held.row_name, held.row_atoms)
+
+    def _tell_of_rounding(self, x: FloatArray) -> None:
+        """Warn, once, of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+        held = self.motion.constraint_set
+        if self._told or held.n_rows == 0:
+            return
+        reach = float(np.abs(x[held.touched]).max())
+        if np.spacing(reach) > COARSE * float(held.scale.min()):
+            self._told = True
+            warnings.warn(
+                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to "
+                f"{np.spacing(reach):.1g} nm; each step turns this into velocity, and the energy wanders. Move the "
+                "origin nearer",
+                stacklevel=3,
+            )
+
+    def apply_positions(self, context: openmm.Context) -> None:
+        """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
+
+        Bonds are those of the System's forces and constraints; see `Motion.restore_positions`.
+
+        Raises
+        ------
+        InfeasibleError, InputError
+            As `Motion.restore_positions`; nothing was changed.
+        """
+        x, _, time = self._state(context)
+        bonds = bonds_of(context.getSystem(), x)
+        brought = self.motion.restore_positions(x, time=time, bonds=bonds if len(bonds) else None)
+        miss = self._worst(brought, None, time)
+        if miss is not None:
+            raise InfeasibleError(
+                f"the rows cannot be reached from here: {miss}; nothing was changed. Start nearer to the targets",
+                residual=abs(miss.off),
+                row=miss.row,
+                atoms=miss.atoms,
+            )
+        context.setPositions(brought)
+        context.computeVirtualSites()
+
+    def apply_velocities(self, context: openmm.Context) -> None:
+        """Make velocities tangent to the rows: the nearest ones in the mass metric.
+
+        Raises
+        ------
+        ConvergenceError, InputError
+            As `Motion.project_velocities`; nothing was changed.
+        """
+        x, v, time = self._state(context)
+        context.setVelocities(self.motion.project_velocities(x, v, time=time))
+
+    def _state(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, float]:
+        state = context.getState(positions=True, velocities=True)
+        if self._engine.cell is not None:
+            self._engine.follow_cell(state)
+        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
+        return x, v, state.getTime().value_in_unit(unit.picosecond)
+
+    def _check_system(self, system: openmm.System) -> None:
+        engine = self._engine
+        missing = {force_name(phase, engine.key) for phase in PHASES} - {
+            force.getName() for force in system.getForces()
+        }
+        if missing:
+            raise InputError(
+                "the System has no forces that carry the rows; call add_to(system), or hold(system, ...), before "
+                "the Context is made",
+                item="system",
+            )
+        now = masses_of(system)
+        if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
+            raise InputError("masses have changed since the rows were built; build them again", item="masses")
+        refuse_virtual_sites(system, engine.atoms, now)
+        touched = set(engine.atoms.tolist())
+        if self.alone and system.getNumConstraints():
+            raise InputError(
+                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+                item="system",
+            )
+        for k in range(system.getNumConstraints()):
+            i, j, _ = system.getConstraintParameters(k)
+            if touched & {i, j}:
+                raise UnsupportedError(
+                    f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
+                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+                )
+
+    # -- results --------------------------------------------------------------------------------
+
+    def multipliers(self, context: openmm.Context) -> FloatArray:
+        """Multipliers at the state of the context, shape (n_rows,): z = A^T lambda is the force that holds the rows.
+
+        In kJ/mol over the unit of the row (kJ/mol/nm for lengths, kJ/mol for angles). Exact for the state as it is,
+        at the price of a force evaluation where forces are not known.
+        """
+        x, v, time = self._state(context)
+        groups = {g for g in range(32) if g not in self.groups}
+        kept = context.getIntegrator().getIntegrationForceGroups()
+        state = context.getState(forces=True, groups=kept & sum(1 << g for g in groups))
+        f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
+        return self.motion.multipliers(x, v, f, time)
+
+    @property
+    def step_multipliers(self) -> FloatArray:
+        """Multipliers at the positions where the last step began, from the step itself, shape (n_rows,).
+
+        2 Lambda/dt^2 of the position stage and -2 mu/dt of the velocity stage before are each of first order in dt;
+        this is their mean, of second order. Costs nothing. For schemes with one drift a step, from the second step
+        on.
+
+        Raises
+        ------
+        InputError
+            No two steps of such a scheme have been made.
+        """
+        return self._engine.step_multipliers()
+
+    def report(self, context: openmm.Context, *, condition: bool = True) -> Report:
+        """Rank, condition, residuals and solvers at the state of the context."""
+        x, v, time = self._state(context)
+        return self.motion.report(x, v, time, condition=condition)
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error that stopped the engine, with the number of the step."""
+        return self._engine.explained_error(step)
+
+    def __repr__(self) -> str:
+        return f"<CarriedConstraints: {self.motion.constraint_set.n_rows} rows on {len(self.atoms)} particles>"

@@ -1,0 +1,300 @@
+"""Constraints of an OpenMM System handed over to kcons.
+
+What stays in the System is solved by OpenMM and must not share atoms with rows of kcons. Constraints that share
+atoms with each other are solved as one, so that whole clusters of them change hands.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike, NDArray
+from openmm import unit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+from kcons.constraints import Angle, Constraint, Distance
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.openmm.carried.carried_constraints import CarriedConstraints
+from kcons.openmm.carried.requirements import masses_of, refuse_agents
+
+#: Hydrogens, also heavy ones, are lighter than this (dalton).
+_HYDROGEN = 4.5
+#: Angles closer to 180 degrees than this stay distances.
+_STRAIGHT = np.radians(5.0)
+#: Name of the force whose bonds of no strength keep molecules together.
+TIES = "kcons molecules"
+#: Forces whose particles OpenMM counts as bonded.
+_BONDING = (openmm.HarmonicBondForce, openmm.CustomBondForce, openmm.CustomCentroidBondForce)
+
+Choice = Literal["all", "hbonds", "touched"] | Iterable[int]
+
+
+def take_constraints(
+    system: openmm.System,
+    which: Choice = "all",
+    *,
+    keep_water: bool = True,
+    angles: bool = False,
+) -> list[Constraint]:
+    """Take constraints out of a System and return them as constraints of kcons.
+
+    Bonds of no strength are added between their atoms, so that the molecules of a Context, which barostats and the
+    wrapping of positions go by, stay what they were.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Changed in place, before a Context is made of it.
+    which : 'all', 'hbonds' or iterable of int
+        Clusters of constraints that share atoms are taken whole: all, those with a hydrogen (lighter than
+        4.5 dalton), or those that touch one of the given atoms.
+    keep_water : bool
+        Whether rigid water stays with OpenMM, whose SETTLE is fastest there; molecules among given atoms are taken
+        all the same.
+    angles : bool
+        Whether distances that close a triangle over two held bonds (createSystem(constraints=HAngles)) come back as
+        angles. Rigid water and angles near 180 degrees stay distances.
+
+    Returns
+    -------
+    list of Constraint
+        A Distance in nm and, where asked for, an Angle; empty if there is nothing to take.
+
+    Raises
+    ------
+    InputError
+        Unknown choice or atoms; nothing was changed.
+    """
+    table = _table(system)
+    chosen = _chosen(system, table, which, keep_water)
+    rows = _as_rows(table, chosen, angles)
+    _release(system, table, chosen)
+    return rows
+
+
+def hold(
+    system: openmm.System,
+    constraints: Constraint | Iterable[Constraint],
+    positions: unit.Quantity | ArrayLike,
+    *,
+    take: Choice = "touched",
+    keep_water: bool = True,
+    angles: bool = False,
+    periodic: bool | None = None,
+    degenerate: Literal["convert", "raise"] = "convert",
+    join: bool = False,
+    time: float = 0.0,
+) -> CarriedConstraints:
+    """Hold rows of kcons in a System: all that has to be done before its Context is made.
+
+    Constraints of the System that share atoms with the rows move over to kcons, and the forces that carry the rows
+    are added.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Changed in place.
+    constraints : Constraint or iterable of Constraint
+        What is held, in nm, ps, dalton, radian. Empty if only constraints of the System are to move over.
+    positions : Quantity or array_like, shape (n_particles, 3)
+        On or near the constraints; targets left at None are taken from them.
+    take : 'touched', 'all', 'hbonds' or iterable of int
+        Which clusters of the System's constraints move over besides those that a row touches.
+    keep_water, angles
+        As for `take_constraints`; water that a row touches moves over.
+    periodic, degenerate, time
+        As for `CarriedConstraints`.
+    join : bool
+        Whether molecules that a row connects count as one from now on, for barostats and wrapping. Needed where
+        a barostat would move them apart.
+
+    Returns
+    -------
+    CarriedConstraints
+        For ``ProjectedIntegrator(..., parts=[...])``.
+
+    Raises
+    ------
+    KconsError
+        As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
+    """
+    given = [constraints] if isinstance(constraints, Constraint) else list(constraints)
+    for item in given:
+        if not isinstance(item, Constraint):
+            raise InputError(f"{item!r} is no kcons constraint", item="constraints")
+    n = system.getNumParticles()
+    table = _table(system)
+    chosen = _chosen(system, table, () if take == "touched" else take, keep_water)
+    touched = np.concatenate([*(item.atoms.ravel() for item in given), np.zeros(0, np.int64)])
+    chosen |= _sharing(table, touched[touched < n])
+    taken = _as_rows(table, chosen, angles)
+    part = CarriedConstraints(system, [*taken, *given], positions, periodic=periodic, degenerate=degenerate, time=time)
+    links = [_neighbours(item.atoms) for item in given] if join else []
+    joined = np.concatenate([*links, np.zeros((0, 2), np.int64)])
+    refuse_agents(system, part.motion.constraint_set, lambda: _molecules(system, joined))
+    # Nothing can fail from here on.
+    _release(system, table, chosen)
+    _tie(system, joined)
+    part.add_to(system)
+    return part
+
+
+# -- what the System holds ------------------------------------------------------------------------
+
+
+@dataclass
+class _Table:
+    """The constraints of a System: pairs (n, 2), lengths in nm (n,), and cluster number of each particle."""
+
+    pairs: IntArray
+    lengths: FloatArray
+    clusters: IntArray
+
+    @property
+    def cluster(self) -> IntArray:
+        """Cluster of each constraint."""
+        return self.clusters[self.pairs[:, 0]]
+
+    @property
+    def water(self) -> NDArray[np.bool_]:
+        """Constraints of molecules that are a triangle of constraints and nothing else."""
+        rows = np.bincount(self.cluster, minlength=len(self.clusters))[self.cluster]
+        atoms = np.bincount(self.clusters)[self.cluster]
+        return (rows == 3) & (atoms == 3)
+
+
+def _table(system: openmm.System) -> _Table:
+    n = system.getNumParticles()
+    first, second, long = [], [], []
+    for k in range(system.getNumConstraints()):
+        i, j, length = system.getConstraintParameters(k)
+        first.append(i)
+        second.append(j)
+        long.append(length._value)  # nm; converting a Quantity takes longer than all else here
+    pairs = np.array([first, second], dtype=np.int64).T
+    lengths = np.array(long, dtype=np.float64)
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    clusters = connected_components(links, directed=False)[1].astype(np.int64)
+    return _Table(pairs, lengths, clusters)
+
+
+def _chosen(system: openmm.System, table: _Table, which: Choice, keep_water: bool) -> NDArray[np.bool_]:
+    """Which constraints to take, in whole clusters."""
+    if isinstance(which, str):
+        if which == "all":
+            chosen = np.ones(len(table.pairs), dtype=bool)
+        elif which == "hbonds":
+            masses = masses_of(system)[table.pairs]
+            with_hydrogen = ((masses > 0) & (masses < _HYDROGEN)).any(axis=1)
+            chosen = np.isin(table.cluster, table.cluster[with_hydrogen])
+        else:
+            raise InputError(f"no choice {which!r}; give 'all', 'hbonds' or the numbers of atoms", item="which")
+        return chosen & ~table.water if keep_water else chosen
+    atoms = np.asarray(list(which))
+    if atoms.size == 0:
+        return np.zeros(len(table.pairs), dtype=bool)
+    if not np.issubdtype(atoms.dtype, np.integer) or atoms.min() < 0 or atoms.max() >= len(table.clusters):
+        raise InputError(f"atoms must be integers from 0 to {len(table.clusters) - 1}", item="which")
+    return _sharing(table, atoms)
+
+
+def _sharing(table: _Table, atoms: IntArray) -> NDArray[np.bool_]:
+    """Constraints of the clusters that these atoms belong to."""
+    return np.asarray(np.isin(table.cluster, table.clusters[atoms]))
+
+
+def _as_rows(table: _Table, chosen: NDArray[np.bool_], angles: bool) -> list[Constraint]:
+    rows: list[Constraint] = []
+    distances = chosen.copy()
+    if angles:
+        triples, values, replaced = _as_angles(table, chosen & ~table.water)
+        distances[replaced] = False
+        if triples:
+            rows.append(Angle(triples, values))
+    if distances.any():
+        rows.insert(0, Distance(table.pairs[distances], table.lengths[distances]))
+    return rows
+
+
+def _as_angles(table: _Table, chosen: NDArray[np.bool_]) -> tuple[list[tuple[int, int, int]], list[float], list[int]]:
+    """Angles (i, j, k), their values, and the constraints i-k that they replace.
+
+    From the shortest constraint up: one that closes a triangle over two shorter ones that are bonds is the far side
+    of an angle, any other is a bond.
+    """
+    bonds: dict[int, dict[int, float]] = {}
+    triples, values, replaced = [], [], []
+    numbers = np.flatnonzero(chosen)
+    for number in numbers[np.argsort(table.lengths[numbers], kind="stable")].tolist():
+        i, k = table.pairs[number].tolist()
+        far = float(table.lengths[number])
+        first, second = bonds.setdefault(i, {}), bonds.setdefault(k, {})
+        vertex = next((j for j in first if j in second and max(first[j], second[j]) < (1 - 1e-6) * far), None)
+        if vertex is None:
+            first[k] = second[i] = far
+            continue
+        a, b = first[vertex], second[vertex]
+        cosine = (a * a + b * b - far * far) / (2 * a * b)
+        if cosine > -np.cos(_STRAIGHT):
+            triples.append((i, vertex, k))
+            values.append(float(np.arccos(cosine)))
+            replaced.append(number)
+    return triples, values, replaced
+
+
+# -- changes --------------------------------------------------------------------------------------
+
+
+def _release(system: openmm.System, table: _Table, chosen: NDArray[np.bool_]) -> None:
+    """Remove constraints, and keep their atoms together by bonds of no strength."""
+    for k in np.flatnonzero(chosen)[::-1].tolist():
+        system.removeConstraint(k)
+    _tie(system, table.pairs[chosen])
+
+
+def _tie(system: openmm.System, pairs: IntArray) -> None:
+    """Make the pairs count as bonded."""
+    if not len(pairs):
+        return
+    n = system.getNumParticles()
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    tree = minimum_spanning_tree(links.tocsr()).tocoo()
+    force = next((f for f in system.getForces() if f.getName() == TIES), None)
+    if force is None:
+        force = openmm.HarmonicBondForce()
+        force.setName(TIES)
+        system.addForce(force)
+        force = system.getForce(system.getNumForces() - 1)
+    for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+        force.addBond(i, j, 0.0, 0.0)
+
+
+def _neighbours(atoms: IntArray) -> IntArray:
+    """Pairs of atoms that follow each other in rows, shape (n, 2)."""
+    return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
+
+
+def _molecules(system: openmm.System, joined: IntArray) -> list[list[int]]:
+    """What Context.getMolecules() will say, from a Context of bonds alone."""
+    bare = openmm.System()
+    for _ in range(system.getNumParticles()):
+        bare.addParticle(1.0)
+    for k in range(system.getNumParticles()):
+        if system.isVirtualSite(k):
+            site = system.getVirtualSite(k)
+            parents = [[k, site.getParticle(m)] for m in range(site.getNumParticles())]
+            joined = np.concatenate([joined, parents])
+    _tie(bare, np.concatenate([joined, _table(system).pairs]))
+    for force in system.getForces():
+        if isinstance(force, _BONDING):
+            bare.addForce(copy.deepcopy(force))
+    context = openmm.Context(bare, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    return [list(atoms) for atoms in context.getMolecules()]

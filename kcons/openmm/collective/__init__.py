@@ -1,0 +1,12 @@
+"""Collective coordinates held on OpenMM's own platforms.
+
+- `small_algebra`: small systems of equations in the language of CustomIntegrator
+- `row_forces`: values and gradients of rows by OpenMM's forces
+- `context_rows`: the rows in a Context
+- `row_program`: the part of the program that holds them
+- `collective_rows`: `CollectiveRows`, what users make
+"""
+
+from kcons.openmm.collective.collective_rows import CollectiveRows
+
+__all__ = ["CollectiveRows"]

@@ -1,0 +1,428 @@
+"""Collective variables as rows: whatever an OpenMM Force can compute, held where it is or moved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import (
+    CertificateError,
+    ConvergenceError,
+    InputError,
+    KconsError,
+    NonFiniteError,
+    SingularGeometryError,
+    UnsupportedError,
+)
+from kcons.openmm.collective.context_rows import ContextRows, variables_of
+from kcons.openmm.collective.row_forces import (
+    Rigid,
+    Row,
+    forces_in,
+    found_values,
+    moved_atoms,
+    number,
+    period_of,
+    place,
+    unit_of,
+)
+from kcons.openmm.collective.row_program import GroupRows
+from kcons.openmm.collective.small_algebra import blocks
+from kcons.openmm.integrator.part import Miss
+from kcons.steppers.compositions import Composition
+from kcons.steppers.rattle import Rattle
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+
+class CollectiveRows(GroupRows):
+    """Any OpenMM Forces, each held as one row sigma = q - target = 0.
+
+    The energy of a Force is its coordinate q, its forces are the gradient; each has a force group of its own, which
+    the integrator keeps out of the dynamics. Positions land on all rows at once (and on the constraints of the
+    System, where the rows touch atoms that it constrains) along the gradients at the start of the drift,
+
+        x1 = xu + M^-1 (sum_k L_k grad q_k(x0) + constraints of the System),    q_k(x1) = target_k,
+
+    by a quasi-Newton iteration on the L that begins with the Gram matrix A M_par^+ A^T at x0. Velocities are projected
+    with the Gram matrix at x1.
+
+    Parameters
+    ----------
+    system : openmm.System
+        The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
+    rows : sequence of Row or openmm.Force
+        What to hold. A Force alone is held at the value found at `positions`; `each_term` makes one Force of each
+        term or variable of a larger one.
+    positions : array_like or Quantity, shape (n_particles, 3), optional
+        In nm if without unit. Needed where a target is to be found.
+    box : sequence of three vectors, optional
+        Periodic box at these positions, unless it is the System's default.
+    tolerance : float
+        Of sigma, relative to the scale of each row: the root of the sum of squares over the rows.
+    max_iterations : int
+        Bound of the quasi-Newton iteration.
+    meets_system : bool, optional
+        Whether the rows touch atoms constrained by the System. Found from the Forces; say True where they touch them
+        in ways that the Forces do not tell.
+
+    Raises
+    ------
+    InputError
+        A number that is not finite, a name of no context parameter, a target to find without positions,
+        meets_system=False where a row does.
+    UnsupportedError
+        More rows than free force groups; rows on virtual sites. The System is unchanged then.
+
+    References
+    ----------
+    Notes, eqs. 99-107; Ryckaert, Ciccotti and Berendsen, J. Comput. Phys. 23, 327 (1977); Andersen, ibid. 52, 24
+    (1983); Broyden, Math. Comput. 19, 577 (1965).
+    """
+
+    def __init__(
+        self,
+        system: openmm.System,
+        rows: Sequence[Row | openmm.Force | int],
+        *,
+        positions: object | None = None,
+        box: Sequence | None = None,
+        tolerance: float = 1e-13,
+        max_iterations: int = 20,
+        meets_system: bool | None = None,
+    ) -> None:
+        given = [row if isinstance(row, Row) else Row(row) for row in rows]
+        if not given:
+            raise InputError("no rows to hold", item="rows")
+        if not tolerance > 0 or max_iterations < 1:
+            raise InputError(
+                f"tolerance {tolerance} and max_iterations {max_iterations} must be positive", item="tolerance"
+            )
+        self.tolerance = float(tolerance)
+        self.max_iterations = int(max_iterations)
+        self.n_rows = len(given)
+        forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
+        self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]
+
+        def read(name: str, per: unit.Unit = unit.dimensionless) -> list[Any]:
+            """An attribute of all rows: numbers, None, and for targets and rates names."""
+            values = [getattr(row, name) for row in given]
+            kept = (str, type(None)) if name in ("target", "rate") else type(None)
+            return [
+                value if isinstance(value, kept) else number(value, f"{name} of row {k}", of, per)
+                for k, (value, of) in enumerate(zip(values, self._units, strict=True))
+            ]
+
+        self._targets = read("target")
+        self._rates = read("rate", unit.picosecond)
+        periods, scales = read("period"), read("scale")
+        for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
+            if target is None and positions is None:
+                raise InputError(f"row {k} has no target; give one, or the positions to find it at", item="positions")
+            if isinstance(rate, str) and not isinstance(target, str):
+                raise InputError(f"row {k}: a rate with a name needs a target with a name", item="rate")
+            if scale is not None and not scale > 0:
+                raise InputError(f"scale of row {k} is {scale}; give a positive number", item="scale")
+        known = _context_parameters(system, [row.force for row in given])
+        for name in (n for n in (*self._targets, *self._rates) if isinstance(n, str)):
+            if name not in known:
+                raise InputError(
+                    f"{name!r} is no context parameter of the System (known: {', '.join(sorted(known)) or 'none'}); "
+                    "define it by addGlobalParameter of a Force",
+                    item="target",
+                )
+        self.names = tuple(_name(row, f) for row, f in zip(given, forces, strict=True))
+        self.periods = tuple(
+            (period_of(f[0]) if len(f) == 1 else 0.0) if period is None else period
+            for period, f in zip(periods, forces, strict=True)
+        )
+        atoms = [moved_atoms(system, f) for f in forces]
+        self._refuse_sites(system, atoms)
+        #: The particles of each row.
+        self.atoms = tuple(tuple(sorted(touched)) for touched in atoms)
+        rigid = Rigid(system)
+        meets = any(rigid.holds(touched) for touched in atoms)
+        if meets and meets_system is False:
+            row = next(k for k, touched in enumerate(atoms) if rigid.holds(touched))
+            raise InputError(
+                f"row {row} ({self.names[row]}) touches atoms that the System constrains; leave out meets_system=False",
+                item="meets_system",
+            )
+        self.meets_system = meets or bool(meets_system)
+        if any(target is None for target in self._targets):
+            found = found_values(system, forces, positions, box)
+            self._targets = [f if t is None else t for t, f in zip(self._targets, found.tolist(), strict=True)]
+        placed = place(system, [row.force for row in given])
+        self._groups = tuple(placed)
+        self.groups = frozenset(placed)
+        touched = [rigid.bodies(a) for a in atoms] if self.meets_system else atoms
+        #: Rows whose gradients can have a product.
+        self._meet = [[bool(a & b) for b in touched] for a in touched]
+        self._block_rows = blocks(touched)
+        self.scales = tuple(
+            (max(1.0, abs(t)) if isinstance(t, float) else 1.0) if scale is None else scale
+            for t, scale in zip(self._targets, scales, strict=True)
+        )
+        self._drives = any(isinstance(t, float) and r != 0.0 for t, r in zip(self._targets, self._rates, strict=True))
+
+    def _refuse_sites(self, system: openmm.System, atoms: Sequence[set[int]]) -> None:
+        for k, touched in enumerate(atoms):
+            sites = [atom for atom in sorted(touched) if system.isVirtualSite(atom)]
+            if sites:
+                raise UnsupportedError(
+                    f"row {k} ({self.names[k]}) depends on particle {sites[0]}, a virtual site, which OpenMM moves at "
+                    "the end of a step only; build the coordinate from the particles that define the site"
+                )
+
+    # -- reading --------------------------------------------------------------------------------
+
+    def at(self, context: openmm.Context) -> ContextRows:
+        """The rows at the state of a context: gradients, Gram matrix, projections."""
+        return ContextRows(self, context)
+
+    @property
+    def driven(self) -> bool:
+        """Whether targets move."""
+        return any(rate != 0.0 for rate in self._rates)
+
+    @property
+    def steered(self) -> bool:
+        """Whether a target is a context parameter, which others may set for the step to come."""
+        return any(isinstance(target, str) for target in self._targets)
+
+    def values(self, context: openmm.Context) -> FloatArray:
+        """q of each row, shape (n_rows,)."""
+        return self.at(context).values()
+
+    def residuals(self, context: openmm.Context) -> FloatArray:
+        """sigma = q - target of each row, shape (n_rows,), to the nearest image."""
+        return self.at(context).sigma()
+
+    def rates(self, context: openmm.Context) -> FloatArray:
+        """A v less the rate of the targets, shape (n_rows,), per ps."""
+        return self.at(context).slopes()
+
+    def rank(self, context: openmm.Context) -> int:
+        """How many degrees of freedom the rows take, beyond the constraints of the System."""
+        return self.at(context).rank()
+
+    def multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """lambda at the positions where the last step began, to second order in the step; shape (n_rows,).
+
+        In kJ/mol per unit of q, z = A^T lambda. It is the mean of 2 L/h^2 of the first drift and 2 mu/h of the
+        velocity projection before it, at the same positions; after a start, or when somebody moved x, only the former,
+        to first order.
+
+        Raises
+        ------
+        UnsupportedError
+            Schemes in which these are not impulses of the same force; see `mean_multipliers`, `multipliers_at`.
+        """
+        scheme = getattr(integrator, "scheme", None)
+        if getattr(integrator, "thermostatted", False):
+            raise UnsupportedError(
+                "with a thermostat the impulses of a step are not those of the forces alone; read "
+                "multipliers_at(context)"
+            )
+        if scheme is not None and not isinstance(scheme, Rattle | Composition):
+            raise UnsupportedError(
+                f"{scheme!r} gives no multipliers at a point by the way; read mean_multipliers(integrator), the mean "
+                "over the last step, or multipliers_at(context), those at the state of a context"
+            )
+        return self._read(integrator, "lambda")
+
+    def mean_multipliers(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """Impulses of the last step over its length, shape (n_rows,): lambda averaged over the step, every scheme."""
+        return self._read(integrator, "mean")
+
+    def multipliers_at(self, context: openmm.Context) -> FloatArray:
+        """lambda at the positions and velocities of the context, as accurate as these; shape (n_rows,).
+
+        (A M_par^+ A^T) lambda = target'' - d(A v)/dt - A M_par^+ f (notes, eq. 104), M_par^+ that of the System's
+        constraints. d(A v)/dt along their free flight by central differences; needs nine evaluations of every row.
+        """
+        return self.at(context).multipliers()
+
+    def work(self, integrator: openmm.CustomIntegrator) -> FloatArray:
+        """What moving each target has added to the energy, in kJ/mol, shape (n_rows,): sum of lambda rate dt."""
+        return self._read(integrator, "work")
+
+    def targets(self, context: openmm.Context) -> FloatArray:
+        """Where each target is now, shape (n_rows,)."""
+        return self.at(context).targets()
+
+    def set_target(
+        self, integrator: ProjectedIntegrator, row: int, target: float | unit.Quantity, rate: object | None = None
+    ) -> None:
+        """Hold row `row` at another value from now on; `restore` brings the state there.
+
+        It belongs to this integrator: no State or checkpoint changes it.
+
+        Raises
+        ------
+        InputError
+            No number; a target that is a context parameter (set that); a rate for a row made without.
+        """
+        if isinstance(self._targets[row], str):
+            raise InputError(f"the target of row {row} is the context parameter {self._targets[row]}", item="target")
+        of = self._units[row]
+        value = number(target, f"target of row {row}", of)
+        slope = None if rate is None else number(rate, f"rate of row {row}", of, unit.picosecond)
+        if slope is not None and self._rates[row] == 0.0:
+            raise InputError(f"row {row} was made without a rate; give it one then", item="rate")
+        variables = variables_of(integrator)
+        if slope is not None:
+            integrator.program.set(self._of("rate", row), slope)
+        if self._rates[row] != 0.0:
+            slope = integrator.getGlobalVariableByName(self._of("rate", row))
+            value -= slope * self._clock(variables)
+        integrator.program.set(self._of("target", row), value)
+
+    def _clock(self, variables: dict[str, float]) -> float:
+        if not self._drives:
+            return 0.0
+        c = self.code
+        kept = variables[f"pending{c}"] and variables[f"step_start{c}"] != variables["good_steps"]
+        return variables[f"clock_end{c}" if kept else f"clock_start{c}"]
+
+    def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
+        return np.array([integrator.getGlobalVariableByName(self._of(name, k)) for k in range(self.n_rows)])
+
+    # -- restoring and checking -----------------------------------------------------------------
+
+    def apply_positions(self, context: openmm.Context, tolerance: float | None = None) -> int:
+        """Bring the positions of the context onto the rows and the System's constraints; returns the iterations.
+
+        Newton with step control. Velocities stay as they are.
+
+        Raises
+        ------
+        ConvergenceError
+            No solution; the positions are unchanged.
+        """
+        return self.at(context).apply_positions(self.tolerance if tolerance is None else tolerance)
+
+    def apply_velocities(self, context: openmm.Context) -> None:
+        """Make the velocities of the context tangent to the rows and to the System's constraints.
+
+        Raises
+        ------
+        SingularGeometryError
+            Rows that vanish or depend on others.
+        """
+        self.at(context).apply_velocities()
+
+    def restore(self, context: openmm.Context, tolerance: float | None = None) -> None:
+        """`apply_positions`, then `apply_velocities`.
+
+        Raises
+        ------
+        ConvergenceError, SingularGeometryError
+            As these.
+        CertificateError
+            The rows say that they are not fulfilled afterwards.
+        """
+        self.apply_positions(context, tolerance)
+        self.apply_velocities(context)
+        miss = self.worst_miss(context)
+        if miss is not None:
+            raise CertificateError(
+                f"after restoring, the {miss}", row=miss.row, residual=abs(miss.off), atoms=miss.atoms
+            )
+
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows.
+
+        Raises
+        ------
+        InputError
+            The context was made before the rows were added to its System.
+        SingularGeometryError
+            Rows that vanish, or depend on others or on the System's constraints.
+        UnsupportedError
+            A barostat or CMMotionRemover that would break them.
+        ConstraintError
+            Positions or velocities are not on the rows; `restore` brings them there.
+        """
+        self.at(context).check()
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """sigma and A v from the Forces themselves, at the state of the context."""
+        return self.at(context).worst_miss(velocities)
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error for a step in which the rows failed."""
+        c = self.code
+        singular = int(integrator.getGlobalVariableByName(f"singular{c}"))
+        if singular:
+            row = singular - 1
+            return SingularGeometryError(
+                f"step {step}: row {row} ({self.names[row]}) vanishes, or depends on the rows before it or on the "
+                "constraints of the System. Leave out a row that others imply; a dihedral over a straight angle or an "
+                "RMSD of 0 has no direction",
+                rows=[row],
+            )
+        off = np.abs(self._read(integrator, "sigma")) / np.array(self.scales)
+        residual = integrator.getGlobalVariableByName(f"residual{c}")
+        row = int(np.argmax(np.where(np.isfinite(off), off, math.inf)))
+        if not math.isfinite(residual):
+            return NonFiniteError(
+                f"step {step}: row {row} ({self.names[row]}) is not a number; forces or time step too large",
+                item="position",
+                step=step,
+            )
+        if residual <= self.tolerance:
+            return NonFiniteError(
+                f"step {step}: forces or velocities are not finite; the time step is too large",
+                item="velocity",
+                step=step,
+            )
+        iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
+        return ConvergenceError(
+            f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
+            f"{iterations} iterations (tolerance {self.tolerance:.3g}); time step too large "
+            f"(dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
+            residual=float(residual),
+            tolerance=self.tolerance,
+            iterations=iterations,
+            row=row,
+            step=step,
+        )
+
+    def __repr__(self) -> str:
+        return f"CollectiveRows({', '.join(self.names)})"
+
+
+def _parts_of(system: openmm.System, force: openmm.Force | int, row: int) -> list[openmm.Force]:
+    """The Forces that make one row."""
+    if isinstance(force, int):
+        return forces_in(system, force)
+    if not isinstance(force, openmm.Force):
+        raise InputError(f"row {row}: {force!r} is neither a Force nor the number of a force group", item="force")
+    return [force]
+
+
+def _name(row: Row, forces: Sequence[openmm.Force]) -> str:
+    if row.name:
+        return row.name
+    if not forces:
+        return f"group {row.force}"
+    force = forces[0]
+    text = force.getEnergyFunction() if hasattr(force, "getEnergyFunction") else ""
+    return type(force).__name__ + (f" {text}" if 0 < len(text) <= 24 else "")
+
+
+def _context_parameters(system: openmm.System, forces: Sequence[openmm.Force | int]) -> set[str]:
+    """Names of all context parameters that the Forces define."""
+    names: set[str] = set()
+    for force in (*system.getForces(), *(f for f in forces if isinstance(f, openmm.Force))):
+        if hasattr(force, "getNumGlobalParameters"):
+            names |= {force.getGlobalParameterName(k) for k in range(force.getNumGlobalParameters())}
+    return names

@@ -1,0 +1,318 @@
+"""The computations that hold rows of which each is the energy of one force group."""
+
+from __future__ import annotations
+
+import openmm
+
+from kcons.openmm.collective.small_algebra import Block
+from kcons.openmm.integrator.program import Program
+
+
+class GroupRows:
+    """Writes remember, land and project for K rows into the program of an integrator.
+
+    What is counted is passes over the whole system, at 18 ns a degree of freedom each. A step with one drift needs,
+    for each row, the gradients once (row, slope and Gram matrix: 3 passes, with constraints of the System 5), one pass
+    for velocities, and one, or with constraints of the System two, for every further iteration of the positions.
+
+    Attributes
+    ----------
+    names, scales, periods : sequence
+        One entry a row.
+    """
+
+    evaluates = True
+    stays_finite = True
+    solves_alone = True
+    code = 1
+    lean = False
+    meets_system: bool
+    groups: frozenset[int]
+    names: tuple[str, ...]
+    scales: tuple[float, ...]
+    periods: tuple[float, ...]
+    tolerance: float
+    max_iterations: int
+    n_rows: int
+    _groups: tuple[int, ...]
+    _targets: list[float | str | None]
+    _rates: list[float | str]
+    _drives: bool
+    _meet: list[list[bool]]
+    _block_rows: list[list[int]]
+
+    # -- names in the program -------------------------------------------------------------------
+
+    def _of(self, name: str, row: int) -> str:
+        return f"{name}{self.code}_{row}"
+
+    def _target(self, row: int) -> str:
+        """Expression of the target now."""
+        target = self._targets[row]
+        if isinstance(target, str):
+            return target
+        return self._of("target", row) + (f"+{self._rate(row)}*clock{self.code}" if self._rates[row] != 0.0 else "")
+
+    def _rate(self, row: int) -> str:
+        rate = self._rates[row]
+        return rate if isinstance(rate, str) else self._of("rate", row)
+
+    # -- program --------------------------------------------------------------------------------
+
+    def declare(self, p: Program) -> None:
+        c = self.code
+        scheme = getattr(p.integrator, "scheme", None)
+        self._leapfrog = scheme is None
+        self._single = scheme is None or len(scheme.drifts) * len(scheme.flight) == 1
+        alone = len(getattr(p.integrator, "parts", (self,))) == 1
+        self._blocks = [Block(rows, c) for rows in self._block_rows]
+        for k, name in enumerate(self.names):
+            p.vector(self._of("row", k), f"M_par^+ gradient of row {k}, {name}")
+            target, rate = self._targets[k], self._rates[k]
+            if isinstance(target, float):
+                p.setting(self._of("target", k), f"target of row {k}", target)
+            if isinstance(rate, float):
+                p.setting(self._of("rate", k), "change of this target in a ps", rate)
+            p.number(self._of("push", k), "L: x moves by L times the row")
+            p.number(self._of("more", k), "change of L")
+            p.number(self._of("sigma", k), "coordinate less target")
+            p.number(self._of("now", k), "the same, after the last push")
+            p.number(self._of("impulse", k), "multiplier times time, over this step")
+            p.number(self._of("mean", k), "multiplier, mean over the last step")
+            p.number(self._of("lambda", k), "multiplier at the start of the last step, to second order")
+            p.number(self._of("end", k), "multiplier of the last velocity projection")
+            p.number(self._of("work", k), "work done by moving the target")
+            p.number(self._of("slope", k), "rate of the coordinate less that of the target")
+        for block in self._blocks:
+            block.declare(p)
+            block.declare_newton(p)
+        p.number(f"known{c}", "whether the last velocity projection was at the start of this step")
+        p.number(f"singular{c}", "1 + number of the first row that vanishes or depends on others")
+        p.number(f"residual{c}", "size of sigma relative to the scales")
+        p.number(f"iterations{c}", "quasi-Newton iterations of the last drift")
+        p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 0 done")
+        p.number(f"held{c}", "whether the rows hold")
+        p.number(f"bad_sum{c}", "not a number if a multiplier is none")
+        if self._drives:
+            p.number(f"clock{c}", "time of the targets")
+            p.number(f"clock_start{c}", "the same at the start of the step")
+            p.number(f"clock_end{c}", "the same at its end")
+            p.number(f"pending{c}", "whether a step began")
+            p.number(f"step_start{c}", "good_steps when it began")
+        self._base, self._start = "xu", "x_last"
+        if not alone:
+            self._base = p.vector(f"base{c}", "positions as other parts leave them")
+        if self.meets_system:
+            p.vector(f"v_kept{c}", "velocities while v is used to project rows")
+            if not self._single:
+                self._start = p.vector(f"start{c}", "positions at the start of the drift")
+
+    def _gradients(self, p: Program, *, sizes: bool, slopes: bool) -> None:
+        """row = M_par^+ gradient, its Gram matrix and the inverse of that, at x."""
+        keep = self.meets_system and not (self.lean and not slopes)
+        if keep:
+            p.each(f"v_kept{self.code}", "v", "v is needed to project the rows")
+        v = f"v_kept{self.code}" if self.meets_system else "v"
+        for k, group in enumerate(self._groups):
+            row = self._of("row", k)
+            if slopes:
+                p.sum(self._of("slope", k), f"-f{group}*{v}", f"rate of {self.names[k]}")
+            if self.meets_system:
+                p.each("v", f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
+                p.hold_velocities("its part along the constraints of the System")
+                p.each(row, "v", "M_par^+ gradient")
+                if sizes:
+                    p.sum(self._of("own", k), f"f{group}*f{group}/m", "its size without those constraints")
+            else:
+                p.each(row, f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
+            for block in self._blocks:
+                if k in block.rows:
+                    for j in block.rows:
+                        if j <= k and self._meet[k][j]:
+                            p.sum(block.gram(k, j), f"-f{group}*{self._of('row', j)}", "Gram matrix")
+                    if sizes and not self.meets_system:
+                        p.let(self._of("own", k), block.gram(k, k), "its size")
+        if keep and not slopes:
+            p.each("v", f"v_kept{self.code}", "v again")
+        p.let(f"singular{self.code}", f"select(failed, singular{self.code}, 0)", "nothing wrong yet")
+        for block in self._blocks:
+            block.invert(p, f"singular{self.code}")
+
+    def begin(self, p: Program) -> None:
+        """Gradients where x is not where the last step ended."""
+        if not self._leapfrog:
+            self._gradients_kept(p)
+            p.let(f"known{self.code}", "0", "no projection was here")
+
+    def renew(self, p: Program) -> None:
+        """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
+        self._gradients_kept(p, sizes=False)
+        p.let(f"known{self.code}", "0", "no projection was here")
+
+    def remember(self, p: Program) -> None:
+        if self._drives:
+            self._set_clock(p)
+        if self._leapfrog:  # no velocity projection has computed them
+            self._gradients_kept(p)
+        if self._start == f"start{self.code}":
+            p.each(self._start, "x", "to start again from")
+
+    def _gradients_kept(self, p: Program, sizes: bool = True) -> None:
+        """Gradients for the drift; v stays."""
+        self._gradients(p, sizes=sizes, slopes=False)
+        singular = f"select(singular{self.code}, {self.code}, 0)"
+        p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
+
+    def _set_clock(self, p: Program) -> None:
+        """At the first drift of a step. A step that failed is not counted in good_steps, and its time is not kept."""
+        c = self.code
+        p.let(f"held{c}", "delta(stage-first_stage)", "does a step begin?")
+        kept = f"held{c}*pending{c}*(1-{_is(f'step_start{c}', 'good_steps')})"
+        p.let(f"clock_start{c}", f"select({kept}, clock_end{c}, clock_start{c})", "the step before was kept")
+        p.let(f"pending{c}", f"select({kept}, 0, pending{c})", "and is over")
+        p.let(f"clock{c}", f"select(held{c}, clock_start{c}, clock{c})", "time of the targets")
+        begins = f"held{c}*delta(first_stage)"
+        p.let(f"pending{c}", f"select({begins}, 1, pending{c})", "a step begins, and not constraints alone")
+        p.let(f"step_start{c}", f"select({begins}, good_steps, step_start{c})", "to see whether it is kept")
+        p.let(f"clock_end{c}", f"select({begins}, clock_start{c}+dt, clock_end{c})", "time at its end")
+
+    def land(self, p: Program, h: str) -> None:
+        c = self.code
+        rows = range(self.n_rows)
+        if self._drives:
+            p.let(f"clock{c}", f"clock{c}+select(first_stage, 0, {h})", "targets at the end of the drift")
+        if self._base != "xu":
+            p.each(self._base, "x", "positions as other parts leave them")
+        p.let(f"iterations{c}", f"select(failed, iterations{c}, 0)", "a new solve")
+        p.let(f"state{c}", "select(failed, 2, 1)", "after a failure only fly")
+        for k in rows:
+            p.let(self._of("push", k), "0", "first without")
+        pushes = "+".join(f"{self._of('push', k)}*{self._of('row', k)}" for k in rows)
+        # The first pass is written apart: a block within the loop makes the set-up of OpenMM take 15 times as long.
+        if self.meets_system:
+            p.hold_positions("onto the constraints of the System")
+        self._measure(p)
+        self._decide(p, first=True)
+        with p.loop(f"state{c} > 0", "until the rows hold"):
+            if self.meets_system:
+                p.each("x", self._start, "constraints of the System refer to where the drift began")
+                p.hold_positions("refer to here")
+            p.each("x", f"{self._base}+{pushes}", "push along the rows")
+            if self.meets_system:
+                p.hold_positions("onto the constraints of the System")
+            self._measure(p)
+            self._decide(p, first=False)
+        p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
+        begins = "delta(stage)"  # not so where constraints are applied alone
+        for k in rows:
+            push, impulse = self._of("push", k), self._of("impulse", k)
+            before = f"select({begins}, 0, {impulse})"
+            if self.lean:  # a drift of velocities that were not made tangent pushes for that as well
+                before = f"-select(behind*looked, 0.5*dt*{self._of('end', k)}, 0)"
+            p.let(impulse, f"{before}+{push}/{h}", "multiplier times time")
+            if self._leapfrog:
+                p.let(self._of("lambda", k), f"{push}/({h}*{h})", "multiplier where the drift began")
+            else:
+                at = f"select(known{c}, 0.5*({self._of('end', k)}+2*{push}/({h}*{h})), 2*{push}/({h}*{h}))"
+                if self.lean:
+                    at = f"select(behind, {push}/({h}*{h}), {at})"
+                p.let(
+                    self._of("lambda", k),
+                    f"select({begins}, {at}, {self._of('lambda', k)})",
+                    "multiplier where the step began",
+                )
+        p.let(f"known{c}", "0", "further drifts begin elsewhere")
+        if not self._single:
+            self._gradients_kept(p)
+        if self._leapfrog:
+            self._end_step(p)
+
+    def _measure(self, p: Program) -> None:
+        """sigma at x; what the last push did, for the quasi-Newton matrix."""
+        c = self.code
+        for k, group in enumerate(self._groups):
+            off = f"energy{group}-({self._target(k)})"
+            p.let(self._of("now", k), off, f"{self.names[k]} less its target")
+            if self.periods[k]:
+                now, period = self._of("now", k), repr(self.periods[k])
+                p.let(now, f"{now}-{period}*floor({now}/{period}+0.5)", "nearest image")
+        p.let(f"held{c}", f"delta(state{c}-1)", "is this an iteration?")
+        for k in range(self.n_rows):
+            now, sigma = self._of("now", k), self._of("sigma", k)
+            p.let(self._of("change", k), f"{now}-{sigma}", "what the push changed")
+            p.let(sigma, f"select(held{c}, {now}, {sigma})", "keep")
+
+    def _decide(self, p: Program, first: bool) -> None:
+        """Done, once more, or give up: then a last pass leaves x where it flew to."""
+        c, rows = self.code, range(self.n_rows)
+        squares = "+".join(f"({self._of('sigma', k)}/{self.scales[k]!r})^2" for k in rows)
+        p.let(f"residual{c}", f"sqrt({squares})", "size of sigma; not a number if one is none")
+        p.let(f"held{c}", f"held{c}*step({self.tolerance!r}-residual{c})", "do the rows hold?")
+        for block in () if first else self._blocks:
+            block.update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
+        p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
+        p.let(
+            f"state{c}",
+            f"select(delta(state{c}-1)*(1-held{c}), select(step(1e10-residual{c})"
+            f"*step({self.max_iterations - 1}-iterations{c}), 1, 2), 0)",
+            "done, or once more, or give up",
+        )
+        for block in self._blocks:
+            for k in block.rows:
+                more = f"select(delta(state{c}-1), -({block.solve(k, 'sigma')}), 0)"
+                p.let(self._of("more", k), more, "what is missing")
+        for k in rows:
+            push = self._of("push", k)
+            p.let(push, f"select(delta(state{c}-2), 0, {push}+{self._of('more', k)})", "push more")
+
+    def project(self, p: Program) -> None:
+        c, rows = self.code, range(self.n_rows)
+        if self._single:
+            self._gradients(p, sizes=False, slopes=True)
+        else:
+            for k, group in enumerate(self._groups):
+                p.sum(self._of("slope", k), f"-f{group}*v", f"rate of {self.names[k]}")
+        for k in rows:
+            if self._rates[k] != 0.0:
+                p.let(self._of("slope", k), f"{self._of('slope', k)}-({self._rate(k)})", "less that of the target")
+        for block in self._blocks:
+            for k in block.rows:
+                p.let(self._of("more", k), f"-({block.solve(k, 'slope')})", "multiplier times time")
+        p.let(f"bad_sum{c}", "+".join(f"abs({self._of('more', k)})" for k in rows), "to find what is no number")
+        bad = f"select(singular{c}, {c}, select(step(1e200-bad_sum{c}), 0, {c}))"
+        p.let("failed", f"select(failed, failed, {bad})", "independent rows, finite velocities?")
+        for k in rows:
+            p.let(self._of("more", k), f"select(failed, 0, {self._of('more', k)})", "nothing after a failure")
+        pushes = "+".join(f"{self._of('more', k)}*{self._of('row', k)}" for k in rows)
+        v = f"v_kept{c}" if self.meets_system and self._single else "v"
+        p.each("v", f"{v}+{pushes}", "tangent to the rows")
+        share = _last_share(p.integrator)
+        for k in rows:
+            p.let(self._of("end", k), f"2*{self._of('more', k)}/(dt*{share!r})", "multiplier at the end of the step")
+            impulse = f"{self._of('impulse', k)}+{self._of('more', k)}"
+            p.let(self._of("impulse", k), impulse, "all of this step")
+        p.let(f"known{c}", "delta(first_stage)", "the next step begins here")
+        self._end_step(p)
+
+    def passed(self, p: Program) -> None:
+        """At the end of a step without `project`."""
+        if any(rate != 0.0 for rate in self._rates):
+            self._end_step(p)
+
+    def _end_step(self, p: Program) -> None:
+        for k in range(self.n_rows):
+            mean, impulse, work = self._of("mean", k), self._of("impulse", k), self._of("work", k)
+            p.let(mean, f"select(first_stage, {mean}, {impulse}/dt)", "mean multiplier")
+            if self._rates[k] != 0.0:
+                done = f"{work}+select(first_stage+failed, 0, {self._rate(k)}*{impulse})"
+                p.let(work, done, "force times speed of the target")
+
+
+def _is(a: str, b: str) -> str:
+    return f"delta({a}-{b})"
+
+
+def _last_share(integrator: openmm.CustomIntegrator) -> float:
+    """Length of the last drift as a fraction of the step."""
+    scheme = getattr(integrator, "scheme", None)
+    return 1.0 if scheme is None else float(scheme.drifts[-1] * scheme.flight[-1])

@@ -1,0 +1,398 @@
+"""The Gaussian isokinetic thermostat in OpenMM: kicks in closed form that keep the kinetic energy."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.ensembles.conserved_momenta import NONE, Momenta, Momentum, conserved_momenta
+from kcons.openmm.integrator.ensemble import Value
+from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
+from kcons.steppers.compositions import Composition
+from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
+from kcons.steppers.splitting import Splitting
+from kcons.thermostats.freedom import AT_REST, atom_numbers, positive
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+#: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
+ROUNDING = 1e-12
+#: Where velocities run against a strong force, s' is a small difference; below this, digits are lost.
+_CANCELS = 1e-4
+#: Boltzmann's constant times Avogadro's number, kJ/mol/K.
+GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+
+
+class Isokinetic(Value):
+    """Constant kinetic energy, for `ProjectedIntegrator(ensemble=...)`.
+
+    Configurations are canonical at T for 2K = (g - 1) kT, g being the independent momenta: three for each particle
+    with a mass, less the rank of all constraints, less three where total momentum is conserved. A kick at fixed
+    positions has the closed form of `kcons.thermostats.isokinetic.kick` with F = M_par^+ f.
+
+    Parameters
+    ----------
+    temperature : Quantity or float, optional
+        In K if a float.
+    kinetic_energy : Quantity or float, optional
+        K itself, in kJ/mol if a float. With neither, K stays what it is at the first step.
+    convention : {'exact', 'notes'}
+        2K = (g - 1) kT, or 2K = 3 n kT of the notes (eq. 111) for n particles with a mass.
+    atoms : array_like of int or bool, optional
+        Thermostat these only. No constraint may couple them to others.
+    momentum : {'auto', 'conserved', 'free'}
+        Whether total momentum is conserved. 'auto' looks at the kinds of forces, and computes those that may know a
+        place in space.
+
+    Raises
+    ------
+    InputError
+        Temperature or energy not positive, both of them, unknown words.
+
+    Warns
+    -----
+    UserWarning
+        At the first step: total momentum is conserved and not zero, or the System is a free cluster, on which no
+        torque acts. Neither samples a temperature.
+
+    Notes
+    -----
+    Schemes: 'rattle', 'geodesic', 'leapfrog' (order 2), 'isokinetic4' and 'isokinetic6'. Targets must rest. Of the
+    leapfrog, K at half steps is constant, and is what the Context tells as kinetic energy.
+
+    References
+    ----------
+    See `kcons.thermostats.Isokinetic`.
+    """
+
+    stays_tangent = True
+    halves = False
+    adds_up = True
+    temperature: float | None
+    kinetic_energy: float | None
+    convention: Literal["exact", "notes"]
+    #: Numbers, or True and False for each particle.
+    atoms: tuple[int, ...] | tuple[bool, ...] | None
+    momentum: Momentum
+
+    def __init__(
+        self,
+        temperature: unit.Quantity | float | None = None,
+        *,
+        kinetic_energy: unit.Quantity | float | None = None,
+        convention: Literal["exact", "notes"] = "exact",
+        atoms: ArrayLike | None = None,
+        momentum: Momentum = "auto",
+    ) -> None:
+        if convention not in ("exact", "notes"):
+            raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
+        if momentum not in ("auto", "conserved", "free"):
+            raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
+        if temperature is not None and kinetic_energy is not None:
+            raise InputError("give temperature or kinetic_energy, not both", item="temperature")
+        self._keep(
+            temperature=None if temperature is None else positive(kelvins(temperature), "temperature"),
+            kinetic_energy=None if kinetic_energy is None else _energy(kinetic_energy),
+            convention=convention,
+            atoms=None if atoms is None else tuple(np.asarray(atoms).tolist()),
+            momentum=momentum,
+        )
+
+    def __repr__(self) -> str:
+        given = [f"{self.temperature:g} K"] if self.temperature is not None else []
+        if self.kinetic_energy is not None:
+            given.append(f"K = {self.kinetic_energy:g} kJ/mol")
+        if self.convention != "exact":
+            given.append(f"convention={self.convention!r}")
+        if self.atoms is not None:
+            given.append(f"atoms=<{len(self.atoms)} atoms>")
+        return f"Isokinetic({', '.join(given)})"
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for schemes whose order is lost with kicks that are quadratic in v."""
+        if isinstance(scheme, RungeKuttaNystrom) or (isinstance(scheme, Composition) and scheme.order > 2):
+            raise UnsupportedError(
+                f"{scheme!r} loses its order with the isokinetic thermostat, whose kicks are not linear; use "
+                "'isokinetic4' or 'isokinetic6'"
+            )
+
+    # -- program --------------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        p = program
+        p.number("two_k", "2K, kept; 0 until the first step")
+        p.number("growth", "integral of alpha over time")
+        p.number("lost", "kicks that turned velocities round and lost digits")
+        p.vector("w", "velocities before a kick")
+        for name, words in (
+            ("ww", "w.M.w"),
+            ("wq", "w.M.q, q = h M_par^+ f"),
+            ("qq", "q.M.q"),
+            ("z", "sqrt(q.M.q/2K)"),
+            ("aim", "cosine between w and q"),
+            ("decay", "exp(-z)"),
+            ("sinhc", "exp(-z) sinh(z)/z"),
+            ("coshc", "exp(-z) (cosh(z)-1)/z^2"),
+            ("scale", "exp(-z) s', by which velocities are divided"),
+            ("keep", "share of w"),
+            ("push", "share of q"),
+        ):
+            p.number(name, words)
+        if self.atoms is not None:
+            p.vector("share", "1 for thermostatted particles, 0 for others")
+        if p.integrator.getKineticEnergyExpression().startswith("m*u*u"):
+            p.integrator.setKineticEnergyExpression("m*u*u/2; u=v-impulse")
+
+    def kick(
+        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+    ) -> None:
+        """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
+
+        F = M_par^+ f only enters as q = h F, which is of the size of velocities.
+        """
+        p, of = program, "" if self.atoms is None else "share*"
+        if impulse:
+            p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        if impulse or not tangent:
+            project()
+        p.each("w", "v", "velocities before the kick")
+        p.each("v", f"{h}*{force}/m", "kick by the applied forces alone")
+        project()
+        p.sum("ww", f"{of}m*w*w", "2K before")
+        p.sum("wq", f"{of}m*w*v", "along the kick")
+        p.sum("qq", f"{of}m*v*v", "size of the kick")
+        # h = 0 where constraints are applied alone: nothing changes then. 1e-300 keeps 0/0 away.
+        p.let("z", f"select({h}, max(sqrt(qq/two_k), 1e-300), 1e-300)", "strength of the kick")
+        p.let("aim", "min(max(wq/sqrt(max(ww*qq, 1e-300)), -1), 1)", "direction of the kick")
+        p.let("decay", "exp(-z)", "all is divided by exp(z)")
+        # sinh is exact near 0, where 1 - exp(-2z) is not.
+        p.let("sinhc", "select(step(z-1), 0.5*(1-decay^2), decay*sinh(min(z, 1)))/z", "closed form")
+        p.let("coshc", "0.5*(select(step(z-1), 1-decay, 2*exp(-0.5*z)*sinh(0.5*min(z, 1)))/z)^2", "closed form")
+        p.let("scale", "max(aim*z*sinhc+0.5*(1+decay^2), 1e-300)", "closed form")
+        p.let("lost", f"lost+step({_CANCELS!r}-scale)", "count what cannot be trusted")
+        p.let("growth", "growth+z+log(scale)", "alpha over time")
+        # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
+        p.let("keep", f"select({h}, sqrt(two_k/ww), 1)*decay/scale", "share of the velocities")
+        p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
+        after = "keep*w+push*v"
+        if self.atoms is not None:
+            after = f"select(share, {after}, w+v)"
+        p.each("v", after, "kick")
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        raise NotImplementedError
+
+    # -- a run ----------------------------------------------------------------------------------
+
+    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+        """Find g and K; scale the velocities, unless they are right to rounding.
+
+        Raises
+        ------
+        InputError
+            All velocities are zero; bad particle numbers.
+        OverdeterminedError
+            g is 1 where a temperature is asked for, or 0.
+        UnsupportedError
+            A constraint couples thermostatted particles to others; targets move.
+        """
+        if integrator.parts and integrator.scheme is None:
+            raise UnsupportedError("the isokinetic leapfrog holds constraints of the System only; use scheme='rattle'")
+        moving = [part for part in integrator.parts if getattr(part, "driven", False)]
+        if moving:
+            raise UnsupportedError(
+                f"the isokinetic thermostat in OpenMM needs targets that rest, and those of {moving[0]!r} move; use "
+                "Langevin, or kcons.ase.IsokineticDynamics"
+            )
+        masses, v = self._masses(integrator, context), velocities_of(context)
+        if self.atoms is None and removes_centre_of_mass_motion(context.getSystem()):
+            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover would do
+        found = float(masses @ np.einsum("ij,ij->i", v, v))
+        if not found > 0:
+            raise InputError(
+                "the isokinetic thermostat needs non-zero kinetic energy: call "
+                "integrator.setVelocitiesToTemperature(context, T) first",
+                item="velocities",
+            )
+        momenta = self._momenta(integrator, context)
+        twice = self._twice_kinetic(self._count(integrator, context, momenta), int(np.sum(masses > 0)), found)
+        if _momentum_share(masses, v, momenta.directions) > AT_REST:
+            warnings.warn(
+                "total momentum is not zero, and a thermostat that scales velocities scales it too instead of "
+                "forgetting it: no temperature is sampled. Take it out of the velocities first, or use Langevin",
+                stacklevel=5,
+            )
+        elif momenta.angular and self.temperature is not None:
+            warnings.warn(
+                "the forces exert no torque (a free cluster), so that angular momentum is only scaled by the "
+                "thermostat and never forgotten: configurations are not canonical. Use Langevin",
+                stacklevel=5,
+            )
+        if self.atoms is not None:
+            share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
+            integrator.setPerDofVariableByName("share", share.tolist())
+        integrator.program.write("two_k", twice)
+        if abs(found / twice - 1) > ROUNDING:
+            v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
+            context.setVelocities(v)
+
+    def verify(self, integrator: ProjectedIntegrator) -> None:
+        """Raise `ConvergenceError` if kicks have lost digits."""
+        if integrator.getGlobalVariableByName("lost"):
+            integrator.program.write("lost", 0.0)
+            raise ConvergenceError(
+                "a kick turned all velocities round against a force that stops them many times over within the "
+                "step, and lost digits; take a smaller time step"
+            )
+
+    def _masses(self, integrator: ProjectedIntegrator, context: openmm.Context) -> np.ndarray:
+        """Of thermostatted particles; 0 for others."""
+        system = context.getSystem()
+        n = system.getNumParticles()
+        masses = np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(n)])
+        if self.atoms is None:
+            return masses
+        inside = np.zeros(n, dtype=bool)
+        inside[atom_numbers(np.asarray(self.atoms), n)] = True
+        if integrator.parts:
+            raise UnsupportedError(
+                "a part of the particles can be thermostatted beside constraints of the System, not beside parts="
+            )
+        for k in range(system.getNumConstraints()):
+            i, j, _ = system.getConstraintParameters(k)
+            if inside[i] != inside[j]:
+                raise UnsupportedError(
+                    f"constraint {k} of the System couples the thermostatted particle {i if inside[i] else j} to "
+                    f"{j if inside[i] else i}, which is not; choose particles such that every constraint is wholly "
+                    "inside or outside"
+                )
+        return np.where(inside, masses, 0.0)
+
+    def _momenta(self, integrator: ProjectedIntegrator, context: openmm.Context) -> Momenta:
+        if self.atoms is not None:
+            return NONE
+        return conserved_momenta(integrator, context, self.momentum)
+
+    def _count(self, integrator: ProjectedIntegrator, context: openmm.Context, momenta: Momenta) -> int:
+        """g: momenta that are thermostatted and independent."""
+        if self.atoms is None:
+            count = integrator.independent_momenta(context)
+        else:
+            masses = self._masses(integrator, context)
+            rows = SystemRows.of(context.getSystem())
+            inside = masses[rows.pairs].any(axis=1)
+            some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
+            count = 3 * int(np.sum(masses > 0)) - some.rank(positions_of(context))
+        count -= len(momenta.directions)
+        if count < 1:
+            raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
+        integrator._watch().thermal = count
+        return count
+
+    def _twice_kinetic(self, count: int, n_moving: int, found: float) -> float:
+        if self.kinetic_energy is not None:
+            return 2 * self.kinetic_energy
+        if self.temperature is None:
+            return found
+        if self.convention == "notes":
+            return 3 * n_moving * GAS_CONSTANT * self.temperature
+        if count < 2:
+            raise OverdeterminedError(
+                "g - 1 = 0: isokinetic temperature undefined for a single degree of freedom; give kinetic_energy, or "
+                "use Langevin",
+                rows=(),
+            )
+        return (count - 1) * GAS_CONSTANT * self.temperature
+
+    # -- what can be read -----------------------------------------------------------------------
+
+    def count(self, integrator: ProjectedIntegrator) -> int:
+        """g of an integrator: its momenta that are thermostatted and independent."""
+        guard = integrator._watch()
+        if guard.thermal is None:
+            return self._count(integrator, guard.context, self._momenta(integrator, guard.context))
+        return guard.thermal
+
+    def warmth(self, integrator: ProjectedIntegrator) -> float:
+        """2 K/(g k) times this is the temperature of the configurations."""
+        count = self.count(integrator)
+        if self.atoms is not None or count < 2:
+            return 1.0
+        return integrator.degrees_of_freedom() / (count - 1)
+
+    def settings(self) -> dict[str, float]:
+        return {}
+
+    def at(self, temperature: float) -> Isokinetic:
+        atoms = None if self.atoms is None else np.asarray(self.atoms)
+        return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        """Kicks scale the velocities from the next step on."""
+        if integrator.getGlobalVariableByName("two_k"):
+            masses = self._masses(integrator, integrator.context)
+            twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
+            integrator.program.write("two_k", twice)
+
+    def friction(self, integrator: ProjectedIntegrator) -> float:
+        """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
+        context = integrator.context
+        masses, v = self._masses(integrator, context), velocities_of(context)
+        state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
+        f = np.asarray(state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer))
+        inside = masses > 0
+        return float(np.sum(v[inside] * f[inside]) / (masses @ np.einsum("ij,ij->i", v, v)))
+
+    def compression_rate(self, integrator: ProjectedIntegrator) -> float:
+        """Divergence of the flow in phase space, -(g - 1) alpha, in 1/ps."""
+        return -(self.count(integrator) - 1) * self.friction(integrator)
+
+    def conserved_energy(self, integrator: ProjectedIntegrator) -> float:
+        """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
+        state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
+        heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
+        return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
+
+
+def kelvins(temperature: unit.Quantity | float) -> float:
+    """A temperature in K, not below zero.
+
+    Raises
+    ------
+    InputError
+        It is none.
+    """
+    value = temperature
+    if unit.is_quantity(value):
+        if not value.unit.is_compatible(unit.kelvin):  # type: ignore[union-attr]
+            raise InputError(f"temperature is {temperature}; give it in K", item="temperature")
+        value = value.value_in_unit(unit.kelvin)  # type: ignore[union-attr]
+    if not 0 <= float(value) < math.inf:  # type: ignore[arg-type]
+        raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
+    return float(value)  # type: ignore[arg-type]
+
+
+def _energy(energy: unit.Quantity | float) -> float:
+    if unit.is_quantity(energy):
+        energy = energy.value_in_unit(unit.kilojoule_per_mole)  # type: ignore[union-attr]
+    return positive(energy, "kinetic_energy")  # type: ignore[arg-type]
+
+
+def _momentum_share(masses: np.ndarray, v: np.ndarray, directions: np.ndarray) -> float:
+    """|P|^2/(M 2K) along directions."""
+    if not len(directions):
+        return 0.0
+    p = directions @ (masses @ v)
+    return float(p @ p / (masses.sum() * (masses @ np.einsum("ij,ij->i", v, v))))

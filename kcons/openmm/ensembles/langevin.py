@@ -1,0 +1,97 @@
+"""Geodesic Langevin dynamics in OpenMM: friction and noise in the tangent plane, in the middle of the drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from openmm import unit
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT, kelvins
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.program import Program
+from kcons.steppers.splitting import Splitting
+
+
+class Langevin(ConstantEnergy):
+    """Canonical ensemble, for `ProjectedIntegrator(ensemble=...)`: half a kick, half a drift along the constraints,
+
+        v = P (exp(-gamma h) v + sqrt((1 - exp(-2 gamma h)) kT/m) noise),    P = M_par^+ M,
+
+    half a drift, half a kick (g-BAOAB). One force evaluation a step. `setRandomNumberSeed` of the integrator makes
+    a run reproducible, as far as the platform's forces are. A value: to change temperature or friction of a run, call
+    `setTemperature` and `setFriction` of its integrator.
+
+    Parameters
+    ----------
+    temperature : Quantity or float
+        In K if a float; 0 for friction without noise.
+    friction : Quantity or float
+        gamma in 1/ps if a float; 0 for none.
+
+    Raises
+    ------
+    InputError
+        A temperature or a friction below zero.
+
+    Notes
+    -----
+    Scheme: 'rattle'. For virtual sites use openmm.LangevinMiddleIntegrator.
+
+    References
+    ----------
+    Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
+    """
+
+    halves = True
+    adds_up = False
+    temperature: float
+    friction: float
+
+    def __init__(self, temperature: unit.Quantity | float, friction: unit.Quantity | float) -> None:
+        gamma = friction
+        if unit.is_quantity(gamma):
+            if not gamma.unit.is_compatible(unit.picosecond**-1):  # type: ignore[union-attr]
+                raise InputError(f"friction is {friction}; give it in 1/ps", item="friction")
+            gamma = gamma.value_in_unit(unit.picosecond**-1)  # type: ignore[union-attr]
+        if not 0 <= float(gamma) < float("inf"):  # type: ignore[arg-type]
+            raise InputError(f"friction is {friction}; give a number in 1/ps, not below zero", item="friction")
+        self._keep(temperature=kelvins(temperature), friction=float(gamma))  # type: ignore[arg-type]
+
+    def __repr__(self) -> str:
+        return f"Langevin({self.temperature:g} K, {self.friction:g}/ps)"
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for all schemes but 'rattle'."""
+        if scheme is None:
+            raise UnsupportedError(
+                "Langevin needs velocities at the time of the positions, and those of the leapfrog are half a step "
+                "behind; for virtual sites use openmm.LangevinMiddleIntegrator"
+            )
+        if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
+            raise UnsupportedError(f"Langevin splits the drift of scheme='rattle' in two; {scheme!r} has another form")
+
+    def declare(self, program: Program) -> None:
+        kT, friction = self.settings().values()
+        program.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", kT)
+        program.setting("friction", "1/ps", friction)
+        program.number("kept_share", "what friction leaves of v in a step")
+        program.number("spread", "size of the noise")
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        p = program
+        p.let("kept_share", "exp(-friction*dt)", "friction")
+        # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
+        p.let("spread", "sqrt(2*kT*kept_share*sinh(friction*dt))", "noise")
+        p.each("v", f"kept_share*(v+{impulse})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
+        project()
+
+    def settings(self) -> dict[str, float]:
+        return {"kT": GAS_CONSTANT * self.temperature, "friction": self.friction}
+
+    def at(self, temperature: float) -> Langevin:
+        return Langevin(temperature, self.friction)
+
+    def with_friction(self, friction: unit.Quantity | float) -> Langevin:
+        """The same with another friction."""
+        return Langevin(self.temperature, friction)

@@ -1,0 +1,130 @@
+"""Copies of an integrator, and the way back from XML, where OpenMM forgets the class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import openmm
+
+from kcons.errors import InputError
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.schemes import LEAPFROG, SCHEMES
+from kcons.steppers.splitting import Splitting
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.ensemble import Ensemble
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+#: Globals that belong to a run, not to the integrator: a copy starts without them.
+RUN_STATE = frozenset(
+    [
+        "good_steps",
+        "stale",
+        "moved",
+        "stage",
+        "h",
+        "per_h",
+        "looked",
+        "behind",
+        "led",
+        "loose",
+        "dt_last",
+        "kick",
+        "growth",
+        "lost",
+    ]
+)
+
+
+def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:
+    """What a user may have set: seed, force groups, global variables."""
+    names = [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
+    program = getattr(integrator, "program", None)
+    return {
+        "seed": integrator.getRandomNumberSeed(),
+        "groups": integrator.getIntegrationForceGroups(),
+        "globals": {name: integrator.getGlobalVariableByName(name) for name in names if name not in RUN_STATE},
+        "settings": {} if program is None else dict(program.settings),
+    }
+
+
+def apply_settings(integrator: ProjectedIntegrator, settings: dict[str, Any]) -> None:
+    """What was set, but no setting of the ensemble or of a part that the integrator itself has kept."""
+    program = integrator.program
+    integrator.setRandomNumberSeed(settings["seed"])
+    openmm.Integrator.setIntegrationForceGroups(integrator, settings["groups"])
+    for name, value in settings["globals"].items():
+        if name not in program.settings and name not in program.idle:
+            program.write(name, value)
+    for name, value in settings["settings"].items():
+        program.set(name, value)
+
+
+def remade(kind: type[ProjectedIntegrator], making: tuple[Any, ...], settings: dict[str, Any]) -> ProjectedIntegrator:
+    """The integrator of these arguments and settings; what pickles call."""
+    dt, scheme, parts, tolerance, check_every, ensemble = making
+    made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
+    apply_settings(made, settings)
+    return made
+
+
+def as_projected(
+    kind: type[ProjectedIntegrator],
+    integrator: openmm.CustomIntegrator,
+    parts: Sequence[Part] = (),
+    check_every: int | None = None,
+    ensemble: Ensemble | None = None,
+) -> ProjectedIntegrator:
+    """The integrator of this class that has the program of `integrator`.
+
+    Raises
+    ------
+    InputError
+        It is no program of this class with these parts.
+    """
+    if not isinstance(integrator, openmm.CustomIntegrator):
+        raise InputError(f"{type(integrator).__name__} is no CustomIntegrator", item="integrator")
+    wanted = program_of(integrator)
+    for scheme in _candidates(integrator, bool(parts)):
+        making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
+        made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
+        if program_of(made) == wanted:
+            apply_settings(made, settings_of(integrator))
+            return made
+    raise InputError(
+        f"this CustomIntegrator has no program of {kind.__name__} with "
+        f"{f'these {len(parts)} parts' if parts else 'no parts'}; give the same parts as when it was made",
+        item="integrator",
+    )
+
+
+def program_of(integrator: openmm.CustomIntegrator) -> tuple[Any, ...]:
+    """Everything that decides what the integrator does."""
+    names = range(integrator.getNumPerDofVariables())
+    tables = []
+    for k in range(integrator.getNumTabulatedFunctions()):
+        table = integrator.getTabulatedFunction(k)
+        values = table.getFunctionParameters() if isinstance(table, openmm.Discrete1DFunction) else ()
+        tables.append((integrator.getTabulatedFunctionName(k), tuple(values)))
+    return (
+        tuple(tuple(integrator.getComputationStep(k)) for k in range(integrator.getNumComputations())),
+        tuple(integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())),
+        tuple(integrator.getPerDofVariableName(k) for k in names),
+        tuple(tables),
+        integrator.getKineticEnergyExpression(),
+    )
+
+
+def _candidates(integrator: openmm.CustomIntegrator, parts: bool) -> Iterable[str | Splitting]:
+    """Schemes by name, then what the tables say, for splittings of one's own."""
+    yield from SCHEMES
+    yield LEAPFROG
+    tables = dict(program_of(integrator)[3])
+    if "drift_share" in tables:
+        drifts, kicks = list(tables["drift_share"]), list(tables["kick_share"])
+        if parts:  # two entries more, for applying constraints alone
+            drifts, kicks = drifts[:-2], kicks[:-2]
+        if kicks[0]:
+            yield Splitting(kicks, drifts)
+        yield Splitting(kicks[1:-1], drifts)

@@ -1,0 +1,166 @@
+"""How velocities change between the drifts: what a statistical ensemble adds to an integrator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+import openmm
+
+from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.program import Program
+from kcons.steppers.splitting import Splitting
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+
+class Ensemble(Protocol):
+    """The kicks of an integrator, and what happens in the middle of its step.
+
+    A value: it never changes, and may be given to any number of integrators. What changes belongs to the integrator.
+
+    Attributes
+    ----------
+    stays_tangent : bool
+        Whether kicks leave v tangent to all constraints at x: a step that ends with a kick ends without a projection
+        of its own then.
+    halves : bool
+        Whether `middle` does something, between two halves of the only drift.
+    adds_up : bool
+        Whether two kicks at the same place, which are one of the sum of their times, are better made as one.
+    """
+
+    stays_tangent: bool
+    halves: bool
+    adds_up: bool
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
+        ...
+
+    def declare(self, program: Program) -> None:
+        """Variables and tables."""
+        ...
+
+    def kick(
+        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+    ) -> None:
+        """Let the applied forces act for a time.
+
+        For h = 0 it must do nothing but add the impulse: so the constraints are applied alone.
+
+        Parameters
+        ----------
+        program : Program
+        h : str
+            Expression of the time.
+        force : str
+            Name of the applied forces.
+        impulse : str
+            Expression that is to be added to v before (that of the drift that came before), or ''.
+        project : callable
+            Writes the computations that make v tangent to all constraints at x.
+        tangent : bool
+            Whether v is tangent before, without the impulse.
+        """
+        ...
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        """Between two halves of the drift; adds the impulse of the first, and leaves v tangent."""
+        ...
+
+    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+        """At the first step of a run, x and v on the constraints.
+
+        Raises
+        ------
+        KconsError
+            The ensemble does not exist for this System or this start.
+        """
+        ...
+
+    def verify(self, integrator: ProjectedIntegrator) -> None:
+        """Raise `ConvergenceError` if something went wrong since the last check."""
+        ...
+
+    def warmth(self, integrator: ProjectedIntegrator) -> float:
+        """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
+        ...
+
+    def settings(self) -> dict[str, float]:
+        """The global variables of the program that are settings of the ensemble, by name."""
+        ...
+
+    def at(self, temperature: float) -> Ensemble:
+        """The same at another temperature (K)."""
+        ...
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        """The integrator has taken this ensemble in the middle of a run."""
+        ...
+
+
+class Value:
+    """Attributes that are given once; equal if they are."""
+
+    def _keep(self, **attributes: Any) -> None:
+        self.__dict__.update(attributes)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise UnsupportedError(
+            f"{self!r} is a value and does not change: call setTemperature or setFriction of the integrator, or make "
+            f"another {type(self).__name__}"
+        )
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and other.__dict__ == self.__dict__
+
+    def __hash__(self) -> int:
+        return hash((type(self), *self.__dict__.items()))
+
+
+class ConstantEnergy(Value):
+    """Newton's equations: v += h f/m."""
+
+    stays_tangent = False
+    halves = False
+    adds_up = False
+
+    def check(self, scheme: Splitting | None) -> None:
+        pass
+
+    def declare(self, program: Program) -> None:
+        pass
+
+    def kick(
+        self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
+    ) -> None:
+        if impulse:
+            program.each("v", f"v+{impulse}+{h}*{force}/m", "the constraint forces act, then the applied ones (kick)")
+        else:
+            program.each("v", f"v+{h}*{force}/m", "the applied forces act (kick)")
+
+    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+        raise NotImplementedError
+
+    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+        pass
+
+    def verify(self, integrator: ProjectedIntegrator) -> None:
+        pass
+
+    def warmth(self, integrator: ProjectedIntegrator) -> float:
+        return 1.0
+
+    def settings(self) -> dict[str, float]:
+        return {}
+
+    def at(self, temperature: float) -> Ensemble:
+        raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
+
+    def follow(self, integrator: ProjectedIntegrator) -> None:
+        pass

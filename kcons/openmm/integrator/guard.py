@@ -1,0 +1,402 @@
+"""An integrator's view of the Context it belongs to: checks before and during a run, and the way back."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import weakref
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import openmm
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
+from kcons.motion.certificate import MOST, SHARE
+from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.system_checks import (
+    SystemRows,
+    check_system,
+    forces_of,
+    refuse_forgotten_parts,
+    removes_centre_of_mass_motion,
+)
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+logger = logging.getLogger("kcons.openmm")
+
+#: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
+NEAR = 0.1
+#: With a note in the log, unless it is what a looser tolerance or single precision leaves.
+TIDY = 1e-4
+#: What rounding may add to a relative distance, near the origin.
+_ROUNDING = 1e-12
+_REMEDY = "let kcons hold these constraints: take them out of the System and hand them over as constraint objects"
+
+
+def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
+    """The Context that was made with this integrator, alone or within a CompoundIntegrator."""
+    address = int(integrator.this)
+    for thing in gc.get_objects():
+        if issubclass(type(thing), openmm.Context):
+            owner = getattr(thing, "_integrator", None)
+            if owner is integrator:
+                return thing
+            if isinstance(owner, openmm.CompoundIntegrator):
+                parts = (owner.getIntegrator(k) for k in range(owner.getNumIntegrators()))
+                if any(int(part.this) == address for part in parts):
+                    return thing
+    return None
+
+
+# A State is in nm and ps whatever else is in use: _value spares the conversion, which takes longer than small Systems.
+
+
+def positions_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+
+def velocities_of(context: openmm.Context) -> FloatArray:
+    return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
+
+
+def _box(context: openmm.Context) -> Any:
+    return context.getState().getPeriodicBoxVectors()._value
+
+
+class Guard:
+    """Watches over one Context.
+
+    Parameters
+    ----------
+    context : openmm.Context
+    integrator : ProjectedIntegrator
+
+    Raises
+    ------
+    UnsupportedError
+        The System cannot be propagated, see `check_system`.
+    """
+
+    def __init__(self, context: openmm.Context, integrator: ProjectedIntegrator) -> None:
+        self._context = weakref.ref(context)
+        self._integrator = weakref.ref(integrator)
+        self.system = context.getSystem()
+        check_system(self.system, leapfrog=integrator.scheme is None)
+        refuse_forgotten_parts(self.system, integrator.row_groups)
+        self.rows = SystemRows.of(self.system)
+        #: Whether something in the System moves x between steps.
+        self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
+        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
+        #: Whether the set-up was checked.
+        self.started = False
+        #: Whether others may have moved x or v since: the next step looks where they are.
+        self.disturbed = True
+        #: g of the thermostat, once it is known.
+        self.thermal: int | None = None
+        self.since_check = 0
+        self._surroundings: tuple[object, ...] | None = None
+        self._good: openmm.State | None = None
+        #: When the last check ended, what it took, and how many were put off since.
+        self._checked, self._cost, self._put_off = perf_counter(), 0.0, 0
+        self._freedom: int | None = None
+        self._left: tuple[int, Any] | None = None
+        self._parameters: dict[str, float] | None = None
+
+    @property
+    def alive(self) -> openmm.Context | None:
+        return self._context()
+
+    @property
+    def context(self) -> openmm.Context:
+        context = self._context()
+        assert context is not None
+        return context
+
+    @property
+    def integrator(self) -> ProjectedIntegrator:
+        integrator = self._integrator()
+        assert integrator is not None
+        return integrator
+
+    # -- constraints of the System --------------------------------------------------------------
+
+    def limit(self, x: FloatArray) -> FloatArray:
+        """What each relative residual may be, given the tolerance and the size of the coordinates."""
+        reach = np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0) / self.rows.lengths
+        # The tolerance is that of the solver; OpenMM checks the squares of the distances.
+        return np.asarray(2 * self.integrator.getConstraintTolerance() + _ROUNDING + 4e-16 * reach)
+
+    def check_rows(self, x: FloatArray, step: int | None) -> None:
+        """Raise if a constraint of the System is not fulfilled at positions x."""
+        if not self.rows.n_rows:
+            return
+        miss = np.abs(self.rows.stretches(x))
+        excess = miss / self.limit(x)
+        row = int(np.argmax(excess))
+        if not excess[row] <= 1:  # also NaN
+            tolerance = self.integrator.getConstraintTolerance()
+            raise ConvergenceError(
+                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g}: the "
+                f"solvers of OpenMM did not converge and do not tell. Take a smaller time step, or {_REMEDY}",
+                residual=float(miss[row]),
+                tolerance=tolerance,
+                row=int(self.rows.numbers[row]),
+                atoms=self.rows.pairs[row],
+                step=step,
+            )
+
+    def begin(self) -> None:
+        """Before the first step, and where others may have moved x or v: both on the constraints.
+
+        Raises
+        ------
+        InputError
+            Positions are off the constraints by more than `NEAR`.
+        NonFiniteError
+            A NaN or infinity in positions or velocities.
+        KconsError
+            What a part finds wrong.
+        """
+        context, integrator = self.context, self.integrator
+        x, v = positions_of(context), velocities_of(context)
+        _check_finite(x, v, context.getStepCount(), False)
+        try:
+            self._put_right(x)
+            self._make_tangent(velocities_of(context))
+            for part in integrator.parts:
+                if not self.started:
+                    part.check(context)
+                elif not (getattr(part, "steered", False) and self._parameters != dict(context.getParameters())):
+                    self._refuse(part.worst_miss(context, velocities=not self._late))
+            if not self.started:
+                integrator.ensemble.begin(integrator, context)
+        except Exception:
+            context.setPositions(x)
+            context.setVelocities(v)
+            raise
+        self.started, self.disturbed = True, False
+        self._remember(context.getState(positions=True, velocities=True))
+
+    @property
+    def _late(self) -> bool:
+        """Whether velocities are those of half a step before, and on no constraints at x."""
+        return self.integrator.scheme is None
+
+    def _put_right(self, x: FloatArray) -> None:
+        """Bring positions that are near the constraints onto them."""
+        integrator, context = self.integrator, self.context
+        miss = np.abs(self.rows.stretches(x))
+        row = int(np.argmax(miss)) if len(miss) else 0
+        if len(miss) and not miss[row] <= NEAR:
+            raise InputError(
+                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative) at the start; minimise the energy or "
+                "call integrator.applyConstraints(context) first",
+                item="positions",
+                atoms=self.rows.pairs[row],
+            )
+        misses = [part.worst_miss(context, velocities=False) for part in integrator.parts]
+        near = any(found is not None and found.near for found in misses)
+        if not near and not np.any(miss > self.limit(x)):
+            return
+        if near:
+            integrator.applyConstraints(context)
+        else:
+            context.applyConstraints(integrator.getConstraintTolerance())
+        now = positions_of(context)
+        self.check_rows(now, None)
+        if near or miss[row] > TIDY:
+            moved = float(np.sqrt(np.max(np.sum((now - x) ** 2, axis=1))))
+            worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
+            worst = next((f"the {found}" for found in misses if found is not None), worst)
+            logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
+
+    def _refuse(self, miss: Miss | None) -> None:
+        if miss is not None:
+            raise InputError(
+                f"the {miss}. What moved them does not know the rows that are held (OpenMM's minimiser is one: take "
+                "integrator.minimizeEnergy); call integrator.applyConstraints(context) and "
+                "integrator.applyVelocityConstraints(context)",
+                item=miss.what,
+                atoms=miss.atoms,
+            )
+
+    def _make_tangent(self, v: FloatArray) -> None:
+        """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
+        integrator, context = self.integrator, self.context
+        if self._late:
+            # What is taken away here the first drift would take away: the leapfrog's way is the same, but the first
+            # impulse, which enters the kinetic energy, is that of a smooth motion.
+            off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
+        else:
+            off = not self.started and bool(integrator.parts and integrator.getGlobalVariableByName("stale"))
+            off = off or self._speed_miss(positions_of(context), v) is not None
+            off = off or any(part.worst_miss(context) is not None for part in integrator.parts)
+        if off:
+            integrator.applyVelocityConstraints(context)
+
+    def _speed_miss(self, x: FloatArray, v: FloatArray) -> Miss | None:
+        """A constraint of the System along which particles move."""
+        rows, tolerance = self.rows, self.integrator.getConstraintTolerance()
+        if not rows.n_rows:
+            return None
+        allowed = (10 * tolerance + _ROUNDING) * rows.speeds_of_one(v) + self.limit(x) * np.sqrt(np.mean(v * v))
+        return Miss.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
+
+    # -- between and after steps ----------------------------------------------------------------
+
+    def surroundings_changed(self) -> bool:
+        """Whether parameters or the box were changed since the last call: forces that were kept are old then."""
+        context = self.context
+        now = (dict(context.getParameters()), _box(context))
+        before, self._surroundings = self._surroundings, now
+        return before is not None and before != now
+
+    def note_surroundings(self) -> None:
+        self.surroundings_changed()
+
+    def meet_others(self) -> None:
+        """Make OpenMM compute forces anew if since the last step the box was changed, or others have made steps.
+
+        It keeps the forces of a CustomIntegrator whatever happens to the box, and whatever the other integrators of a
+        CompoundIntegrator do to x.
+        """
+        context = self.context
+        if self._left is not None and self._left != (context.getStepCount(), _box(context)):
+            context.setVelocities(velocities_of(context))
+            self.disturbed = False
+
+    def leave(self) -> None:
+        """A call of `step` ends."""
+        context = self.context
+        self._left = context.getStepCount(), _box(context)
+        if any(getattr(part, "steered", False) for part in self.integrator.parts):
+            self._parameters = dict(context.getParameters())
+
+    def count(self, steps: int) -> None:
+        """Count steps that were made; check where a check is due.
+
+        Where the integrator may spare them, checks wait while they would take more than `SHARE` of the time.
+
+        Raises
+        ------
+        CertificateError, ConvergenceError, NonFiniteError
+            The Context is put back to where it was checked last.
+        """
+        self.since_check += steps
+        self.disturbed = False
+        if not self.integrator.check_every or self.since_check < self.integrator.check_every:
+            return
+        spare = self.integrator.spare and self._put_off < MOST
+        if spare and self._cost > SHARE * (perf_counter() - self._checked):
+            self._put_off += 1
+            self.since_check = 0
+            return
+        self.check()
+
+    def check(self) -> None:
+        """Positions and velocities finite and on all that is held, or back to where they were.
+
+        What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
+        velocities of the Context, whatever the solvers have found.
+        """
+        context, integrator = self.context, self.integrator
+        step, begun = context.getStepCount(), perf_counter()
+        try:
+            integrator.ensemble.verify(integrator)
+            now = context.getState(positions=True, velocities=True)
+            x = np.asarray(now.getPositions(asNumpy=True)._value)
+            v = np.asarray(now.getVelocities(asNumpy=True)._value)
+            _check_finite(x, v, step, self.rows.n_rows > 0)
+            self.check_rows(x, step)
+            misses = [] if self._late else [self._speed_miss(x, v)]
+            misses += [part.worst_miss(context, velocities=not self._late) for part in integrator.parts]
+            for miss in misses:
+                self.certify(miss, f"at step {step} ")
+        except (CertificateError, ConvergenceError, NonFiniteError) as error:
+            error.step = step
+            if isinstance(error, CertificateError):
+                error.state = self._good
+            if not self.disturbed and self._good is not None:
+                self.put_back()
+                good = context.getStepCount()
+                error.args = (
+                    f"{error}. The Context is back at step {good}, the last that was checked",
+                    *error.args[1:],
+                )
+            raise
+        self._remember(now)
+        self._cost = self._checked - begun
+
+    def certify(self, miss: Miss | None, where: str = "") -> None:
+        """Raise `CertificateError` for a miss that the solvers have not told of."""
+        if miss is not None:
+            raise CertificateError(
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
+                "step, or see what changed the state or the rows behind their back",
+                row=miss.row,
+                residual=abs(miss.off),
+                atoms=miss.atoms,
+            )
+
+    def _remember(self, now: openmm.State) -> None:
+        self.since_check = self._put_off = 0
+        self._checked = perf_counter()
+        self._good = now
+
+    def put_back(self) -> None:
+        """The state that was checked last."""
+        if self._good is not None:
+            good, context = self._good, self.context
+            context.setPeriodicBoxVectors(*good.getPeriodicBoxVectors())
+            context.setPositions(good.getPositions(asNumpy=True))
+            context.setVelocities(good.getVelocities(asNumpy=True))
+            context.setTime(good.getTime())
+            context.setStepCount(good.getStepCount())
+            self.since_check = 0
+            self.disturbed = False
+            self.integrator.refresh()
+
+    def explosion(self, words: str, step: int) -> NonFiniteError:
+        """The error for a NaN that OpenMM met after `step`, once the state is put back."""
+        solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if self.rows.n_rows else ""
+        return NonFiniteError(
+            f"{words} It appeared after step {step}; positions and velocities are those of step "
+            f"{self.context.getStepCount()}. Take a smaller time step, or minimise the energy first{solver}",
+            item="position",
+            step=step,
+        )
+
+    # -- degrees of freedom ---------------------------------------------------------------------
+
+    def independent_momenta(self) -> int:
+        """Three for each particle with a mass, less the rank of all constraints."""
+        if self._freedom is None:
+            moving = 3 * int(np.sum(self.rows.masses > 0))
+            held = self.rows.rank(positions_of(self.context))
+            held += sum(part.rank(self.context) for part in self.integrator.parts)
+            self._freedom = moving - held
+        return self._freedom
+
+    def degrees_of_freedom(self) -> int:
+        """Also less three where a CMMotionRemover acts."""
+        return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:
+    for array, item in ((x, "position"), (v, "velocity")):
+        bad = ~np.isfinite(array).all(axis=1)
+        if bad.any():
+            atom = int(np.argmax(bad))
+            solver = f". Where the solvers of OpenMM diverge, {_REMEDY}" if held else ""
+            raise NonFiniteError(
+                f"the {item} of particle {atom} is not finite at step {step}; take a smaller time step, or minimise "
+                f"the energy first{solver}",
+                item=item,
+                atom=atom,
+                step=step,
+            )

@@ -1,0 +1,215 @@
+"""The program of a step with what nobody looks at left out.
+
+Between two steps of one call of `step` nobody sees the velocities. The second half kick of a step and the first of the
+next are then one, and the velocities are not made tangent: the next drift starts where they would be, pushes along
+the same gradients, and absorbs what they have across. The motion is the same; see notes on RATTLE and leapfrog.
+
+At the end of a call velocities are completed. What they were before is kept (`raw`), and the next call goes on from
+there unless somebody has changed x or v: how many steps a call makes does not change a bit of the motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.step_writer import StepWriter
+from kcons.steppers.rattle import Rattle
+
+#: Schemes whose shortest drifts are less than this part of a step: what rounding does to x, divided by the length of
+#: the drift, must be kept out of v there.
+SHORT_DRIFT = 1 / 30
+
+
+class LeanStepWriter(StepWriter):
+    """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, leave out what nobody looks at.
+
+    Velocity Verlet without parts does so where a kick costs much: two of half a step are made as one.
+
+    Attributes
+    ----------
+    lazy : bool
+        Whether the program does so, when the global `between` is 1.
+    observed : int
+        How many steps at the end of a call must be complete, for multipliers of a step to be there.
+    filtered : bool
+        Whether drifts change v by impulses without the rounding errors of positions.
+    """
+
+    lazy = False
+    lean = False
+    joined = False
+    observed = 1
+    filtered = False
+
+    def write(self) -> None:
+        plain = type(self.ensemble) is ConstantEnergy
+        self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
+        #: Without parts: the kick that ends a step is made with that which begins the next.
+        self.joined = self.ensemble.adds_up and not self.parts and isinstance(self.scheme, Rattle)
+        self.lazy = self.lean or self.joined or (self.scheme is None and not self.parts)
+        self.observed = 2 if self.lean else 1
+        self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
+        if self.lazy:
+            self.program.control("between", "1 if nobody looks at the velocities after this step")
+        super().write()
+
+    # -- the leapfrog without parts -------------------------------------------------------------
+
+    def _write_plain(self) -> None:
+        if self.joined:
+            self._write_joined()
+            return
+        if self.scheme is not None:
+            super()._write_plain()
+            return
+        p = self.program
+        self._kick("dt")
+        p.each("x", "x+dt*v", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        p.hold_positions("back onto the constraints of the System")
+        with p.when("between = 0", "somebody asks for the kinetic energy"):
+            p.each("impulse", "(x-xu)/dt", "what the constraint forces do to v")
+        p.each("v", "v+(x-xu)/dt", "the constraint forces act on v as well")
+
+    # -- velocity Verlet whose kicks are dear ---------------------------------------------------
+
+    def _write_joined(self) -> None:
+        p = self.program
+        p.number("behind", "1 where v lacks the half kick at the end of the last step")
+        p.number("kick", "length of the first kick as a fraction of the step")
+        p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
+        self._kick("kick*dt", tangent=True)
+        p.each("v", f"v+{self._drift('dt')}", "the constraint forces act on v as well")
+        self._project()
+        with p.when("between = 0", "somebody looks at the velocities"):
+            self._kick("0.5*dt", tangent=True)
+        p.let("behind", "between", "the next step makes up for it")
+
+    # -- impulses without rounding --------------------------------------------------------------
+
+    def _drift(self, h: str) -> str:
+        """As there. What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
+
+        (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
+        along the constraints.
+        """
+        if not self.filtered:
+            return super()._drift(h)
+        p = self.program
+        p.vector("x_start", "positions where the drift began")
+        p.vector("v_next", "velocities with all of (x-xu)/h")
+        p.each("x_start", "x", "where the drift begins")
+        p.each("x", f"x+{h}*v", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        p.hold_positions("back onto the constraints of the System")
+        p.each("v_next", f"v+(x-xu)/{h}", "the constraint forces act on v as well, and rounding errors of x")
+        p.each("v", f"(x-xu)/{h}", "to be split")
+        p.each("xu", "x", "where the drift ends")
+        p.each("x", "x_start", "back, for a moment")
+        p.hold_positions("only tells the System's constraints where x is")
+        p.hold_velocities("what is along the constraints: rounding")
+        p.each("x", "xu", "where the drift ends")
+        p.hold_positions("only tells the System's constraints where x is")
+        return "v_next-2*v"
+
+    # -- velocity Verlet with parts -------------------------------------------------------------
+
+    def _declare_guards(self) -> None:
+        for part in self.parts:
+            part.lean = self.lean
+        super()._declare_guards()
+        if not self.lean:
+            return
+        p = self.program
+        self.force = p.vector("force", "applied forces at x, where a call of step begins or ends")
+        p.vector("u", "velocities of the drift")
+        p.vector("raw", "v at the end of the last call, with half a kick and a projection to come")
+        p.number("moved", "how far others have moved x or v since the last call")
+        p.control("moving", "1 where barostats may move x between steps")
+        p.number("looked", "1 if somebody may have looked since the last step", 1.0)
+        p.control("lean", "1 where v may do without half a kick between steps")
+        p.number("behind", "1 where v, or else raw, does so now")
+        p.number("led", "the same when the last drift began")
+        p.number("dt_last", "length of the last step")
+        p.number("loose", "1 where v was taken back to a step at whose end nobody looked: it is not tangent")
+
+    def _write_guarded(self) -> None:
+        if not self.lean:
+            super()._write_guarded()
+            return
+        p = self.program
+        with p.when("failed = 0", "after a failure nothing moves"):
+            with p.when("looked != 0", "x and v may have been changed"):
+                p.sum("moved", "(x-x_last)^2+(v-v_last)^2", "by whom ever")
+                p.let("behind", "select(moved+abs(dt-dt_last), 0, behind)", "then v is what it is")
+                p.each("v_last", "v", "to come back to")
+                p.each("v", "select(behind, raw, v)", "go on as if nobody had looked")
+            with p.when("first_stage = 0", "a step"):
+                p.let_others_act()
+            with p.when("looked != 0", "forces may be known"):
+                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
+                with p.when("moved+stale != 0", "others did"):
+                    p.each("x_last", "x", "start here")
+                    p.each("force", "f", "applied forces")
+                p.each("u", "v+select(behind, 1, kick_share(first_stage))*dt*force/m", "the applied forces act (kick)")
+                if any(hasattr(part, "begin") for part in self.parts):
+                    with p.when("moved+stale != 0", "others did"):
+                        self._each("begin")
+            with p.when("looked = 0", "in the middle of many steps"):
+                p.each("x_last", "x", "to come back to")
+                p.each("u", "v+dt*f/m", "the applied forces act (both half kicks)")
+                self._each("renew")
+            p.let("stale", "0", "forces belong to x")
+            p.let("led", "behind", "for multipliers")
+            p.let("dt_last", "dt", "to see whether it is changed")
+            p.let("stage", "first_stage", "the drift")
+            p.let("per_h", "0", "no drift yet")
+            with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+                p.let("h", "dt*drift_share(stage)", "length of the drift")
+                self._drift_with("u", "h")
+                p.let("per_h", "1/h", "the constraint forces act on v as well")
+                p.let("stage", "stage+1", "what follows")
+            with p.when("select(failed, 0, 1-between) != 0", "somebody looks at the velocities"):
+                p.each("force", "f", "applied forces")
+                p.each("raw", "v" if self.single else "u+per_h*(x-xu)", "the constraint forces act")
+                p.each("v", "raw+dt*kick_share(stage)*force/m", "the applied forces act (kick)")
+                self._project()
+                p.let("behind", "0", "unless all is well")
+            with p.when("failed = 0", "all solves converged"):
+                self._finish()
+            with p.when("failed != 0", "a solve failed"):
+                p.each("x", "x_last", "back to where the step began")
+                p.each("v", "select(looked, v_last, u-0.5*dt*f/m)", "back to where the step began")
+                p.let("loose", "1-looked", "was it complete?")
+                p.let("behind", "select(looked, behind, 0)", "can it go on as if nobody had looked?")
+                p.let("looked", "1", "somebody does")
+                p.let("stale", "1", "forces are those of elsewhere")
+
+    def _finish(self) -> None:
+        p = self.program
+        p.let("good_steps", "good_steps+1", "count it")
+        p.let("behind", "lean", "v, or raw, lacks half a kick")
+        p.let("looked", "1-between", "does somebody look?")
+        with p.when("looked = 0", "nobody does"):
+            if not self.single:
+                p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
+            self._each("passed")
+        with p.when("looked != 0", "somebody does"):
+            p.each("x_last", "x", "where forces were computed")
+            p.each("v_last", "v", "to see whether others change it")
+
+    def _each(self, method: str) -> None:
+        """Call a method of the parts that have it."""
+        for part in self.parts:
+            if hasattr(part, method):
+                getattr(part, method)(self.program)
+
+    def _drift_with(self, u: str, h: str) -> None:
+        p = self.program
+        for part in self.parts:
+            part.remember(p)
+        if self.single:
+            self.parts[0].land_alone(p, u, h)  # type: ignore[attr-defined]
+            return
+        self._land(u, h)

@@ -1,0 +1,167 @@
+"""What an integrator may hold besides the constraints of its System."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import KconsError
+from kcons.openmm.integrator.program import Program
+
+
+@dataclass(frozen=True)
+class Miss:
+    """A row that is off by more than it may be.
+
+    Attributes
+    ----------
+    what : str
+        'positions', or 'velocities'.
+    row : int
+    name : str
+    off, allowed : float
+        sigma in the unit of the row, or A v less its target, per ps.
+    atoms : sequence of int
+    near : bool
+        Whether positions are off by less than a tenth of the length that is held.
+    """
+
+    what: str
+    row: int
+    name: str
+    off: float
+    allowed: float
+    atoms: Sequence[int] = ()
+    near: bool = False
+
+    @classmethod
+    def worst(
+        cls,
+        what: str,
+        off: FloatArray,
+        allowed: ArrayLike,
+        name: Callable[[int], str],
+        atoms: Callable[[int], Iterable[int]],
+        near: ArrayLike = 0.0,
+    ) -> Miss | None:
+        """The worst of some rows, or None if each is off by no more than allowed; NaN is the worst."""
+        size = np.abs(off)
+        limit = np.broadcast_to(np.asarray(allowed, dtype=float), size.shape)
+        wrong = ~(size <= limit)
+        if not wrong.any():
+            return None
+        with np.errstate(all="ignore"):
+            row = int(np.argmax(np.where(np.isfinite(size), np.where(wrong, size / limit, 0.0), np.inf)))
+        close = bool(np.all(size[wrong] <= np.broadcast_to(near, size.shape)[wrong]))
+        return cls(what, row, name(row), float(off[row]), float(limit[row]), [int(a) for a in atoms(row)], close)
+
+    def __str__(self) -> str:
+        rate = "" if self.what == "positions" else " per ps"
+        return f"{self.what} are off row {self.name} by {abs(self.off):.3g}{rate}"
+
+
+class Part(Protocol):
+    """Rows of one kind, and the computations that keep them.
+
+    A program is written once and calls each method where its computations belong. The variables at hand are x, v,
+    m, dt; `xu`, positions as they were before anything brought them onto constraints; and `failed`, which a part
+    sets to its own `code` when a solve does not converge. The integrator then computes nothing more in this step,
+    puts positions and velocities back to what they were before it and asks the part that has this code for the
+    error to raise.
+
+    The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
+    is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
+
+    Some things are optional.
+
+    - `driven`: whether rows demand velocities that are not 0.
+    - `steered`: whether context parameters move targets; positions need not be on the rows after one has changed.
+    - `engine_at(context)`: the engine for the rows and the positions it takes, by which thermostats see what the rows
+      do to total momentum.
+    - `begin_run()` is called before steps are made.
+    - `begin(program)`: what to compute where x is not where the last step ended, for parts that keep something from
+      step to step; written where the applied forces are computed anew.
+    - `begin_early(program)`: the same where velocities are projected before the first drift.
+    - `stays_finite = True`: after a failure x is still a place where forces can be computed; set-up is faster then.
+
+    Steps at whose end nobody looks may end without `project` (see `kcons.openmm.integrator.lean_step_writer`): the next drift absorbs
+    what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
+    The optional `renew(program)` is called before each drift that follows one, where v is free to be used, and
+    `passed(program)` at their ends. A part with `alone = True` knows that the System has no constraints; where there is
+    no other part, `land_alone(program, u, h)` is the whole drift with the velocity u, changes v by its impulse too, and
+    needs `remember` before.
+
+    Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
+    `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.integrator.system_checks`.
+
+    Attributes
+    ----------
+    code : int
+        Number of the part in its integrator, from 1; set by the integrator before `declare`.
+    evaluates : bool
+        Whether `remember` or `project` evaluate force groups or move x, after which the applied forces must be
+        computed again or kept.
+    meets_system : bool
+        Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
+        within its own `land`; at most one part of an integrator may.
+    solves_alone : bool
+        Whether the program also brings a state onto the rows outside of steps. Where a part does not, all parts are
+        asked to do so by `apply_positions` and `apply_velocities`.
+    groups : frozenset of int
+        Force groups that carry rows, not forces.
+    lean : bool
+        Set by the integrator.
+    """
+
+    code: int
+    evaluates: bool
+    meets_system: bool
+    solves_alone: bool
+    groups: frozenset[int]
+    lean: bool
+
+    def declare(self, program: Program) -> None:
+        """Variables and tables."""
+        ...
+
+    def remember(self, program: Program) -> None:
+        """Before each drift, x on the constraints: keep the gradients at x."""
+        ...
+
+    def land(self, program: Program, h: str) -> None:
+        """After x = xu: bring x onto the rows along the gradients that were kept. `h` is the length of the drift."""
+        ...
+
+    def project(self, program: Program) -> None:
+        """Make v tangent to the rows at x."""
+        ...
+
+    def check(self, context: openmm.Context) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
+        ...
+
+    def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
+        """What the rows themselves say of the state of the context, whatever solvers believe; None if all hold."""
+        ...
+
+    def apply_positions(self, context: openmm.Context) -> Any:
+        """Bring the positions of the context onto the rows; velocities stay as they are."""
+        ...
+
+    def apply_velocities(self, context: openmm.Context) -> Any:
+        """Make the velocities of the context tangent to the rows."""
+        ...
+
+    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
+        """The error for a step in which the part set `failed`."""
+        ...
+
+    def rank(self, context: openmm.Context) -> int:
+        """How many degrees of freedom the rows take, beyond the constraints of the System."""
+        ...

@@ -1,0 +1,458 @@
+"""The integrator: kicks and constrained drifts in turn, to order 2, 4 or 6."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.openmm.integrator.copies import as_projected, remade, settings_of
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
+from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
+from kcons.openmm.integrator.hearing import listen
+from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.settings import Settings, picoseconds
+from kcons.openmm.integrator.states_on_constraints import StatesOnConstraints
+from kcons.openmm.integrator.step_counts import StepCounts, count_step
+from kcons.steppers.splitting import Splitting
+
+
+class ProjectedIntegrator(StatesOnConstraints, Settings):
+    """Dynamics at constant energy on the constraints of the System, and on more where asked.
+
+    One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
+    projection of v at the end. The System's own constraints are solved by OpenMM (SETTLE, CCMA, SHAKE): its
+    `constrainVelocities` is the projector M_par^+ M, its `constrainPositions` the drift's solve. Only the tolerance
+    limits the accuracy.
+
+    At the first step the integrator looks at the System and its Context: what it cannot propagate it refuses, and
+    velocities are made tangent to the constraints. Later it checks at every `check_every` steps that positions and
+    velocities are on all that is held, by the constraints of the System and the rows themselves: whether its solvers
+    did converge OpenMM does not tell.
+
+    Parameters
+    ----------
+    timestep : Quantity or float
+        In ps if a float; more than 0. OpenMM refuses negative steps: to go back, turn the velocities round.
+    scheme : str or Splitting
+        'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
+        'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
+        openmm.VerletIntegrator, for Systems with virtual sites.
+    parts : sequence of Part
+        What else to hold: collective variables, surfaces, constraint objects of kcons.
+    tolerance : float
+        Relative tolerance of the System's constraints.
+    check_every : int, optional
+        Steps between two checks; 0 for none but the first. Left open, 100, and later, up to 10,000, where checks would
+        take more than a hundredth of the time.
+    ensemble : Ensemble, optional
+        How velocities change between drifts; constant energy by default.
+
+    Raises
+    ------
+    InputError, UnsupportedError
+        A time step that is no positive number, an unknown scheme, parts that do not go together.
+
+    Notes
+    -----
+    Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
+    """
+
+    #: Steps between two checks, if nothing else is asked for, ...
+    _check_every = 100
+    #: ... when checks come later where they would take more than a hundredth of the time.
+    spare = True
+    #: What writes the program.
+    _writer: type[LeanStepWriter] = LeanStepWriter
+
+    def __init__(
+        self,
+        timestep: unit.Quantity | float,
+        scheme: str | Splitting = "rattle",
+        *,
+        parts: Sequence[Part] = (),
+        tolerance: float = 1e-10,
+        check_every: int | None = None,
+        ensemble: Ensemble | None = None,
+    ) -> None:
+        super().__init__(picoseconds(timestep))
+        self.setConstraintTolerance(tolerance)
+        if check_every is not None:
+            self.check_every = check_every
+        #: None for the leapfrog.
+        self.scheme = to_scheme(scheme)
+        self._ensemble: Ensemble = ConstantEnergy() if ensemble is None else ensemble
+        self._ensemble.check(self.scheme)
+        self.parts = tuple(parts)
+        if sum(part.meets_system for part in self.parts) > 1:
+            raise UnsupportedError("only one part may share atoms with the constraints of the System")
+        for k, part in enumerate(self.parts, start=1):
+            part.code = k
+        #: Force groups that carry rows, not forces.
+        self.row_groups: frozenset[int] = frozenset().union(*(part.groups for part in self.parts))
+        self._guard: Guard | None = None
+        if self.row_groups:
+            self.setIntegrationForceGroups(-1)
+        self.program = Program(self)
+        self._plan = self._writer(self.program, self.scheme, self.parts, self.ensemble)
+        self._plan.write()
+        listen(self)
+
+    def __repr__(self) -> str:
+        scheme = "leapfrog" if self.scheme is None else repr(self.scheme)
+        held = "".join(f", {part!r}" for part in self.parts)
+        return f"<ProjectedIntegrator: {scheme}, {self._dt * 1e3:g} fs{held}>"
+
+    def __str__(self) -> str:
+        return f"{self!r}\n{self.listing()}"
+
+    def listing(self) -> str:
+        """The steps of the integrator, in words."""
+        return self.program.listing()
+
+    def counts(self, *, seen: bool = True, iterations: int = 2) -> StepCounts:
+        """What a step makes OpenMM do, where all goes well.
+
+        Parameters
+        ----------
+        seen : bool
+            Steps at whose end somebody looks; False for those within a call of `step`.
+        iterations : int
+            How often loops run that solve for positions.
+        """
+        lean = {"between": float(not seen), "lean": 1.0}
+        known = {name: value for name, value in lean.items() if name in self.program.numbers}
+        return count_step(self.program, iterations=iterations, **known)
+
+    # -- running --------------------------------------------------------------------------------
+
+    @property
+    def check_every(self) -> int:
+        """Steps between two checks; 0 for none but the first."""
+        return self._check_every
+
+    @check_every.setter
+    def check_every(self, steps: int) -> None:
+        if int(steps) != steps or steps < 0:
+            raise InputError(f"check_every is {steps}; give a number of steps, 0 for never", item="check_every")
+        self._check_every, self.spare = int(steps), False
+
+    @property
+    def context(self) -> openmm.Context:
+        """The Context that this integrator belongs to.
+
+        Found by itself; set it where this fails.
+
+        Raises
+        ------
+        UnsupportedError
+            There is none.
+        """
+        guard = self._guard
+        context = None if guard is None else guard.alive
+        if context is None:
+            context = find_context(self)
+            if context is None:
+                raise UnsupportedError("this integrator belongs to no Context; create one with it first")
+            self.context = context
+        return context
+
+    @context.setter
+    def context(self, context: openmm.Context) -> None:
+        if self._guard is None or self._guard.alive is not context:
+            self._guard = Guard(context, self)
+
+    def _watch(self, context: openmm.Context | None = None) -> Guard:
+        if context is None:
+            context = self.context
+        self.context = context
+        assert self._guard is not None
+        return self._guard
+
+    def step(self, steps: int) -> None:
+        """Make `steps` steps.
+
+        Raises
+        ------
+        KconsError
+            A solve of one of the parts failed: positions, velocities, time and step count are those before that
+            step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
+            check failed, or a NaN appeared: they are those of the last check.
+        InputError, UnsupportedError
+            At the first step: the System cannot be propagated, or the start is not on the constraints.
+        """
+        guard = self._watch()
+        if guard.disturbed:
+            guard.begin()
+        if self._plan.kept and guard.surroundings_changed():
+            self.refresh()
+        guard.meet_others()
+        while steps > 0:
+            block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
+            self._run_block(guard, block)
+            guard.count(block)
+            steps -= block
+        guard.leave()
+        if self._plan.kept:
+            guard.note_surroundings()
+
+    def _run_block(self, guard: Guard, steps: int) -> None:
+        """Where the program can do less in steps whose end nobody looks at, let it."""
+        unseen = steps - self._plan.observed if self._plan.lazy else 0
+        if self._plan.lean:
+            self.program.write("lean", guard.undisturbed)
+            self.program.write("moving", guard.moving)
+        if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
+            self.program.write("between", 1.0)
+            try:
+                self._run(guard, unseen)
+            finally:
+                self.program.write("between", 0.0)
+            steps -= unseen
+        self._run(guard, steps)
+
+    def _run(self, guard: Guard, steps: int) -> None:
+        context = guard.context
+        time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
+        before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
+        for part in self.parts:
+            begin_run = getattr(part, "begin_run", None)
+            if begin_run is not None:
+                begin_run()
+        try:
+            super().step(steps)
+        except openmm.OpenMMException as error:
+            guard.put_back()
+            if "NaN" not in str(error):
+                raise
+            raise guard.explosion(str(error), first) from error
+        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
+        done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
+        # OpenMM's clock goes on with the first step size after setStepSize.
+        expected = time + done * self._dt
+        if code or abs(context.getTime().value_in_unit(unit.picosecond) - expected) > 1e-6 * self._dt:
+            context.setTime(expected)
+        if code:
+            context.setStepCount(first + done)
+            guard.since_check += done
+            failure = self._failure(code, first + done + 1)
+            if self._plan.lean and self.getGlobalVariableByName("loose"):
+                self.program.write("between", 0.0)
+                self.applyVelocityConstraints(context)
+            raise failure
+
+    def _failure(self, code: int, step: int) -> KconsError:
+        error = self.parts[code - 1].failure(self, step)
+        self.program.write("failed", 0.0)
+        return error
+
+    def refresh(self) -> None:
+        """Compute the forces anew at the next step.
+
+        Where parts are held, forces are kept from one step to the next. What changes them is seen: positions,
+        parameters, boxes, `updateParametersInContext`.
+        """
+        if self.parts:
+            self.program.write("stale", 1.0)
+        if "behind" in self.program.numbers:
+            self.program.write("behind", 0.0)
+
+    def check(self, context: openmm.Context | None = None) -> None:
+        """Whether all is well: the System, its constraints and the parts, at the present state.
+
+        Raises
+        ------
+        KconsError
+            What is wrong. Also a failure in a step that ran within a CompoundIntegrator.
+        """
+        guard = self._watch(context)
+        if self.parts:
+            code = int(self.getGlobalVariableByName("failed"))
+            if code:
+                raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
+        for part in self.parts if guard.disturbed else ():
+            part.check(guard.context)
+        guard.check()
+        for part in self.parts:
+            part.check(guard.context)
+
+    # -- constraints outside of steps -----------------------------------------------------------
+
+    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Bring positions onto all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            They cannot be reached from here; positions are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        start, velocities = positions_of(context), velocities_of(context)
+        tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
+        try:
+            context.applyConstraints(tolerance)
+            if not all(part.solves_alone for part in self.parts):
+                for part in self.parts:
+                    part.apply_positions(context)
+            elif self.parts:
+                context.setVelocities(np.zeros_like(velocities))
+                self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
+            guard.check_rows(positions_of(context), None)
+            for part in self.parts:
+                guard.certify(part.worst_miss(context, velocities=False))
+        except KconsError:
+            context.setPositions(start)
+            raise
+        finally:
+            context.setVelocities(velocities)
+
+    def applyVelocityConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Make velocities tangent to all constraints, those of the parts as well.
+
+        Raises
+        ------
+        KconsError
+            A part cannot do it; velocities are unchanged.
+        """
+        guard = self._watch(context)
+        context = guard.context
+        velocities = velocities_of(context)
+        by_program = bool(self.parts) and all(part.solves_alone for part in self.parts)
+        try:
+            if not by_program:
+                context.applyVelocityConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+                for part in self.parts:
+                    part.apply_velocities(context)
+                return
+            self._run_alone(guard, self._plan.alone, self._plan.alone)
+        except KconsError:
+            context.setVelocities(velocities)
+            raise
+
+    def _run_alone(self, guard: Guard, first: int, end: int) -> None:
+        """The stages from `first` to `end` and the projection, as no step: clock and counts stay."""
+        context = guard.context
+        time, count, good = context.getTime(), context.getStepCount(), self.getGlobalVariableByName("good_steps")
+        self.refresh()
+        program = self.program
+        program.write("first_stage", first)
+        program.write("end_stage", end)
+        try:
+            super().step(1)
+        finally:
+            for name in ("first_stage", "end_stage"):
+                program.write(name, (program.settings | program.idle)[name])
+            program.write("good_steps", good)
+            self.refresh()
+            context.setTime(time)
+            context.setStepCount(count)
+        code = int(self.getGlobalVariableByName("failed"))
+        if code:
+            raise self._failure(code, count)
+
+    # -- temperature that is found --------------------------------------------------------------
+
+    def kinetic_energy(self, context: openmm.Context | None = None) -> unit.Quantity:
+        """Of the velocities at x; no forces are computed unless the scheme is the leapfrog."""
+        guard = self._watch(context)
+        if self.scheme is None:
+            state = guard.context.getState(energy=True, groups=self.getIntegrationForceGroups())
+            return state.getKineticEnergy()
+        v = velocities_of(guard.context)
+        return 0.5 * float(guard.rows.masses @ np.einsum("ij,ij->i", v, v)) * unit.kilojoule_per_mole
+
+    def computeSystemTemperature(self) -> unit.Quantity:
+        """2 K/(g k), with g the degrees of freedom that constraints leave; StateDataReporter asks for it.
+
+        With `Isokinetic`, whose K does not fluctuate, the temperature of the configurations.
+
+        Raises
+        ------
+        InputError
+            No degree of freedom is left.
+        """
+        freedom = self.degrees_of_freedom()
+        if freedom <= 0:
+            raise InputError("the constraints leave no degree of freedom: there is no temperature", item="constraints")
+        warmth = self.ensemble.warmth(self)
+        return (2 * warmth * self.kinetic_energy() / (freedom * unit.MOLAR_GAS_CONSTANT_R)).in_units_of(unit.kelvin)
+
+    # -- settings -------------------------------------------------------------------------------
+
+    def setIntegrationForceGroups(self, groups: int | Iterable[int]) -> None:
+        """Choose the force groups that act; groups that carry rows never do.
+
+        Parameters
+        ----------
+        groups : int or iterable of int
+            A bit mask or group numbers. -1 and all 32 groups mean: all but the groups of rows.
+
+        Raises
+        ------
+        InputError
+            Groups that carry rows are among those given.
+        UnsupportedError
+            The Context exists; it has read the groups and would ignore the change.
+        """
+        if getattr(self, "_guard", None) is not None or (getattr(self, "program", None) and find_context(self)):
+            raise UnsupportedError("the Context has read the force groups already; set them before it is created")
+        wanted = {g for g in range(32) if (groups >> g) & 1} if isinstance(groups, int) else set(groups)
+        rows = self.row_groups
+        if len(wanted) == 32:
+            wanted -= rows
+        if wanted & rows:
+            raise InputError(
+                f"force groups {sorted(wanted & rows)} carry constraint rows, their forces are gradients and must not "
+                "act; leave them out",
+                item="groups",
+            )
+        super().setIntegrationForceGroups(wanted)
+
+    # -- copies and files -----------------------------------------------------------------------
+
+    @classmethod
+    def from_xml(cls, xml: str, **arguments: Any) -> ProjectedIntegrator:
+        """The integrator that XmlSerializer wrote; OpenMM itself reads it as a plain CustomIntegrator.
+
+        Parameters
+        ----------
+        xml : str
+            The text of the file.
+        **arguments
+            `parts`, `check_every` and `ensemble`, which the file does not contain.
+
+        Raises
+        ------
+        InputError
+            The file has no program of this class with these parts.
+        """
+        return as_projected(cls, openmm.XmlSerializer.deserialize(xml), **arguments)
+
+    @classmethod
+    def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> ProjectedIntegrator:
+        """A plain CustomIntegrator that was one of these once, see `from_xml`."""
+        return as_projected(cls, integrator, **arguments)
+
+    def _making(self) -> tuple[Any, ...]:
+        scheme = LEAPFROG if self.scheme is None else self.scheme
+        every = None if self.spare else self.check_every
+        return self._dt, scheme, self.parts, self.getConstraintTolerance(), every, self.ensemble
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return remade, (type(self), self._making(), settings_of(self))
+
+    def __copy__(self) -> ProjectedIntegrator:
+        """Without the Context, and with copies of the parts: an integrator and its parts serve one Context."""
+        return remade(type(self), deepcopy(self._making()), settings_of(self))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedIntegrator:
+        return self.__copy__()

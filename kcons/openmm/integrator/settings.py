@@ -1,0 +1,215 @@
+"""What an integrator was made with, what it was told since, and what it hears of its Context."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.ensembles.isokinetic import kelvins
+from kcons.openmm.ensembles.langevin import Langevin
+from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
+from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.states_on_constraints import value_in
+from kcons.steppers.splitting import Splitting
+
+if TYPE_CHECKING:
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+#: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
+_SAME = 1e-6
+
+
+class Settings(openmm.CustomIntegrator):
+    """Settings belong to the integrator: they are kept here and in its program, and written into the Context.
+
+    Attributes
+    ----------
+    program : Program
+    scheme : Splitting or None
+        None for the leapfrog.
+    """
+
+    program: Program
+    scheme: Splitting | None
+    _ensemble: Ensemble
+    _guard: Guard | None
+
+    def refresh(self) -> None:
+        """Compute the forces anew at the next step."""
+        raise NotImplementedError
+
+    @property
+    def ensemble(self) -> Ensemble:
+        """How velocities change between drifts, as it is now; see `setTemperature`, `setFriction`."""
+        return self._ensemble
+
+    @property
+    def thermostatted(self) -> bool:
+        """Whether velocities change by more than forces and constraints."""
+        return type(self.ensemble) is not ConstantEnergy
+
+    # -- temperature and friction ---------------------------------------------------------------
+
+    def setTemperature(self, temperature: unit.Quantity | float) -> None:
+        """Change the temperature (K if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is below zero; with `Isokinetic`, zero.
+        UnsupportedError
+            The ensemble has none.
+        """
+        self._take(self.ensemble.at(kelvins(temperature)))
+
+    def getTemperature(self) -> unit.Quantity:
+        """The temperature of the ensemble.
+
+        Raises
+        ------
+        UnsupportedError
+            It has none.
+        """
+        return self._given("temperature") * unit.kelvin
+
+    def setFriction(self, friction: unit.Quantity | float) -> None:
+        """Change the friction (1/ps if a float) of the ensemble.
+
+        Raises
+        ------
+        InputError
+            It is below zero.
+        UnsupportedError
+            The ensemble has none.
+        """
+        self._given("friction")
+        assert isinstance(self.ensemble, Langevin)
+        self._take(self.ensemble.with_friction(friction))
+
+    def getFriction(self) -> unit.Quantity:
+        """The friction of the ensemble.
+
+        Raises
+        ------
+        UnsupportedError
+            It has none.
+        """
+        return self._given("friction") / unit.picosecond
+
+    def _given(self, what: str) -> float:
+        value = getattr(self.ensemble, what, None)
+        if not isinstance(value, float):
+            name = "constant energy" if not self.thermostatted else repr(self.ensemble)
+            raise UnsupportedError(f"there is no {what} at {name}; give ensemble=Langevin(temperature, friction)")
+        return value
+
+    def _take(self, ensemble: Ensemble) -> None:
+        self._ensemble = ensemble
+        for name, value in ensemble.settings().items():
+            self.program.set(name, value)
+        ensemble.follow(cast("ProjectedIntegrator", self))
+
+    # -- steps, tolerance, variables ------------------------------------------------------------
+
+    @property
+    def _dt(self) -> float:
+        return float(self.getStepSize().value_in_unit(unit.picosecond))
+
+    def setStepSize(self, size: unit.Quantity | float) -> None:
+        """Change the time step.
+
+        Raises
+        ------
+        InputError
+            It is no positive number.
+        """
+        super().setStepSize(picoseconds(size))
+
+    def setConstraintTolerance(self, tol: float) -> None:
+        """Change the relative tolerance of the System's constraints.
+
+        Raises
+        ------
+        InputError
+            It is not between 0 and 1.
+        """
+        if not 0 < tol < 1:
+            raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
+        super().setConstraintTolerance(tol)
+
+    def setGlobalVariableByName(self, name: str, value: float) -> None:
+        """Set a variable of the program.
+
+        Raises
+        ------
+        UnsupportedError
+            It is a setting, which has a method of its own.
+        """
+        if name in self.program.settings:
+            raise UnsupportedError(
+                f"{name} is a setting of the integrator: use setTemperature, setFriction, or set_target of a part"
+            )
+        super().setGlobalVariableByName(name, value)
+
+    def setGlobalVariable(self, index: int, value: float) -> None:
+        """As `setGlobalVariableByName`."""
+        self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
+
+    # -- what the Context is told, see kcons.openmm.integrator.hearing -------------------------------------
+
+    def _hear_moved(self) -> None:
+        """Something has moved x or v."""
+        if self._guard is not None:
+            self._guard.disturbed = True
+
+    def _hear_forget(self) -> None:
+        """A State is about to be loaded: what it does not bring is that of a new integrator."""
+        self.program.forget()
+        if self.scheme is None:
+            self.setPerDofVariableByName("impulse", [openmm.Vec3(0, 0, 0)] * self._n_particles())
+
+    def _hear_loaded(self, context: openmm.Context) -> None:
+        """Variables were read from a State or checkpoint: what this integrator was made with wins.
+
+        The run goes on as if nothing had happened where the State is that of this run. Forces that were kept are
+        those of another System otherwise, or of other settings.
+        """
+        other = bool(self.program.differing())
+        self.program.push()
+        if other or not self._forces_kept(context):
+            self.refresh()
+        if self._guard is not None:
+            self._guard.started, self._guard.disturbed = False, True
+
+    def _hear_reinitialized(self) -> None:
+        """The Context has read the System again."""
+        self._guard = None
+        self.program.push()
+        self.refresh()
+
+    def _forces_kept(self, context: openmm.Context) -> bool:
+        """Whether forces that the program has kept are those at x."""
+        if "force" not in self.program.vectors or self.getGlobalVariableByName("stale"):
+            return True
+        kept = np.array(self.getPerDofVariableByName("force"))
+        state = context.getState(forces=True, groups=self.getIntegrationForceGroups())
+        now = np.asarray(state.getForces(asNumpy=True)._value)
+        return bool(np.abs(kept - now).max(initial=0.0) <= _SAME * np.abs(now).max(initial=0.0))
+
+    def _n_particles(self) -> int:
+        return len(self.getPerDofVariableByName("xu"))
+
+
+def picoseconds(timestep: Any) -> float:
+    dt = value_in(timestep, unit.picosecond)
+    if not (np.isfinite(dt) and dt > 0):
+        raise InputError(
+            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
+            item="timestep",
+        )
+    return dt

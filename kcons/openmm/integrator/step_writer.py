@@ -1,0 +1,250 @@
+"""Writes the program of one step: kicks, drifts along the constraints, projections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kcons.openmm.integrator.ensemble import Ensemble
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import stages_of
+from kcons.steppers.splitting import Splitting
+
+
+class StepWriter:
+    """One step of a scheme, with what is held.
+
+    Attributes
+    ----------
+    drifts, kicks : list of float
+        The stages of the scheme as fractions of the step; see `stages_of`.
+    alone : int
+        With parts: number of the stage that is a drift without kicks, for applying constraints outside of steps.
+    kept : bool
+        Whether the applied forces are kept in a variable: where parts evaluate row groups, OpenMM remembers the
+        forces of the last groups only.
+    """
+
+    def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
+        self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
+        self.drifts, self.kicks = ([0.5, 0.5], [0.5, 0.0, 0.5]) if ensemble.halves else stages_of(scheme)
+        self.alone = len(self.drifts) + 1
+        self.kept = scheme is not None and any(part.evaluates for part in self.parts)
+
+    def write(self) -> None:
+        p = self.program
+        self.force = p.vector("force", "applied forces at x") if self.kept else "f"
+        p.vector("xu", "positions before constraints act on them")
+        if self.scheme is None:
+            # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
+            # impulse of the forces at x is added, and half that of the constraints in the drift to x.
+            p.integrator.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
+            p.vector("impulse", "change of v by the constraints in the last drift")
+        self.ensemble.declare(p)
+        if self.parts:
+            self._declare_guards()
+            for part in self.parts:
+                part.declare(p)
+            self._write_guarded()
+        else:
+            p.let_others_act()
+            self._write_plain()
+
+    # -- a step without parts -------------------------------------------------------------------
+
+    def _write_plain(self) -> None:
+        p, drifts, kicks = self.program, self.drifts, self.kicks
+        if kicks[0]:
+            self._kick(_of_dt(kicks[0]), tangent=True)
+        if self.ensemble.halves:
+            self.ensemble.middle(p, self._drift("(0.5*dt)"), self._project)
+            self._kick("0.5*dt", self._drift("(0.5*dt)"))
+        elif len(drifts) == 1:
+            impulse = self._drift("dt")
+            if kicks[1]:
+                self._kick(_of_dt(kicks[1]), impulse)
+            else:
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+        else:
+            p.table("drift_share", drifts, "length of drift k as a fraction of the step")
+            p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
+            p.number("stage", "number of the drift")
+            p.number("h", "length of the drift")
+            p.let("stage", "0", "first drift")
+            # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
+            with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
+                p.let("h", "dt*drift_share(stage)", "length of this drift")
+                p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
+                p.let("stage", "stage+1", "what follows")
+                with p.when("kick_share(stage) != 0", "a kick follows"):
+                    self._kick("dt*kick_share(stage)")
+        if self.scheme is not None and not self._ends_tangent:
+            self._project()
+
+    # -- a step that is taken back when a part fails --------------------------------------------
+
+    def _declare_guards(self) -> None:
+        p, n = self.program, len(self.drifts)
+        p.control("failed", "number of the part whose solve failed, 0 for none")
+        p.number("good_steps", "steps done since the integrator was made")
+        p.control("first_stage", f"0; {self.alone} to apply the constraints alone")
+        p.setting("end_stage", "where the stages end", n)
+        p.number("stage", "number of the drift")
+        p.number("h", "length of the drift")
+        if self._last_drift_apart:
+            p.number("per_h", "1/h after the drift")
+        p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
+        p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
+        p.vector("x_last", "positions to come back to")
+        p.vector("v_last", "velocities to come back to")
+        p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
+        if self.kept:
+            p.number("moved", "how far others have moved x since the last step")
+
+    def _write_guarded(self) -> None:
+        """The same program brings positions, or velocities alone, onto the constraints.
+
+        It starts at the last stage of the tables then, a drift without kicks, or behind it.
+        """
+        p = self.program
+        with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
+            p.let_others_act()
+        with p.when("failed = 0", "after a failure nothing moves"):
+            if self.kept:
+                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
+                with p.when("moved+stale != 0", "others did"):
+                    p.each("x_last", "x", "start here")
+                    p.each("force", "f", "applied forces")
+                    for part in self.parts:
+                        for name in ("begin", "begin_early") if self.ensemble.stays_tangent else ("begin",):
+                            begin = getattr(part, name, None)
+                            if begin is not None:
+                                begin(p)
+            else:
+                p.each("x_last", "x", "to come back to")
+            p.let("stale", "0", "forces belong to x")
+            p.each("v_last", "v", "to come back to")
+            if self.kicks[0]:
+                self._kick("dt*kick_share(first_stage)", tangent=True)
+            p.let("stage", "first_stage", "first drift")
+            if self.ensemble.halves:
+                with p.when("first_stage = 0", "a step"):
+                    p.let("h", "dt*drift_share(0)", "length of the first drift")
+                    self.ensemble.middle(p, self._drift("h"), self._project)
+                    p.let("stage", "1", "what follows")
+            if self._last_drift_apart:
+                self._write_single()
+            else:
+                self._write_loop()
+            if self.scheme is None:
+                # The leapfrog has velocities of half a step ago, which belong to no x.
+                with p.when("first_stage*step(0.5-failed) != 0", "constraints alone"):
+                    self._project()
+                with p.when("failed = 0", "the step is good"):
+                    p.let("good_steps", "good_steps+1", "count it")
+            else:
+                with p.when("failed = 0", "all solves converged"):
+                    if self._last_drift_apart:
+                        self._kick_after("per_h*(x-xu)")
+                    if not self._ends_tangent:
+                        self._project()
+                    p.let("good_steps", "good_steps+delta(failed)", "count it")
+                    if self.kept:
+                        p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+            with p.when("failed != 0", "a solve failed"):
+                p.each("x", "x_last", "back to where the step began")
+                p.each("v", "v_last", "back to where the step began")
+                p.let("stale", "1", "forces are those of elsewhere")
+
+    def _write_single(self) -> None:
+        """One drift needs no loop; set-up takes 15 times as long for each block within a loop."""
+        p = self.program
+        p.let("per_h", "0", "no drift yet")
+        with p.when("stage < end_stage*step(0.5-failed)", "unless velocities are projected alone"):
+            p.let("h", "dt*drift_share(stage)", "length of the drift")
+            impulse = self._drift("h")
+            if self.scheme is None:
+                p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
+            p.let("per_h", "1/h", "the constraint forces act on v as well, with the kick that follows")
+            p.let("stage", "stage+1", "what follows")
+
+    def _write_loop(self) -> None:
+        p = self.program
+        with p.loop("stage < end_stage*step(0.5-failed)", "all drifts and kicks of the scheme"):
+            p.let("h", "dt*drift_share(stage)", "length of this drift")
+            if self.single:
+                # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
+                self.parts[0].remember(p)
+                self.parts[0].land_alone(p, "v", "h")  # type: ignore[attr-defined]
+            else:
+                p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
+            p.let("stage", "stage+1", "what follows")
+            # Without the block set-up is faster, but forces are then computed after a failure as well.
+            if all(self.kicks[1:]) and all(getattr(part, "stays_finite", False) for part in self.parts):
+                self._kick_after()
+            else:
+                with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
+                    self._kick_after()
+
+    # -- what both are made of ------------------------------------------------------------------
+
+    @property
+    def single(self) -> bool:
+        """Whether there is one part, whose rows are all there is."""
+        return len(self.parts) == 1 and getattr(self.parts[0], "alone", False)
+
+    @property
+    def _last_drift_apart(self) -> bool:
+        """Whether the last drift is written outside of a loop."""
+        return len(self.drifts) == 1 or self.ensemble.halves
+
+    @property
+    def _ends_tangent(self) -> bool:
+        """Whether the last kick leaves v tangent, so that no projection is needed."""
+        # In a loop, the last kick may be left out, where constraints are applied alone.
+        return self.ensemble.stays_tangent and self.kicks[-1] != 0 and (not self.parts or self._last_drift_apart)
+
+    def _kick_after(self, impulse: str = "") -> None:
+        """The kick that follows drift `stage`, with the forces at x."""
+        if self.kept:
+            self.program.each("force", "f", "applied forces")
+        self._kick("dt*kick_share(stage)", impulse)
+
+    def _kick(self, h: str, impulse: str = "", tangent: bool = False) -> None:
+        # The leapfrog's velocities belong to half a step before.
+        self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent and self.scheme is not None)
+
+    def _drift(self, h: str) -> str:
+        """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""
+        p = self.program
+        for part in self.parts:
+            part.remember(p)
+        self._land("v", h)
+        if self.scheme is None:
+            p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
+            return "impulse"
+        return f"(x-xu)/{h}"
+
+    def _land(self, u: str, h: str) -> None:
+        """Fly freely for h with velocities u, and go from there back onto all constraints."""
+        p = self.program
+        p.each("x", f"x+{h}*{u}", "move freely (drift)")
+        p.each("xu", "x", "where that leads")
+        for part in self.parts:
+            if not part.meets_system:
+                part.land(p, h)
+        together = [part for part in self.parts if part.meets_system]
+        if together:
+            together[0].land(p, h)
+        else:
+            p.hold_positions("back onto the constraints of the System")
+
+    def _project(self) -> None:
+        p = self.program
+        p.hold_velocities("tangent to the constraints of the System")
+        for part in self.parts:
+            part.project(p)
+
+
+def _of_dt(share: float) -> str:
+    return "dt" if share == 1 else f"{share!r}*dt"

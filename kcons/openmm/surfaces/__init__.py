@@ -1,0 +1,9 @@
+"""Particles on surfaces in OpenMM.
+
+- `surface_rows`: what all surfaces share
+- `quadrics`, `compiled_quadrics`: spheres, cylinders, planes, ellipsoids
+- `tori`: tori
+- `formulas`: surfaces given by a formula
+- `step_writer`: the program of a step
+- `surface_integrator`: `SurfaceIntegrator`
+"""

@@ -1,0 +1,292 @@
+"""Particles on surfaces: spheres, ellipsoids, cylinders, planes, tori, and what a formula gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import unit
+
+from kcons.constraints import MovingTarget, Torus
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.surfaces.compiled_quadrics import CompiledQuadricRows
+from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
+from kcons.openmm.surfaces.quadrics import QUADRICS, QuadricRows
+from kcons.openmm.surfaces.step_writer import SurfaceStepWriter
+from kcons.openmm.surfaces.surface_rows import CARRIER, SurfaceRows, engine, positions_and_velocities, refuse_system
+from kcons.openmm.surfaces.tori import TorusRows
+from kcons.steppers import Splitting
+
+AnySurface: TypeAlias = Constraint | ExpressionSurface
+
+
+def surface_parts(
+    surfaces: AnySurface | Iterable[AnySurface],
+    *,
+    system: openmm.System | None = None,
+    n_particles: int | None = None,
+    positions: ArrayLike | None = None,
+    compiled: bool = False,
+) -> tuple[SurfaceRows, ...]:
+    """Parts of a `ProjectedIntegrator` that hold particles on surfaces, one for each kind of arithmetic.
+
+    Parameters
+    ----------
+    surfaces : Sphere, Cylinder, Plane, Ellipsoid, Torus, ExpressionSurface, or several of them
+        Those of `kcons.constraints`, with lengths in nm.
+    system : openmm.System, optional
+        Checked; formulas add their forces to it, so that it is needed for them before the Context is made.
+    n_particles : int, optional
+        Particles of the System, where it is not given.
+    positions : array_like or Quantity, shape (n_particles, 3), optional
+        Needed for targets that are left open: each such particle keeps the radius or plane it has there.
+    compiled : bool
+        Whether the landing on quadrics is computed by compiled code, through PythonForces that are added to
+        `system`: faster on the CPU and Reference platforms, and only for quadrics alone.
+
+    Raises
+    ------
+    InputError
+        Particles that are not in the System, open targets without positions, wrong radii.
+    UnsupportedError
+        Two surfaces for a particle; a particle without mass, or with a constraint of the System; a barostat;
+        moving targets; other kinds of constraints.
+    """
+    given = (surfaces,) if isinstance(surfaces, Constraint | ExpressionSurface) else tuple(surfaces)
+    if not given:
+        raise InputError("no surface was given", item="surfaces")
+    if system is None and n_particles is None:
+        raise InputError("give the System, or the number of its particles", item="n_particles")
+    n = system.getNumParticles() if system is not None else int(n_particles or 0)
+    formulas = [item for item in given if isinstance(item, ExpressionSurface)]
+    known = [item for item in given if not isinstance(item, ExpressionSurface)]
+    atoms = _all_atoms(given, n)
+    x = None if positions is None else _in_nm(positions, n)
+    rows = [_settled(item, x) for item in known]
+    if system is not None:
+        refuse_system(system, atoms)
+    elif formulas:
+        raise InputError("surfaces given by formulas add forces to the System: give system=", item="system")
+    parts: list[SurfaceRows] = []
+    quadrics = [item for item in rows if isinstance(item, QUADRICS)]
+    tori = [item for item in rows if isinstance(item, Torus)]
+    if compiled:
+        if tori or formulas:
+            raise UnsupportedError("compiled=True is for spheres, cylinders, planes and ellipsoids alone")
+        if system is None:
+            raise InputError("compiled=True adds forces to the System: give system=", item="system")
+        parts.append(CompiledQuadricRows(quadrics, system))
+    elif quadrics:
+        parts.append(QuadricRows(quadrics, n))
+    if tori:
+        parts.append(TorusRows(tori, n))
+    if formulas:
+        assert system is not None
+        parts.append(ImplicitRows(formulas, system))
+    for part in parts:
+        part.bonded = system is None or system.getNumConstraints() > 0
+    return tuple(parts)
+
+
+class SurfaceIntegrator(ProjectedIntegrator):
+    """Dynamics of particles on surfaces, beside free particles and the constraints of the System.
+
+    Each particle on a surface is a problem of its own: quadrics (spheres, cylinders, planes, ellipsoids) have the
+    landing in closed form, tori by Newton's method for one number, formulas by Newton's method on forces that
+    OpenMM differentiates. Everything is computed by OpenMM, on any platform. With the scheme 'geodesic' and all
+    surfaces spheres, the free flight follows exact great circles.
+
+    Parameters
+    ----------
+    timestep : Quantity or float
+        In ps if a float.
+    surfaces, system, n_particles, positions, compiled
+        See `surface_parts`.
+    parts : sequence of Part
+        What else to hold, on other particles.
+    scheme, **arguments
+        See `ProjectedIntegrator`.
+
+    Attributes
+    ----------
+    surfaces : tuple of SurfaceRows
+        Its parts that are surfaces.
+
+    Raises
+    ------
+    InputError, UnsupportedError
+        See `surface_parts` and `ProjectedIntegrator`.
+    """
+
+    _writer = SurfaceStepWriter
+    _plan: SurfaceStepWriter
+
+    def __init__(
+        self,
+        timestep: unit.Quantity | float,
+        scheme: str | Splitting = "rattle",
+        *,
+        surfaces: AnySurface | Iterable[AnySurface] = (),
+        system: openmm.System | None = None,
+        n_particles: int | None = None,
+        positions: ArrayLike | None = None,
+        compiled: bool = False,
+        parts: Sequence[Part] = (),
+        **arguments: Any,
+    ) -> None:
+        # Copies are made from the parts alone.
+        ready = (
+            not isinstance(surfaces, Constraint | ExpressionSurface)
+            and not tuple(surfaces)
+            and any(isinstance(part, SurfaceRows) for part in parts)
+        )
+        held: tuple[SurfaceRows, ...] = ()
+        if not ready:
+            held = surface_parts(
+                surfaces, system=system, n_particles=n_particles, positions=positions, compiled=compiled
+            )
+        together: tuple[Part, ...] = (*held, *parts)
+        self.surfaces = tuple(part for part in together if isinstance(part, SurfaceRows))
+        super().__init__(timestep, scheme, parts=together, **arguments)
+
+    def _run(self, guard: Guard, steps: int) -> None:
+        try:
+            super()._run(guard, steps)
+        except NonFiniteError:
+            # A force that is not finite is seen in the step after the one whose velocities it has spoilt.
+            if not all(np.isfinite(array).all() for array in positions_and_velocities(guard.context)):
+                guard.put_back()
+            raise
+
+    def applyConstraints(self, context: openmm.Context | None = None, tolerance: float | None = None) -> None:
+        """Bring positions onto all constraints: those of the System by OpenMM, surfaces by `apply_positions`.
+
+        Raises
+        ------
+        KconsError
+            They cannot be reached from here; positions are unchanged.
+        """
+        if len(self.surfaces) < len(self.parts):
+            super().applyConstraints(context, tolerance)
+            return
+        context = self.context if context is None else context
+        start, _ = positions_and_velocities(context)
+        context.applyConstraints(self.getConstraintTolerance() if tolerance is None else tolerance)
+        try:
+            self.apply_positions(context)
+        except KconsError:
+            context.setPositions(start)
+            raise
+
+    # -- the state of a context -----------------------------------------------------------------
+
+    @property
+    def surface_atoms(self) -> IntArray:
+        """Particles on surfaces, in the order of `multipliers`, shape (n_rows,)."""
+        return np.concatenate([part.atoms for part in self.surfaces])
+
+    def rank(self, context: openmm.Context) -> int:
+        """Degrees of freedom taken by surfaces and other parts, beyond the constraints of the System."""
+        return sum(part.rank(context) for part in self.parts)
+
+    def apply_positions(self, context: openmm.Context) -> None:
+        """Move each particle to the nearest point of its surface.
+
+        Raises
+        ------
+        ConvergenceError
+            A particle finds no surface; nothing was moved.
+        """
+        x, _ = positions_and_velocities(context)
+        try:
+            for part in self.surfaces:
+                part.apply_positions(context)
+        except KconsError:
+            context.setPositions(x)
+            raise
+
+    def apply_velocities(self, context: openmm.Context) -> None:
+        """Take away what velocities have across the surfaces."""
+        for part in self.surfaces:
+            part.apply_velocities(context)
+
+    def multipliers(self, context: openmm.Context) -> FloatArray:
+        """lambda of each row, exact at the present state; kJ/mol/nm where the coordinate is a length in nm.
+
+        z = lambda grad q is the force of the surface; q as documented by the kcons object, or the formula.
+        """
+        x, v, f = self._dynamics(context)
+        return engine(context, self.surfaces, x).multipliers(x[self.surface_atoms], v, f)
+
+    def constraint_forces(self, context: openmm.Context) -> FloatArray:
+        """Force of the surfaces on each particle in kJ/mol/nm, exact at the present state, shape (n_particles, 3)."""
+        x, v, f = self._dynamics(context)
+        out = np.zeros_like(x)
+        out[self.surface_atoms] = engine(context, self.surfaces, x).constraint_force(x[self.surface_atoms], v, f)
+        return out
+
+    def _dynamics(self, context: openmm.Context) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Positions of all particles; velocities and applied forces of those on surfaces."""
+        x, v = positions_and_velocities(context)
+        groups = set(range(32)) - self.row_groups
+        f = context.getState(forces=True, groups=groups).getForces(asNumpy=True)
+        atoms = self.surface_atoms
+        return x, v[atoms], np.array(f.value_in_unit(unit.kilojoule_per_mole / unit.nanometer))[atoms]
+
+
+def _all_atoms(given: Sequence[AnySurface], n: int) -> IntArray:
+    for item in given:
+        if not isinstance(item, (*QUADRICS, Torus, ExpressionSurface)):
+            raise UnsupportedError(
+                f"{item!r} is no sphere, cylinder, plane, ellipsoid, torus or ExpressionSurface; {CARRIER}"
+            )
+    atoms = np.concatenate([np.asarray(item.atoms, dtype=np.int64).reshape(-1) for item in given])
+    if len(atoms) and not 0 <= atoms.min() <= atoms.max() < n:
+        raise InputError(
+            f"surfaces name the particles {atoms.min()} to {atoms.max()}, but the System has {n}",
+            item="surfaces",
+            atoms=[int(atoms.min()), int(atoms.max())],
+        )
+    names, counts = np.unique(atoms, return_counts=True)
+    if len(names) < len(atoms):
+        raise UnsupportedError(f"particle {names[np.argmax(counts)]} is on two surfaces, that is on a curve; {CARRIER}")
+    return atoms
+
+
+def _in_nm(positions: ArrayLike, n: int) -> FloatArray:
+    if unit.is_quantity(positions):
+        positions = positions.value_in_unit(unit.nanometer)  # type: ignore[union-attr]
+    x = np.asarray(positions, dtype=np.float64)
+    if x.shape != (n, 3):
+        raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
+    return x
+
+
+def _settled(item: Constraint, x: FloatArray | None) -> Constraint:
+    """With a target that rests, and that was checked."""
+    if isinstance(item.target, MovingTarget):
+        raise UnsupportedError(f"{item!r} has a target that moves with time; {CARRIER}")
+    if item.target is None:
+        if x is None:
+            raise InputError(
+                f"{item!r} has no radius or offset: give it, or give positions= to take it from them", item="target"
+            )
+        item = item.with_target(item.measure(x[item.atoms], 0.0))
+    target = item.target_at(0.0)
+    length = item.scale() + target if item.family == "Ellipsoid" else target
+    if item.family != "Plane" and not np.all(length > 0):
+        k = int(np.argmin(length))
+        raise InputError(
+            f"{item.row_name(k)}: radius {length[k]:g} is not positive; give a length in nm greater than zero",
+            item="radius",
+            atoms=item.atoms[k].tolist(),
+        )
+    return item
