@@ -14,7 +14,7 @@ from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.terminal import console, rendered, say_written
 
 if TYPE_CHECKING:
-    from kcons.mdanalysis.result import CheckResult
+    from kcons.mdanalysis.check.result import CheckResult
 
 #: The exit status of each result; 2 is wrong use.
 EXIT = {"kept": 0, "tolerated": 0, "violated": 1, "incomplete": 3}
@@ -51,30 +51,30 @@ def add(commands: Any) -> None:
 
 def _check(chosen: argparse.Namespace) -> int:
     try:
-        from kcons.mdanalysis.check_files import check_trajectory
+        from kcons.mdanalysis.check.check_files import check_trajectory
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "MDAnalysis":
             raise
         raise InputError("kcons check needs MDAnalysis: python -m pip install 'kcons[mdanalysis]'") from None
-    from kcons import check_report
+    from kcons.mdanalysis.check import report
 
     if chosen.out is not None:
-        check_report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
+        report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
     try:
         result = _result(chosen, check_trajectory)
     except UnreadableError as error:
         reason = str(error)
         print(f"kcons: {reason}", file=sys.stderr)
-        say_written(_put(chosen, lambda folder: check_report.write_failure(chosen.trajectory, reason, folder)))
+        say_written(_put(chosen, lambda folder: report.write_failure(chosen.trajectory, reason, folder)))
         return EXIT["incomplete"]
     terminal = console()
-    tables = (check_report.unit_table(result), check_report.row_table(result))
-    terminal.print(check_report.summary(result), highlight=False, markup=False)
+    tables = (report.unit_table(result), report.row_table(result))
+    terminal.print(report.summary(result), highlight=False, markup=False)
     for table in tables:
         terminal.print(table)
-    terminal.print(check_report.verdict(result), soft_wrap=True)
-    text = [check_report.summary(result), *map(rendered, tables), result.verdict]
-    say_written(_put(chosen, lambda folder: check_report.write(result, folder, tables=text)))
+    terminal.print(report.verdict(result), soft_wrap=True)
+    text = [report.summary(result), *map(rendered, tables), result.verdict]
+    say_written(_put(chosen, lambda folder: report.write(result, folder, tables=text)))
     return EXIT[result.status]
 
 

@@ -3,8 +3,9 @@
 Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
 """
 
-from kcons.mdanalysis.check import ConstraintCheck
-from kcons.mdanalysis.check_files import check_trajectory
+from kcons.mdanalysis.check.check_files import check_trajectory
+from kcons.mdanalysis.check.constraint_check import ConstraintCheck
+from kcons.mdanalysis.check.result import CheckResult
 from kcons.mdanalysis.conversions import (
     ase_to_openmm,
     from_ase,
@@ -15,8 +16,7 @@ from kcons.mdanalysis.conversions import (
     universe_of,
 )
 from kcons.mdanalysis.loading import load_trajectory, open_universe
-from kcons.mdanalysis.result import CheckResult
-from kcons.mdanalysis.universe import constraints_of, selected, snapshot_of
+from kcons.mdanalysis.topology import constraints_of, selected, snapshot_of
 from kcons.mdanalysis.writing import ASE_UNITS, OPENMM_UNITS, OpenMMReporter, RunUnits, TrajectoryWriter, write_ase
 
 __all__ = [

@@ -19,7 +19,7 @@ from kcons.constraints import Constraint, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
-from kcons.mdanalysis.universe import snapshot_of
+from kcons.mdanalysis.topology import snapshot_of
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows

@@ -487,37 +487,37 @@ MUTANTS = [
     ),
     # -- checks of trajectories --
     (
-        "mdanalysis/check.py",
+        "mdanalysis/check/constraint_check.py",
         "self._table.allow(of_targets + self._tolerance * self._table.sizes)",
         "self._table.allow(self._tolerance * self._table.sizes)",
         "tests/mdanalysis/test_check_precision.py::test_two_roundings_make_more_than_one",
     ),
     (
-        "mdanalysis/check.py",
+        "mdanalysis/check/constraint_check.py",
         "self._table.allow(of_targets + self._tolerance * self._table.sizes)",
         "self._table.allow(of_targets + self._tolerance)",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
     (
-        "mdanalysis/check.py",
+        "mdanalysis/check/constraint_check.py",
         "found.margins + self._tolerance * table.sizes > 0",
         "found.margins + self._tolerance > 0",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
     (
-        "mdanalysis/check.py",
+        "mdanalysis/check/constraint_check.py",
         "np.where(seen, found.mean(found.rounded), self._of_targets)",
         "self._of_targets",
         "tests/mdanalysis/test_check_precision.py::test_targets_that_are_means_have_the_mean_rounding_of_their_frames",
     ),
     (
-        "mdanalysis/check_files.py",
+        "mdanalysis/check/check_files.py",
         "precision.half_step(universe.atoms.positions)",
         "precision.half_step(universe.atoms.positions).max()",
         "tests/mdanalysis/test_check_precision.py::test_a_wild_molecule_of_the_topology_excuses_no_other",
     ),
     (
-        "mdanalysis/rows.py",
+        "mdanalysis/check/row_table.py",
         "np.where(periodic, 1.0, constraint_set.scale)",
         "np.where(periodic, 1.0, 1.0)",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import water_files as files
 
-from kcons import check_report
 from kcons.cli import main
 from kcons.errors import OccupiedError
 from kcons.mdanalysis import check_trajectory
+from kcons.mdanalysis.check import report
 
 N = 20
 
@@ -89,7 +89,7 @@ def test_nothing_that_can_be_read_is_incomplete_too(folder, capsys):
     good = (folder / "nothing.dcd").read_bytes()
     (folder / "nothing.dcd").write_bytes((folder / "nan.dcd").read_bytes())
     assert command(folder, "nothing.dcd", "--frames", ":3") == 0
-    assert {path.name for path in out.iterdir()} == set(check_report.FILES)
+    assert {path.name for path in out.iterdir()} == set(report.FILES)
     (folder / "nothing.dcd").write_bytes(good)
     capsys.readouterr()
     assert command(folder, "nothing.dcd") == 3
@@ -174,17 +174,17 @@ def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):
 def test_writing_refuses_others_and_leaves_nothing_unfinished(folder, tmp_path, monkeypatch):
     one = check_trajectory(folder / "good.xtc", folder / "t.gro", "none", rank=False)
     other = check_trajectory(folder / "good.trr", folder / "t.gro", "none", rank=False)
-    check_report.write(one, tmp_path / "out")
+    report.write(one, tmp_path / "out")
     with pytest.raises(OccupiedError, match=r"good\.xtc; give another folder"):
-        check_report.write(other, tmp_path / "out")
+        report.write(other, tmp_path / "out")
     # A second check that began at the same time has its file there, still empty.
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "check.json").touch()
     with pytest.raises(OccupiedError):
-        check_report.write(one, tmp_path / "new")
+        report.write(one, tmp_path / "new")
     planted = tmp_path / "out" / "check.json.unfinished"
     planted.symlink_to(tmp_path / "victim")
-    check_report.write(one, tmp_path / "out")
+    report.write(one, tmp_path / "out")
     assert not (tmp_path / "victim").exists() and not planted.is_symlink()
 
 
@@ -298,7 +298,7 @@ def drawn(monkeypatch, result):
 
     kept = []
     monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
-    check_report.plot(result, None)
+    report.plot(result, None)
     axes = kept[0].axes[0]
     return {line.get_label(): line for line in axes.lines}, axes
 
@@ -338,5 +338,5 @@ def test_the_picture_has_no_stroke_to_the_zero_of_the_first_frame(folder, monkey
 def test_plot_of_one_frame_and_of_nothing_wrong(folder, tmp_path):
     result = check_trajectory(folder / "good.xtc", folder / "t.gro", "none", frames="2:3", rank=False)
     assert max(result.series["largest Å"]) < 1e-12 and result.status == "incomplete"
-    check_report.plot(result, tmp_path / "p.png")
+    report.plot(result, tmp_path / "p.png")
     assert (tmp_path / "p.png").stat().st_size > 5000

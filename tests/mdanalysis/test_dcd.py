@@ -10,8 +10,9 @@ import water_files as files
 from water_files import mda
 
 from kcons.constraints import Distance
-from kcons.mdanalysis import ConstraintCheck, dcd
-from kcons.mdanalysis.dcd import plain_dcd
+from kcons.mdanalysis import ConstraintCheck
+from kcons.mdanalysis.check import plain_dcd as dcd
+from kcons.mdanalysis.check.plain_dcd import plain_dcd
 
 N = 25
 

@@ -10,7 +10,8 @@ from water_files import mda
 
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
 from kcons.errors import InputError
-from kcons.mdanalysis import ConstraintCheck, load_trajectory, workers
+from kcons.mdanalysis import ConstraintCheck, load_trajectory
+from kcons.mdanalysis.check import workers
 
 N, SIDE = 40, 12.0
 

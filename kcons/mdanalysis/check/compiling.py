@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
-from kcons.mdanalysis.dcd import Block
-from kcons.mdanalysis.deviations import Deviations
-from kcons.mdanalysis.precision import FilePrecision
-from kcons.mdanalysis.rank import PIECE, rank_of
-from kcons.mdanalysis.rows import RowTable
-from kcons.solvers.frames import coordinate_grid, kinetic
+from kcons.mdanalysis.check.deviations import Deviations
+from kcons.mdanalysis.check.file_precision import FilePrecision
+from kcons.mdanalysis.check.frame_kernels import coordinate_grid, kinetic
+from kcons.mdanalysis.check.plain_dcd import Block
+from kcons.mdanalysis.check.rank import PIECE, rank_of
+from kcons.mdanalysis.check.row_table import RowTable
 
 #: Clusters of each kind in a sample: compiled code takes four at once, solvers up to eight.
 OF_A_KIND = 8
 #: What the other process runs.
-COMMAND = "from kcons.mdanalysis.compiling import main; main()"
+COMMAND = "from kcons.mdanalysis.check.compiling import main; main()"
 
 T = TypeVar("T")
 
@@ -54,7 +54,7 @@ class Frame:
         The cell.
     time : float
     in_blocks : bool
-        Whether the file can be read by `kcons.mdanalysis.dcd`.
+        Whether the file can be read by `kcons.mdanalysis.check.plain_dcd`.
     """
 
     x: NDArray[np.float32]

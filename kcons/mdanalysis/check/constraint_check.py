@@ -17,11 +17,12 @@ from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
-from kcons.mdanalysis.compiling import compiled_elsewhere, frame_of, look_once, sample_of
-from kcons.mdanalysis.dcd import PlainDcd, plain_dcd
-from kcons.mdanalysis.deviations import UNITS, Deviations
-from kcons.mdanalysis.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.findings import (
+from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
+from kcons.mdanalysis.check.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.endings import intact_frames, last_offset, leftover
+from kcons.mdanalysis.check.file_precision import FilePrecision, by_frame, described, precision_of
+from kcons.mdanalysis.check.findings import (
     Part,
     by_unit,
     gaps_of,
@@ -30,16 +31,15 @@ from kcons.mdanalysis.findings import (
     row_result,
     verdict_of,
 )
+from kcons.mdanalysis.check.frame_kernels import coordinate_grid, farthest, kinetic
+from kcons.mdanalysis.check.plain_dcd import PlainDcd, plain_dcd
+from kcons.mdanalysis.check.rank import rank_of
+from kcons.mdanalysis.check.result import Break, CheckResult
+from kcons.mdanalysis.check.row_table import SECOND_ORDER, RowTable, cell_matrix, size_of
+from kcons.mdanalysis.check.target_file import TargetFile
+from kcons.mdanalysis.check.temperature import BOLTZMANN, masses_of, temperature_of
+from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
-from kcons.mdanalysis.names import AtomNames
-from kcons.mdanalysis.precision import FilePrecision, by_frame, described, precision_of
-from kcons.mdanalysis.rank import rank_of
-from kcons.mdanalysis.result import Break, CheckResult
-from kcons.mdanalysis.rows import SECOND_ORDER, RowTable, cell_matrix, size_of
-from kcons.mdanalysis.targets import TargetFile
-from kcons.mdanalysis.temperature import BOLTZMANN, masses_of, temperature_of
-from kcons.mdanalysis.workers import inherited, short_pickle, with_backend
-from kcons.solvers.frames import coordinate_grid, farthest, kinetic
 
 #: Times a run that the largest coordinate is looked up; frames, at least, that a mean of a row is taken over, and one
 #: in how many frames at least.
@@ -65,7 +65,7 @@ class ConstraintCheck(AnalysisBase):
     targets : {'given', 'first', 'mean'}, path or TargetFile
         Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
         say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
-        parameter file, see `kcons.mdanalysis.targets`.
+        parameter file, see `kcons.mdanalysis.check.target_file`.
     tolerance : float
         Relative violation that counts as the engine's tolerance and not as a violation, in parts of the length (of
         1 rad for angles).

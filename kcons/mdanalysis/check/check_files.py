@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from kcons.errors import InputError, UnreadableError
-from kcons.mdanalysis.check import ConstraintCheck
+from kcons.mdanalysis.check.constraint_check import ConstraintCheck
+from kcons.mdanalysis.check.file_precision import precision_of
+from kcons.mdanalysis.check.memory import give_back
+from kcons.mdanalysis.check.result import CheckResult
+from kcons.mdanalysis.check.target_file import TargetFile
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
-from kcons.mdanalysis.memory import give_back
-from kcons.mdanalysis.precision import precision_of
-from kcons.mdanalysis.result import CheckResult
-from kcons.mdanalysis.targets import TargetFile
-from kcons.mdanalysis.universe import constraints_of
+from kcons.mdanalysis.topology import constraints_of
 
 
 def check_trajectory(

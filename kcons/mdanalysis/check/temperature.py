@@ -11,9 +11,9 @@ from MDAnalysis.exceptions import NoDataError
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.mdanalysis.findings import Part
-from kcons.mdanalysis.names import AtomNames
-from kcons.mdanalysis.result import fitted
+from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.check.findings import Part
+from kcons.mdanalysis.check.result import fitted
 
 #: Boltzmann's constant in amu Å²/(ps² K).
 BOLTZMANN = 0.831446261815324

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.frames import farthest, lengths, powers_below, triangles
+from kcons.mdanalysis.check.frame_kernels import farthest, lengths, powers_below, triangles
 
 #: Bytes of a block: what stays in the cache of a core.
 BLOCK = 1 << 20

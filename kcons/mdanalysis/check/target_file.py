@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints import Constraint
 from kcons.errors import InputError
-from kcons.mdanalysis.names import AtomNames
+from kcons.mdanalysis.check.atom_names import AtomNames
 
 _WIDTH = {"length": 2, "angle": 3}
 _FAMILY = {"Distance": "length", "Angle": "angle"}

@@ -13,10 +13,9 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.mdanalysis.dcd import Block, look_at
-from kcons.mdanalysis.deviations import UNITS, Deviations
-from kcons.mdanalysis.precision import FilePrecision
-from kcons.solvers.frames import (
+from kcons.mdanalysis.check.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.file_precision import FilePrecision
+from kcons.mdanalysis.check.frame_kernels import (
     LANES,
     UNIFORM,
     coordinate_grid,
@@ -28,6 +27,7 @@ from kcons.solvers.frames import (
     powers_below,
     triangles,
 )
+from kcons.mdanalysis.check.plain_dcd import Block, look_at
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 
 #: What second order adds to the error of rows other than distances, at most.

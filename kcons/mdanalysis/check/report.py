@@ -16,7 +16,7 @@ from rich.text import Text
 from kcons.errors import OccupiedError
 
 if TYPE_CHECKING:
-    from kcons.mdanalysis.result import CheckResult
+    from kcons.mdanalysis.check.result import CheckResult
 
 COLOURS = {"kept": "green", "tolerated": "green", "violated": "red", "incomplete": "yellow"}
 #: What `write` writes.

@@ -9,10 +9,10 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.mdanalysis.deviations import UNITS, Deviations
-from kcons.mdanalysis.names import AtomNames
-from kcons.mdanalysis.result import Break, RowResult, UnitResult, fitted
-from kcons.mdanalysis.rows import RowTable
+from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.check.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.result import Break, RowResult, UnitResult, fitted
+from kcons.mdanalysis.check.row_table import RowTable
 
 
 @dataclass

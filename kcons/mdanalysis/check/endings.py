@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from MDAnalysis.lib.util import anyopen
 
-from kcons.mdanalysis.precision import XTC_MAGIC
-from kcons.mdanalysis.result import Break
+from kcons.mdanalysis.check.file_precision import XTC_MAGIC
+from kcons.mdanalysis.check.result import Break
 
 
 def leftover(path: str | Path, file_format: str, n_frames: int, n_atoms: int, last_offset: int | None) -> Break | None:
