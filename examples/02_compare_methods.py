@@ -8,10 +8,11 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from kcons import compare, report, scenes
+from kcons.comparison import scenes
+from kcons.comparison.work_precision import measure, report
 
 scene = scenes.build("chain", size=10)
-result = compare.compare(scene, methods=["rattle", "ase-kcons", "ase-bonds"], budget=10)
+result = measure.compare(scene, methods=["rattle", "ase-kcons", "ase-bonds"], budget=10)
 
 Console(width=report.WIDTH).print(report.table(result))
 print(report.explanation(result))

@@ -31,13 +31,15 @@ from ase.md.verlet import VelocityVerlet
 from rich.console import Console
 
 import kcons
-from kcons import State, System, compare, measuring
+from kcons import State, System
 from kcons.ase import constrain
+from kcons.comparison.scenes.openmm_host import system_of
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision import measure as compare
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.plan.plan import DistanceClusters, make_plan
-from kcons.scenes.openmm_host import system_of
 from kcons.solvers.sparse.distances import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
@@ -454,7 +456,7 @@ def certificates(full: bool) -> dict:
 
 def show_certificates(result: dict, console: Console) -> None:
     headings = ("system", "rows", "steps", "step", "certificates", "each", "share")
-    table = measuring.table("Certificates in a run without forces", headings, {"system"})
+    table = scripts.table("Certificates in a run without forces", headings, {"system"})
     table.add_row("", "", "", "µs", "", "µs", "%", end_section=True)
     for r in result["certificates"]:
         table.add_row(
@@ -520,7 +522,7 @@ def exponent(rows: list[dict], start: str) -> float:
 
 def show(result: dict, console: Console) -> None:
     headings = ("system", "solver", "rows", "P", "V", "P + V", "bare", "P + V", "σ/tol", "|Av|/v", "set-up")
-    table = measuring.table("Engine: time and error", headings, {"system", "solver"})
+    table = scripts.table("Engine: time and error", headings, {"system", "solver"})
     table.add_row("", "", "", "ns/row", "ns/row", "ns/row", "ns/atom", "× bare", "", "", "s", end_section=True)
     for r in result["engine"]:
         table.add_row(
@@ -548,9 +550,9 @@ def show(result: dict, console: Console) -> None:
 
 def main() -> None:
     console = Console(width=150)
-    parser = measuring.options(__doc__, full="all sizes and the slow peers")
+    parser = scripts.options(__doc__, full="all sizes and the slow peers")
     parser.add_argument("--certificates", action="store_true", help="only what certificates take of a run")
-    measuring.script(
+    scripts.script(
         parser,
         lambda options: certificates(options.full) if options.certificates else run(options.full, console),
         lambda result: (show_certificates if "certificates" in result else show)(result, console),

@@ -22,7 +22,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kcons import compare, methods, scenes
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.work_precision import measure
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
@@ -185,7 +187,7 @@ def show(result: dict[str, Any], console: Console) -> None:
                 cells += [f"> {curves[stepper][-1]['evaluations']:,.0f}", "", ""]
             else:
                 ratio = f"{plain / needed:.1f}" if plain else ""
-                cells += [f"{needed:,.0f}", ratio, "" if seconds is None else compare.duration(seconds)]
+                cells += [f"{needed:,.0f}", ratio, "" if seconds is None else measure.duration(seconds)]
         table.add_row(stepper, str(scheme.order), str(scheme.force_evaluations), *cells)
     console.print(table)
     for name in SYSTEMS:
@@ -221,7 +223,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from kcons import report
+    from kcons.comparison.work_precision import report
 
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -260,8 +262,8 @@ def main() -> None:
     if options.show:
         result = json.loads(options.show.read_text())
     else:
-        environment = compare.environment()
-        compare.warm_up(scenes.build("butane"))
+        environment = measure.environment()
+        measure.warm_up(scenes.build("butane"))
         result = {
             "environment": environment,
             "goal": GOAL,

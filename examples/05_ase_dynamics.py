@@ -23,9 +23,9 @@ from ase.md.md import MolecularDynamics
 from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
-from kcons import measuring
 from kcons.ase import ConstrainedDynamics, constrain, rigid_water
-from kcons.compare import environment
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision.measure import environment
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
 
@@ -360,7 +360,7 @@ def main() -> None:
         pulled_bond(40)
         return run(options.full)
 
-    measuring.script(measuring.options(__doc__, full="everything that the page shows; minutes"), measure, show)
+    scripts.script(scripts.options(__doc__, full="everything that the page shows; minutes"), measure, show)
 
 
 if __name__ == "__main__":

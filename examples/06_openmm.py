@@ -24,7 +24,8 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons import compare, measuring
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision import measure as compare
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
 
@@ -82,7 +83,7 @@ def race(
         context.setVelocitiesToTemperature(300, 1)
         integrators[name].step(steps)
     calls = {name: partial(integrator.step, steps) for name, integrator in integrators.items()}
-    return measuring.speeds(measuring.in_turn(calls, repeats), steps)
+    return scripts.speeds(scripts.in_turn(calls, repeats), steps)
 
 
 def plain_water(full: bool) -> dict[str, Any]:
@@ -170,12 +171,12 @@ def show(result: dict[str, Any], console: Console) -> None:
     for measured in result["measurements"].values():
         if "rows" in measured:
             headings = ("integrator", "ms a step", "steps a second, relative")
-            table = measuring.table(measured["title"], headings, {"integrator"})
+            table = scripts.table(measured["title"], headings, {"integrator"})
             for name, row in measured["rows"].items():
                 table.add_row(name, f"{row['ms']:.3f}", f"{row['ratio']:.2f}")
         else:
             headings = ("scheme", "step/fs", "error/nm", "force evaluations/ps", "fewer than RATTLE at 5e-7 nm")
-            table = measuring.table(measured["title"], headings, {"scheme"})
+            table = scripts.table(measured["title"], headings, {"scheme"})
             for scheme, points in measured["schemes"].items():
                 for k, p in enumerate(points):
                     fewer = f"{measured['fewer_than_rattle'][scheme]:.1f} ×" if k == 0 else ""
@@ -191,7 +192,7 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 def main() -> None:
     console = Console(width=120)
-    parser = measuring.options(__doc__, full="the sizes of the committed results")
+    parser = scripts.options(__doc__, full="the sizes of the committed results")
     parser.add_argument("--only", choices=[*MEASUREMENTS], help="one measurement")
 
     def measure(options: argparse.Namespace) -> dict[str, Any]:
@@ -199,7 +200,7 @@ def main() -> None:
         measured = {name: measurement(options.full) for name, measurement in chosen.items()}
         return {"machine": compare.environment(), "full": options.full, "measurements": measured}
 
-    measuring.script(parser, measure, lambda result: show(result, console))
+    scripts.script(parser, measure, lambda result: show(result, console))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from openmm import app, unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons import measuring
+from kcons.comparison.study import scripts
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -85,7 +85,7 @@ def measure_collective(full: bool = False) -> dict[str, Any]:
         contexts[name] = context
     steps, rounds = (50, 9) if full else (5, 3)
     calls = {name: partial(integrator.step, steps) for name, (integrator, _, _) in runs.items()}
-    found = measuring.speeds(measuring.in_turn(calls, rounds), steps)
+    found = scripts.speeds(scripts.in_turn(calls, rounds), steps)
     return {
         "title": f"Distances held in rigid water, {len(x)} atoms, PME, 2 fs",
         "atoms": len(x),

@@ -29,18 +29,19 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons import compare, measuring
+from kcons.comparison.hard_cases.rings import ring
+from kcons.comparison.scenes.openmm_host import system_of
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision import measure as compare
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
-from kcons.hard_cases.rings import ring
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold, take_constraints
 from kcons.openmm.carried.requirements import masses_of
 from kcons.openmm.integrator.guard import positions_of, velocities_of
-from kcons.scenes.openmm_host import system_of
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 KT = 2.494  # 300 K in kJ/mol
@@ -142,8 +143,8 @@ def solver(name: str, system: openmm.System, x: np.ndarray, tolerance: float, re
         "rows": held.n_rows,
         "tolerance": tolerance,
         **{f"{key}_ns": float(np.median(values)) for key, values in samples.items()},
-        "p_ratio": measuring.ratio(samples["ccma_p"], samples["p"]),
-        "v_ratio": measuring.ratio(samples["ccma_v"], samples["v"]),
+        "p_ratio": scripts.ratio(samples["ccma_p"], samples["p"]),
+        "v_ratio": scripts.ratio(samples["ccma_v"], samples["v"]),
         "ccma_error": float(np.max(np.abs(held.value(theirs)) / held.scale)),
         "error": error,
         "ccma_velocity_error": float(np.abs(rate @ tangent.ravel()).max()),
@@ -202,7 +203,7 @@ def speeds(name: str, times: dict[str, list[float]], steps: int) -> dict:
     return {
         "name": name,
         "ms_a_step": {label: 1e3 * float(np.median(t)) / steps for label, t in times.items()},
-        "ratio": {label: measuring.ratio(times["VerletIntegrator"], t) for label, t in times.items()},
+        "ratio": {label: scripts.ratio(times["VerletIntegrator"], t) for label, t in times.items()},
     }
 
 
@@ -244,7 +245,7 @@ def steps_in_water(molecules: int, rows: tuple[int, ...], steps: int, repeats: i
         one = openmm.XmlSerializer.clone(system)
         part = hold(one, Distance(pairs_in_water(start, count)), start)
         add(f"{count} carried", ProjectedIntegrator(0.001, parts=[part]), one, part)
-    times = measuring.in_turn(calls, repeats)
+    times = scripts.in_turn(calls, repeats)
     for _, part in keep:
         if part is not None:
             part.check(_)
@@ -268,7 +269,7 @@ def steps_in_dhfr(name: str, tolerance: float, steps: int, repeats: int, **optio
         integrator.step(3)
         keep.append(context)
         calls[label] = lambda integrator=integrator: integrator.step(steps)
-    times = measuring.in_turn(calls, repeats)
+    times = scripts.in_turn(calls, repeats)
     part.check(keep[-1])
     return speeds(f"DHFR AllBonds, {name}, {tolerance:g}", times, steps)
 
@@ -440,7 +441,7 @@ def run(full: bool, console: Console, kept: dict | None = None) -> dict:
 
 
 def show(result: dict, console: Console) -> None:
-    table = measuring.table(
+    table = scripts.table(
         "The solver alone: OpenMM's CCMA and kcons on the same input, ns a row",
         ("system", "rows", "tol", *("P CCMA", "P kcons", "ratio", "V CCMA", "V kcons", "ratio"), "CCMA", "kcons"),
         {"system"},
@@ -454,7 +455,7 @@ def show(result: dict, console: Console) -> None:
         )  # fmt: skip
     console.print(table)
     headings = ("system", "rows", "CCMA", "rows given to kcons", "ratio", "moved over to kcons", "ratio")
-    table = measuring.table("From a System to a Context, s", headings, {"system"})
+    table = scripts.table("From a System to a Context, s", headings, {"system"})
     for r in result["setup"]:
         table.add_row(
             r["name"], f"{r['rows']:,}", f"{r['ccma_s']:.2f}", f"{r['given_s']:.3f}", f"{r['given_ratio']:.0f}",
@@ -462,13 +463,13 @@ def show(result: dict, console: Console) -> None:
         )  # fmt: skip
     console.print(table)
     title = "Speed of whole steps: milliseconds, and times VerletIntegrator's steps a second"
-    table = measuring.table(title, ("system", "integrator", "ms", "speed"), {"system", "integrator"})
+    table = scripts.table(title, ("system", "integrator", "ms", "speed"), {"system", "integrator"})
     for r in result["steps"]:
         for k, (name, ms) in enumerate(r["ms_a_step"].items()):
             table.add_row(r["name"] if k == 0 else "", name, f"{ms:.2f}", f"{r['ratio'][name]:.2f}")
     console.print(table)
     headings = ("distances held", "kcons", "OpenMM")
-    table = measuring.table("Hard cases: largest relative error of a distance over 500 steps", headings, headings)
+    table = scripts.table("Hard cases: largest relative error of a distance over 500 steps", headings, headings)
     for r in result["hard"]:
         ours, theirs = r["kcons"], r["OpenMM"]
         bad = f"NaN after {theirs['steps']} steps" if not np.isfinite(theirs["error"]) else f"{theirs['error']:.0e}"
@@ -487,13 +488,13 @@ def show(result: dict, console: Console) -> None:
 
 def main() -> None:
     console = Console(width=150)
-    parser = measuring.options(__doc__, full="all systems")
+    parser = scripts.options(__doc__, full="all systems")
     parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
 
     def measure(options: argparse.Namespace) -> dict:
         return run(options.full, console, json.loads(options.steps.read_text()) if options.steps else None)
 
-    measuring.script(parser, measure, lambda result: show(result, console))
+    scripts.script(parser, measure, lambda result: show(result, console))
 
 
 if __name__ == "__main__":

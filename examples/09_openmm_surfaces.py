@@ -25,7 +25,7 @@ from openmm import unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons import compare
+from kcons.comparison.work_precision import measure
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm import ExpressionSurface, SurfaceIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
@@ -161,7 +161,7 @@ def precision(duration: float) -> list[dict[str, Any]]:
 
 def run(full: bool) -> dict[str, Any]:
     n, repeats, steps = (1000, 15, 60) if full else (64, 3, 20)
-    result: dict[str, Any] = {"machine": compare.environment(), "full": full, "particles": n, "speed": []}
+    result: dict[str, Any] = {"machine": measure.environment(), "full": full, "particles": n, "speed": []}
     for cutoff in CUTOFFS if full else CUTOFFS[1:2]:
         for compiled in (False, True):
             result["speed"].append(speed("spheres", "rattle", compiled, n, cutoff, repeats, steps))

@@ -29,14 +29,14 @@ from ase import Atoms, units
 from rich.console import Console
 from rich.table import Table
 
-from kcons import compare
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
+from kcons.comparison.scenes import fluid
+from kcons.comparison.scenes.lennard_jones import LennardJones
+from kcons.comparison.scenes.potential import Potential, PotentialCalculator
+from kcons.comparison.work_precision import measure as compare
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.scenes import fluid
-from kcons.scenes.lennard_jones import LennardJones
-from kcons.scenes.potential import Potential, PotentialCalculator
 from kcons.steppers import State, Stepper, System, run
 from kcons.thermostats import Isokinetic, Langevin, configurational_temperature, mean, thermal_velocities
 

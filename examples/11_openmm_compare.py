@@ -25,11 +25,13 @@ from typing import Any
 import openmm
 from rich.console import Console
 
-from kcons import compare, measuring, report, scenes
-from kcons.compare import Comparison, Measurement
+from kcons.comparison import scenes
+from kcons.comparison.scenes import Scene
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision import measure, report
+from kcons.comparison.work_precision.measure import Comparison, Measurement
 from kcons.openmm import ProjectedIntegrator, hold
 from kcons.progress import Bars
-from kcons.scenes import Scene
 
 #: Scenes, the errors in Å that they are asked for, and steps a turn.
 FULL = {"alanine": (1e-3, 1e-5, 1e-7), "dhfr": (1e-3, 1e-4, 1e-5), "villin": (1e-3, 1e-4, 2e-5)}
@@ -61,7 +63,7 @@ def steps_in_turn(scene: Scene, steps: int, turns: int) -> dict[str, dict[str, f
         contexts[name].setVelocities(scene.velocities * host.speed)
         integrator.step(2)
     calls = {name: partial(integrator.step, steps) for name, (_, integrator) in racers.items()}
-    return measuring.speeds(measuring.in_turn(calls, turns), steps)
+    return scripts.speeds(scripts.in_turn(calls, turns), steps)
 
 
 def cheapest(result: Comparison, target: float) -> dict[str, Any]:
@@ -98,7 +100,7 @@ def run(full: bool) -> dict[str, Any]:
                 continue
             scene = scenes.build(name, quick=not full)
             methods = None if full else QUICK_METHODS
-            result = compare.compare(scene, methods=methods, budget=60 if full else 5, watcher=watcher)
+            result = measure.compare(scene, methods=methods, budget=60 if full else 5, watcher=watcher)
             found[name] = result.to_dict()
             if full:
                 found[name]["targets"] = [cheapest(result, target) for target in targets]

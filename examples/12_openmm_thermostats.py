@@ -26,7 +26,8 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons import compare, measuring
+from kcons.comparison.study import scripts
+from kcons.comparison.work_precision import measure
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -115,7 +116,7 @@ def speed(full: bool) -> dict[str, Any]:
         contexts[name].getState(positions=True)
 
     calls = {name: partial(call, name) for name in integrators}
-    rows = measuring.speeds(measuring.in_turn(calls, rounds, clock=time.perf_counter), steps)
+    rows = scripts.speeds(scripts.in_turn(calls, rounds, clock=time.perf_counter), steps)
     return {"title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs", "rows": rows}
 
 
@@ -177,13 +178,13 @@ def show(result: dict[str, Any], console: Console) -> None:
     fast, sampled = (result["measurements"].get(name) for name in ("speed", "sampling"))
     if fast:
         headings = ("integrator", "ms a step", "steps a second, relative")
-        table = measuring.table(fast["title"], headings, {"integrator"})
+        table = scripts.table(fast["title"], headings, {"integrator"})
         for name, row in fast["rows"].items():
             table.add_row(name, f"{row['ms']:.2f}", f"{row['ratio']:.2f}")
         console.print(table)
     if sampled and "reference" in sampled:
         headings = ("integrator", "step/fs", "mean U, kJ/mol", "less that at 1 fs")
-        table = measuring.table(sampled["title"], headings, {"integrator"})
+        table = scripts.table(sampled["title"], headings, {"integrator"})
         zero = sampled["reference"]
         for name, points in sampled["sampling"].items():
             for row in points:
@@ -199,14 +200,14 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main() -> None:
-    parser = measuring.options(__doc__, full="the sizes of the committed results")
+    parser = scripts.options(__doc__, full="the sizes of the committed results")
     parser.add_argument("--only", choices=["speed", "sampling"], help="one measurement; others in --out are kept")
     options = parser.parse_args()
     console = Console(width=120)
     if options.show:
         show(json.loads(options.show.read_text()), console)
         return
-    result: dict[str, Any] = {"machine": compare.environment(), "full": options.full, "measurements": {}}
+    result: dict[str, Any] = {"machine": measure.environment(), "full": options.full, "measurements": {}}
     if options.out and options.only and options.out.exists():
         result["measurements"] = json.loads(options.out.read_text())["measurements"]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kcons.hard_cases import SYSTEMS, Case, Problem, all_cases, case, load, outcome, pages, run_cell
+from kcons.comparison.hard_cases import SYSTEMS, Case, Problem, all_cases, case, load, outcome, pages, run_cell
 
 
 @case("Y01", "Cube by all 28 distances, tumbling", "residual 1e-10, kinetic energy 1e-3")

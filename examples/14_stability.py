@@ -11,7 +11,7 @@ import argparse
 import json
 from pathlib import Path
 
-from kcons.stability import digest, drift, fuzz, largest_step, pages, trial
+from kcons.comparison.stability import digest, drift, fuzz, largest_step, pages, trial
 
 
 def main() -> None:

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kcons import measuring, solver_precision
+from kcons.comparison.solvers_alone import solver_precision
+from kcons.comparison.study import scripts
 
 
 def main() -> None:
@@ -23,11 +24,11 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="large systems")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    result = measuring.continued(options.out, solver_precision.measure, quick=not options.full)
+    result = scripts.continued(options.out, solver_precision.measure, quick=not options.full)
     if options.out:
         solver_precision.figure(result).savefig(options.out.with_suffix(".png"), dpi=130)
     page, title = solver_precision.table(result), "Constraint solvers alone: time a constraint, and what is left"
-    Console(width=170).print(measuring.table(title, page.headings, page.headings, page.rows))
+    Console(width=170).print(scripts.table(title, page.headings, page.headings, page.rows))
 
 
 if __name__ == "__main__":

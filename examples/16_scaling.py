@@ -14,7 +14,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kcons import measuring, scaling
+from kcons.comparison.solvers_alone import scaling
+from kcons.comparison.study import scripts
 
 
 def main() -> None:
@@ -22,11 +23,11 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="all sizes and solvers")
     parser.add_argument("--out", type=Path, help="JSON file for the results")
     options = parser.parse_args()
-    result = measuring.continued(options.out, scaling.measure, quick=not options.full)
+    result = scripts.continued(options.out, scaling.measure, quick=not options.full)
     if options.out:
         scaling.figure(result).savefig(options.out.with_suffix(".png"), dpi=130)
     page = scaling.table(result)
-    Console(width=150).print(measuring.table("Cost and memory against size", page.headings, page.headings, page.rows))
+    Console(width=150).print(scripts.table("Cost and memory against size", page.headings, page.headings, page.rows))
 
 
 if __name__ == "__main__":

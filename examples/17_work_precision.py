@@ -15,7 +15,8 @@ from time import perf_counter
 import numpy as np
 from matplotlib.figure import Figure
 
-from kcons import State, System, run, scenes, steppers
+from kcons import State, System, run, steppers
+from kcons.comparison import scenes
 from kcons.errors import ConvergenceError
 
 STEPPERS = [steppers.Rattle(), steppers.Suzuki4(), steppers.BlanesMoan4(), steppers.BlanesMoan6()]

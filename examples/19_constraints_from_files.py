@@ -22,7 +22,7 @@ import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons import Motion
-from kcons.scenes.any_file import read
+from kcons.comparison.scenes.any_file import read
 from kcons.topology import Snapshot, Topology
 from kcons.topology.rows_by_name import HeldRows, held_rows
 

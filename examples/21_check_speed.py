@@ -26,8 +26,8 @@ with warnings.catch_warnings():
     import MDAnalysis as mda
 
 from kcons import __version__
+from kcons.comparison.study.machine import environment
 from kcons.constraints import Distance
-from kcons.machine import environment
 from kcons.mdanalysis import ConstraintCheck
 
 OXYGEN_HYDROGEN, ANGLE = 0.9572, np.radians(104.52)

@@ -17,10 +17,11 @@ import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator
 
-from kcons import measuring, scenes
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.machine import environment
-from kcons.scenes.fluid import Fluid
+from kcons.comparison import scenes
+from kcons.comparison.scenes.fluid import Fluid
+from kcons.comparison.study import scripts
+from kcons.comparison.study.machine import environment
 from kcons.thermostats import thermal_velocities
 
 #: Fluid, molecules, steps of a block: 10 to 20 ms.
@@ -106,8 +107,8 @@ def run(full: bool) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = measuring.options(__doc__, full="as many blocks as the page shows")
-    measuring.script(parser, lambda options: run(options.full), show)
+    parser = scripts.options(__doc__, full="as many blocks as the page shows")
+    scripts.script(parser, lambda options: run(options.full), show)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from kcons.errors import InputError, KconsError
 from kcons.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 
 if TYPE_CHECKING:
-    from kcons.runs import Method
-    from kcons.scenes import Scene
-    from kcons.scenes.fluid import Fluid
+    from kcons.comparison.methods.method import Method
+    from kcons.comparison.scenes import Scene
+    from kcons.comparison.scenes.fluid import Fluid
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -86,34 +86,34 @@ def _parser() -> argparse.ArgumentParser:
     files.add_argument("--rigid-residues", nargs="+", metavar="NAME", help="residues held rigid")
     common.add_argument("--list", action="store_true", help="list scenes and methods, and leave")
 
-    compare = commands.add_parser(
+    measure = commands.add_parser(
         "compare",
         parents=[common],
         help="how much error each method makes, for how much time",
         description="Run a scene through several methods; table, plot and JSON of error against cost. Trajectories "
         "are compared, or averages of the scenes at a temperature.",
     )
-    compare.add_argument(
+    measure.add_argument(
         "--dt",
         type=numbers,
         help="time steps, comma separated, in the unit the scene shows; "
         "steppers with several force evaluations a step take longer ones at the same cost",
     )
-    compare.add_argument(
+    measure.add_argument(
         "--methods",
         type=names,
         help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
     )
-    compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
-    compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
-    compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
-    compare.add_argument(
+    measure.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
+    measure.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
+    measure.add_argument("--budget", type=float, help="seconds for each method (default 20)")
+    measure.add_argument(
         "--target-error",
         type=float,
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
-    report = compare.add_argument_group("the whole comparison")
+    report = measure.add_argument_group("the whole comparison")
     report.add_argument(
         "--all",
         action="store_true",
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--fresh", action="store_true", help="measure again what is there already")
     report.add_argument("--redraw", type=Path, metavar="DIR", help="pictures and page from the numbers in DIR, no run")
     report.add_argument("--into", type=Path, metavar="PAGE", help="with --redraw: the table into this page, too")
-    compare.set_defaults(run=_compare)
+    measure.set_defaults(run=_compare)
 
     plan = commands.add_parser(
         "plan",
@@ -148,7 +148,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         return _compare_all(chosen)
     if chosen.list:
         return _list()
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
     folder: Path = chosen.out or Path(f"compare-{Path(chosen.scene or '').stem}")
@@ -162,22 +162,23 @@ def _compare(chosen: argparse.Namespace) -> int:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
         return _compare_averages(chosen, budget, folder, asked)
-    from kcons import compare, methods, recommendation, report
+    from kcons.comparison.methods import methods
+    from kcons.comparison.work_precision import measure, recommendation, report
+    from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
     from kcons.progress import Bars
-    from kcons.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
     with Bars() as watcher:
-        watcher.begin("building the scene" + ("" if compare.kernels_cached() else "; compiling kernels (once)"), 1)
+        watcher.begin("building the scene" + ("" if measure.kernels_cached() else "; compiling kernels (once)"), 1)
         scene = _scene(chosen, quick=chosen.quick)
         watcher.end()
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-        reference = None if target is None else compare.reference_of(scene, watcher)
+        reference = None if target is None else measure.reference_of(scene, watcher)
         rounds = QUICK_ROUNDS if chosen.quick else ROUNDS
-        result = compare.compare(
+        result = measure.compare(
             scene,
             methods=chosen.methods,
             budget=budget,
@@ -208,7 +209,7 @@ def _compare(chosen: argparse.Namespace) -> int:
 
 def _expression(chosen: argparse.Namespace) -> str:
     """Python that makes the scene, after `from kcons import scenes`."""
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}
     said |= {"quick": True} if chosen.quick else {}
@@ -228,30 +229,31 @@ def _literal(value: Any) -> str:
 
 
 def _compare_all(chosen: argparse.Namespace) -> int:
-    from kcons import everything, parts
+    from kcons.comparison.work_precision import parts_of_the_whole, whole
     from kcons.progress import Bars
 
     if chosen.list:
         print("parts of the whole comparison")
-        for item in parts.PLAN:
+        for item in parts_of_the_whole.PLAN:
             print(f"  {item.key:<22} {item.heading}")
         return 0
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
         raise InputError("--all runs all scenes and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
-        say_written(everything.redraw(chosen.redraw, chosen.into))
+        say_written(whole.redraw(chosen.redraw, chosen.into))
         return 0
     folder: Path = chosen.out or Path("compare-all")
-    items = parts.chosen(chosen.only)
+    items = parts_of_the_whole.chosen(chosen.only)
     folder.mkdir(parents=True, exist_ok=True)
     with Bars() as watcher:
-        path = everything.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
+        path = whole.run(items, folder, quick=chosen.quick, fresh=chosen.fresh, watcher=watcher)
     print(f"wrote {path}, and beside it JSON, PNG and TXT of every part")
     return 0
 
 
 def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, asked: dict[str, Any]) -> int:
-    from kcons import sampling, sampling_report
+    from kcons.comparison.averages import report as sampling_report
+    from kcons.comparison.averages import sampling
     from kcons.progress import Bars
 
     sampling.chosen(chosen.methods)  # complain before any work
@@ -276,7 +278,7 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
 
 
 def _check_scene(chosen: argparse.Namespace) -> None:
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     known = ", ".join((*scenes.SCENES, *scenes.FLUIDS))
     if chosen.scene is None:
@@ -308,7 +310,7 @@ def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
         if chosen.add_hydrogens and scenes.by_mdanalysis(chosen.scene, _molecules(chosen)):
@@ -327,7 +329,7 @@ def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
 
 
 def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     return scenes.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
 
@@ -338,7 +340,7 @@ def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
 def _plan(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return _list()
-    from kcons import scenes
+    from kcons.comparison import scenes
 
     _check_scene(chosen)
     given = _molecules(chosen)
@@ -357,7 +359,7 @@ def _plan(chosen: argparse.Namespace) -> int:
 
 def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
     """Nothing but the rows: no forces are needed."""
-    from kcons.scenes import any_file
+    from kcons.comparison.scenes import any_file
 
     for name in ("forces", "force_field", "platform", "add_hydrogens"):
         if name in given:
@@ -375,7 +377,9 @@ def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
 
 
 def _list() -> int:
-    from kcons import methods, sampling, scenes
+    from kcons.comparison import scenes
+    from kcons.comparison.averages import sampling
+    from kcons.comparison.methods import methods
 
     print("scenes")
     for name, entry in scenes.SCENES.items():

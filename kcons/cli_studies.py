@@ -38,8 +38,8 @@ def add(commands: Any) -> None:
 
 
 def _hard_cases(chosen: argparse.Namespace) -> int:
-    from kcons import hard_cases
-    from kcons.hard_cases import pages
+    from kcons.comparison import hard_cases
+    from kcons.comparison.hard_cases import pages
     from kcons.progress import Bars
 
     cases = hard_cases.chosen(chosen.only)
@@ -57,9 +57,9 @@ def _hard_cases(chosen: argparse.Namespace) -> int:
 
 
 def _stability(chosen: argparse.Namespace) -> int:
-    from kcons import stability
+    from kcons.comparison import stability
+    from kcons.comparison.stability import pages
     from kcons.progress import Bars
-    from kcons.stability import pages
 
     chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"

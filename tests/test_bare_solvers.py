@@ -7,8 +7,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons import bare_solvers, bare_systems
-from kcons.bare_solvers import CANDIDATES
+from kcons.comparison.solvers_alone import bare_solvers, bare_systems
+from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES
 from kcons.errors import UnsupportedError
 
 SYSTEMS = {

@@ -8,7 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons import compare, methods, runs, scenes
+from kcons.comparison import scenes
+from kcons.comparison.methods import method as runs
+from kcons.comparison.methods import methods
+from kcons.comparison.work_precision import measure
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System, run
 
@@ -20,12 +23,12 @@ def chain():
 
 @pytest.fixture(scope="module")
 def result(chain):
-    return compare.compare(chain, budget=30)
+    return measure.compare(chain, budget=30)
 
 
 @pytest.fixture(scope="module")
 def spheres():
-    return compare.compare(scenes.build("sphere-pendulum", 2), budget=30)
+    return measure.compare(scenes.build("sphere-pendulum", 2), budget=30)
 
 
 def test_all_methods_are_there(chain, result):
@@ -123,12 +126,12 @@ def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
 
 def test_energy_slope_is_the_fit():
     scene = scenes.build("sphere", 2)
-    log = compare._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
-    slope, error = compare._energy_slope(scene, log)
+    log = measure._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
+    slope, error = measure._energy_slope(scene, log)
     assert slope == pytest.approx(2.0 / scene.motion.degrees_of_freedom)
     assert error == pytest.approx(0.0, abs=1e-12)
     log.energies = [0.0, 1.0, 0.0, 1.0, 0.0]
-    slope, error = compare._energy_slope(scene, log)
+    slope, error = measure._energy_slope(scene, log)
     assert abs(slope) < 2 * error
 
 
@@ -159,7 +162,7 @@ class Broken(methods.CoreStepper):
 
 def compare_with(monkeypatch, method, chain, **options):
     monkeypatch.setattr(methods, "METHODS", {method.name: method})
-    return compare.compare(chain, **options)
+    return measure.compare(chain, **options)
 
 
 def test_method_over_budget_is_stopped_after_one_step(monkeypatch, chain):
@@ -219,7 +222,7 @@ def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
 )
 def test_bad_arguments(chain, options, text):
     with pytest.raises(InputError, match=text):
-        compare.compare(chain, **options)
+        measure.compare(chain, **options)
 
 
 # -- every small scene ------------------------------------------------------------------------------
@@ -247,7 +250,7 @@ COMPOSED = ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 def test_quick_comparison(name):
     scene = scenes.build(name, quick=True)
     steps = scene.time_steps[:2]
-    result = compare.compare(replace(scene, time_steps=steps), budget=60)
+    result = measure.compare(replace(scene, time_steps=steps), budget=60)
     refused = {m.method: m.note for m in result.measurements if m.status == "not run" and m.setting == 0}
     assert refused.keys() == REFUSED[name].keys()
     for method, text in REFUSED[name].items():
@@ -276,7 +279,7 @@ def test_quick_comparison(name):
 
 
 def test_environment_names_machine_and_versions():
-    found = compare.environment()
+    found = measure.environment()
     assert found["cpu"]
     assert found["cores"] >= 1
     assert found["versions"]["numpy"] == np.__version__
@@ -285,10 +288,10 @@ def test_environment_names_machine_and_versions():
 
 def test_kernels_are_looked_for_where_they_are_cached(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert not compare.kernels_cached()
+    assert not measure.kernels_cached()
     (tmp_path / "deeper").mkdir()
     (tmp_path / "deeper" / "kernel.nbi").touch()
-    assert compare.kernels_cached()
+    assert measure.kernels_cached()
 
 
 def test_stopwatch_counts_nested_calls_once():
@@ -308,7 +311,7 @@ def test_stopwatch_counts_nested_calls_once():
 
 
 def test_watcher_hears_of_everything(chain):
-    class Listener(compare.Watcher):
+    class Listener(measure.Watcher):
         def __init__(self):
             self.heard, self.open = [], 0
 
@@ -323,7 +326,7 @@ def test_watcher_hears_of_everything(chain):
             self.open -= 1
 
     listener = Listener()
-    compare.compare(chain, methods=["rattle"], watcher=listener)
+    measure.compare(chain, methods=["rattle"], watcher=listener)
     assert listener.open == 0
     assert "kernels" in listener.heard[0]
     assert listener.heard[1] == "reference solution"
@@ -344,4 +347,4 @@ def test_watcher_hears_of_everything(chain):
     ],
 )
 def test_duration(seconds, text):
-    assert compare.duration(seconds) == text
+    assert measure.duration(seconds) == text

@@ -10,12 +10,14 @@ from unittest.mock import Mock
 
 import pytest
 
-from kcons import cli, comparison_page, everything, parts, scenes, timing_rounds
-from kcons.compare import Watcher
+from kcons import cli
+from kcons.comparison import scenes
+from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
+from kcons.comparison.work_precision import parts_of_the_whole, timing_rounds, whole, whole_page
+from kcons.comparison.work_precision.measure import Watcher
+from kcons.comparison.work_precision.measurement import Comparison
+from kcons.comparison.work_precision.parts_of_the_whole import Item
 from kcons.errors import InputError
-from kcons.methods import STEPPERS, USUAL_STEPPERS
-from kcons.parts import Item
-from kcons.results import Comparison
 
 TINY = (
     Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
@@ -39,21 +41,21 @@ class Listener(Watcher):
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    for module in (parts, everything):
+    for module in (parts_of_the_whole, whole):
         monkeypatch.setattr(module, "PLAN", TINY)
-    monkeypatch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, {}))
-    monkeypatch.setattr(everything, "code_digest", lambda: "digest")
+    monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
+    monkeypatch.setattr(whole, "code_digest", lambda: "digest")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("all")
     with pytest.MonkeyPatch.context() as patch:
-        for module in (parts, everything):
+        for module in (parts_of_the_whole, whole):
             patch.setattr(module, "PLAN", TINY)
-        patch.setattr(everything, "methods_of", lambda item, scene, quick: (METHODS, {}))
-        patch.setattr(everything, "code_digest", lambda: "digest")
-        everything.run(TINY, folder)
+        patch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
+        patch.setattr(whole, "code_digest", lambda: "digest")
+        whole.run(TINY, folder)
     return folder
 
 
@@ -80,21 +82,21 @@ def test_a_part_of_a_module_goes_on_where_it_was_interrupted(tmp_path, monkeypat
             keep(found)
         return found
 
-    monkeypatch.setattr(everything, "import_module", lambda name: SimpleNamespace(measure=measure))
-    monkeypatch.setattr(everything, "find_spec", lambda name: True)
-    monkeypatch.setattr(everything, "comparison_page", Mock())
+    monkeypatch.setattr(whole, "import_module", lambda name: SimpleNamespace(measure=measure))
+    monkeypatch.setattr(whole, "find_spec", lambda name: True)
+    monkeypatch.setattr(whole, "comparison_page", Mock())
     items = [Item("alone", "A module", module="kcons.some_module", seconds=1)]
     with pytest.raises(KeyboardInterrupt):
-        everything.run(items, tmp_path)
-    assert everything.read(tmp_path, "alone")["result"] == {"points": [0, 1]}
-    everything.run(items, tmp_path)
-    everything.run(items, tmp_path)
+        whole.run(items, tmp_path)
+    assert whole.read(tmp_path, "alone")["result"] == {"points": [0, 1]}
+    whole.run(items, tmp_path)
+    whole.run(items, tmp_path)
     assert measured == [0, 1, "interrupted", 2]
-    assert everything.read(tmp_path, "alone")["result"] == {"points": [0, 1, 2]}
+    assert whole.read(tmp_path, "alone")["result"] == {"points": [0, 1, 2]}
 
 
 def test_numbers_come_back_as_they_were(finished):
-    data = everything.read(finished, "chain-3")
+    data = whole.read(finished, "chain-3")
     found = Comparison.from_dict(data["comparison"])
     assert list(dict.fromkeys(m.method for m in found.measurements)) == METHODS
     assert found.timing["repeats"] == timing_rounds.FULL_ROUNDS.least and found.timing["margin"] is not None
@@ -108,8 +110,8 @@ def test_numbers_come_back_as_they_were(finished):
 
 
 def test_what_cannot_be_run_is_said(finished):
-    assert everything.read(finished, "gone")["not run"] == "this version of kcons has no scene 'no such scene'"
-    assert "kcons.no_such_module" in everything.read(finished, "later")["not run"]
+    assert whole.read(finished, "gone")["not run"] == "this version of kcons has no scene 'no such scene'"
+    assert "kcons.no_such_module" in whole.read(finished, "later")["not run"]
 
 
 class Page(HTMLParser):
@@ -135,28 +137,28 @@ def test_page_is_one_file_with_everything(finished):
     assert page.tags.count("img") == 2
     for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A scene of the future", "not run: this version"):
         assert text in page.text
-    environment = everything.read(finished, "sphere")["environment"]
+    environment = whole.read(finished, "sphere")["environment"]
     assert environment["cpu"] in page.text
     assert (environment["commit"] or "not from a repository") in page.text
     assert f"numpy {environment['versions']['numpy']}" in page.text
 
 
 def test_winners_name_host_and_gain(finished):
-    table = comparison_page.winners(everything.parts(finished))
+    table = whole_page.winners(whole.parts(finished))
     cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
     (sphere,) = [row for row in cells if row["scene"] == "Spheres"]
     assert sphere["decided by"] == "force evaluations" and sphere["over"] == "SciPy DOP853 on eq. 105"
     # Where times decide, how well they repeat is said.
     margins = {
         part.heading: part.data["comparison"]["timing"]["margin"]
-        for part in everything.parts(finished)
+        for part in whole.parts(finished)
         if part.key in ("chain-3", "sphere")
     }
     for row in cells:
         by_time = row["decided by"] == "wall time"
         assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
     assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
-    text = comparison_page.markdown(table, (0, 1, 4))
+    text = whole_page.markdown(table, (0, 1, 4))
     assert text.splitlines()[0] == "| scene | host | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
@@ -164,7 +166,7 @@ def test_winners_name_host_and_gain(finished):
 
 def test_close_calls_are_named(finished):
     """Lines that only the margin saves are listed, and what beats kcons in both is counted."""
-    (chain,) = [part for part in everything.parts(finished) if part.key == "chain-3"]
+    (chain,) = [part for part in whole.parts(finished) if part.key == "chain-3"]
 
     def told(error, factor, margin):
         data = copy.deepcopy(chain.data)
@@ -174,7 +176,7 @@ def test_close_calls_are_named(finished):
         peer |= {"error": error * best["error"], "seconds_per_time": factor * best["seconds_per_time"]}
         data["comparison"]["measurements"] = [best, peer]
         data["comparison"]["timing"] = {"force_seconds": 1e-3, "margin": margin}
-        return comparison_page.results([dataclasses.replace(chain, data=data)])
+        return whole_page.results([dataclasses.replace(chain, data=data)])
 
     text = told(1.0, 0.8, 0.3)
     assert "In 1 of 1 lines of this table no other method is both cheaper and more accurate" in text
@@ -192,12 +194,12 @@ def test_close_calls_are_named(finished):
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        everything.run(TINY, tmp_path, watcher=Listener("Spheres"))
+        whole.run(TINY, tmp_path, watcher=Listener("Spheres"))
     assert (tmp_path / "index.html").exists()
     assert not (tmp_path / "sphere.json").exists()
     first = (tmp_path / "chain-3.json").read_bytes()
     listener = Listener()
-    everything.run(TINY, tmp_path, watcher=listener)
+    whole.run(TINY, tmp_path, watcher=listener)
     assert listener.parts[0] == "chain-3: measured already"
     assert not any("Chain" in part for part in listener.parts)
     assert any("Spheres" in part for part in listener.parts)
@@ -207,32 +209,32 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
 
 def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
     item = TINY[0]
-    key = everything.read(finished, item.key)["key"]
-    assert key == everything.key_of(item, False)
-    assert key != everything.key_of(item, True)
-    assert key != everything.key_of(Item("chain-3", "Chain of 3 bonds", "chain", 4, budget=5), False)
-    monkeypatch.setattr(everything, "code_digest", lambda: "another")
-    assert key != everything.key_of(item, False)
+    key = whole.read(finished, item.key)["key"]
+    assert key == whole.key_of(item, False)
+    assert key != whole.key_of(item, True)
+    assert key != whole.key_of(Item("chain-3", "Chain of 3 bonds", "chain", 4, budget=5), False)
+    monkeypatch.setattr(whole, "code_digest", lambda: "another")
+    assert key != whole.key_of(item, False)
 
 
 def test_fresh_measures_again_and_half_a_file_is_no_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(everything, "methods_of", lambda item, scene, quick: (["rattle"], {}))
+    monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (["rattle"], {}))
     (tmp_path / "sphere.json").write_text('{"format": "kcons-rep')
-    assert everything.read(tmp_path, "sphere") is None
+    assert whole.read(tmp_path, "sphere") is None
     sphere = TINY[2:3]
-    everything.run(sphere, tmp_path)
+    whole.run(sphere, tmp_path)
     again, once = Listener(), Listener()
-    everything.run(sphere, tmp_path, watcher=once)
-    everything.run(sphere, tmp_path, fresh=True, watcher=again)
+    whole.run(sphere, tmp_path, watcher=once)
+    whole.run(sphere, tmp_path, fresh=True, watcher=again)
     assert once.parts == ["sphere: measured already"]
     assert again.parts == ["1 of 1: Spheres"]
 
 
 def test_quick_leaves_large_parts_out_and_keeps_to_its_time(tmp_path):
     listener = Listener()
-    everything.run(TINY, tmp_path, quick=True, limit=1e-9, watcher=listener)
-    assert everything.read(tmp_path, "sphere")["not run"] == "in the full run only"
-    assert everything.read(tmp_path, "chain-3")["not run"] == "the time of a quick run was over"
+    whole.run(TINY, tmp_path, quick=True, limit=1e-9, watcher=listener)
+    assert whole.read(tmp_path, "sphere")["not run"] == "in the full run only"
+    assert whole.read(tmp_path, "chain-3")["not run"] == "the time of a quick run was over"
     assert all(done <= total for done, total in listener.times)
 
 
@@ -240,9 +242,9 @@ def test_a_scene_that_cannot_be_built_is_a_failure_and_is_tried_again(tmp_path):
     bad = (Item("chain-0", "No chain", "chain", 0),)
     for _ in range(2):
         listener = Listener()
-        everything.run(bad, tmp_path, watcher=listener)
+        whole.run(bad, tmp_path, watcher=listener)
         assert listener.parts == ["1 of 1: No chain"]
-    assert "at least one bond" in everything.read(tmp_path, "chain-0")["failed"]
+    assert "at least one bond" in whole.read(tmp_path, "chain-0")["failed"]
 
 
 def test_redraw_makes_the_same_page_from_the_numbers(finished, tmp_path, capsys):
@@ -283,25 +285,25 @@ def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
 
 
 def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(comparison_page, "PICTURES", ("sphere",))
+    monkeypatch.setattr(whole_page, "PICTURES", ("sphere",))
     page = tmp_path / "page.md"
-    page.write_text(f"head\n{comparison_page.BEGIN}\nold\n{comparison_page.END}\ntail\n")
-    parts = everything.parts(finished)
-    assert comparison_page.fill(page, parts) == [page, tmp_path / "figures" / "report-sphere.png"]
+    page.write_text(f"head\n{whole_page.BEGIN}\nold\n{whole_page.END}\ntail\n")
+    parts_of_the_whole = whole.parts(finished)
+    assert whole_page.fill(page, parts_of_the_whole) == [page, tmp_path / "figures" / "report-sphere.png"]
     first = page.read_text(encoding="utf-8")
     assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
     assert "| scene | host | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
     assert "full run" in first
-    comparison_page.fill(page, parts)
+    whole_page.fill(page, parts_of_the_whole)
     assert page.read_text(encoding="utf-8") == first
     page.write_text("no marks")
     with pytest.raises(InputError, match="no place for results"):
-        comparison_page.fill(page, parts)
+        whole_page.fill(page, parts_of_the_whole)
 
 
 def test_there_is_nothing_to_redraw(tmp_path):
     with pytest.raises(InputError, match="no results"):
-        everything.redraw(tmp_path)
+        whole.redraw(tmp_path)
 
 
 # -- the real plan ----------------------------------------------------------------------------------
@@ -309,8 +311,8 @@ def test_there_is_nothing_to_redraw(tmp_path):
 
 def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     monkeypatch.undo()
-    plan = {item.key: item for item in parts.PLAN}
-    assert len(plan) == len(parts.PLAN)
+    plan = {item.key: item for item in parts_of_the_whole.PLAN}
+    assert len(plan) == len(parts_of_the_whole.PLAN)
     for item in plan.values():
         assert item.module or item.scene in scenes.SCENES
     assert {"sphere", "sphere-pendulum", "sphere-pendulum-top", "pendulum", "triple-pendulum", "rotor"} <= set(plan)
@@ -320,20 +322,20 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
         for constrain in ("hbonds", "allbonds", "hangles"):
             assert plan[f"{structure}-{constrain}"].options == {"constrain": constrain}
     assert sum(item.seconds for item in plan.values()) <= 6300  # "an hour and three quarters" (docs/report.md)
-    assert sum(item.quick_seconds for item in plan.values()) <= everything.QUICK_SECONDS
-    assert [item.key for item in parts.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
+    assert sum(item.quick_seconds for item in plan.values()) <= whole.QUICK_SECONDS
+    assert [item.key for item in parts_of_the_whole.chosen(["water"])] == ["water-216", "water-900", "water-5000"]
 
 
 def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
     monkeypatch.undo()
     scene = scenes.build("chain", 3)
-    names, left_out = everything.methods_of(Item("x", "x", "chain"), scene, False)
+    names, left_out = whole.methods_of(Item("x", "x", "chain"), scene, False)
     for name in ("rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853", "verlet"):
         assert name in names
     assert "openmm-middle-bath" not in names
     assert not left_out
     assert set(STEPPERS) | {"extrapolation"} <= set(names)
-    quick, _ = everything.methods_of(Item("x", "x", "chain"), scene, True)
+    quick, _ = whole.methods_of(Item("x", "x", "chain"), scene, True)
     assert {name for name in quick if name in STEPPERS} == set(USUAL_STEPPERS)
-    kept, out = everything.methods_of(Item("x", "x", "chain", without={"ase-i": "slow", "dop": "why"}), scene, False)
+    kept, out = whole.methods_of(Item("x", "x", "chain", without={"ase-i": "slow", "dop": "why"}), scene, False)
     assert out == {"ase-internals": "slow", "dop853": "why", "dop853-projected": "why"} and not set(out) & set(kept)

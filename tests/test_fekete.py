@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from kcons import compare, methods, scenes
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.scenes.fekete import OPTIMA
+from kcons.comparison.work_precision import measure
 from kcons.errors import InputError
-from kcons.scenes.fekete import OPTIMA
 
 #: Thomson's problem, as everyone has it.
 PUBLISHED = {4: 3.674234614, 6: 9.985281374, 12: 49.165253058, 20: 150.881568334}
@@ -21,7 +23,7 @@ def test_optima_are_the_published_ones():
 @pytest.mark.parametrize("size", OPTIMA)
 def test_every_size_finds_its_optimum(size):
     scene = scenes.build("fekete", size)
-    found = compare.compare(scene.with_time_steps([0.16]), methods=["rattle"])
+    found = measure.compare(scene.with_time_steps([0.16]), methods=["rattle"])
     (m,) = found.of("rattle")
     assert m.error < 1e-8
     assert found.reference["how"].startswith("the least energy known")

@@ -9,10 +9,10 @@ import pytest
 from ase import Atoms, units
 from ase.calculators.tip3p import angleHOH, rOH
 
-from kcons import scenes
+from kcons.comparison import scenes
+from kcons.comparison.scenes import fluid
+from kcons.comparison.scenes.lennard_jones import LennardJones
 from kcons.errors import InputError
-from kcons.scenes import fluid
-from kcons.scenes.lennard_jones import LennardJones
 from kcons.steppers import State, run
 from kcons.thermostats import thermal_velocities
 

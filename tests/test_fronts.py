@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from kcons import fronts
-from kcons.results import Comparison, Measurement
+from kcons.comparison.work_precision import fronts
+from kcons.comparison.work_precision.measurement import Comparison, Measurement
 
 UNITS = {"length": "Å", "energy": "eV", "time": "fs", "long_time": "ps"}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from kcons import page
+from kcons.comparison.study import html_page
 
 VOID = {"meta", "link", "img", "br"}
 
@@ -36,10 +36,13 @@ class Reader(HTMLParser):
 def read(tmp_path: Path) -> Reader:
     figure = Figure()
     figure.subplots().plot([1, 2], [3, 4])
-    table = page.PageTable(["method", "error"], [["a < b & c", "1e-6"], ["plain", "2"]], marks=["good", ""])
-    sections = [page.Section("First", ["<script>text</script>"], [figure], [table]), page.Section("Last", literal="x")]
+    table = html_page.PageTable(["method", "error"], [["a < b & c", "1e-6"], ["plain", "2"]], marks=["good", ""])
+    sections = [
+        html_page.Section("First", ["<script>text</script>"], [figure], [table]),
+        html_page.Section("Last", literal="x"),
+    ]
     reader = Reader()
-    reader.feed(page.write(tmp_path / "p.html", "A title", sections, introduction=["Hello."]).read_text())
+    reader.feed(html_page.write(tmp_path / "p.html", "A title", sections, introduction=["Hello."]).read_text())
     return reader
 
 
@@ -58,6 +61,6 @@ def test_text_is_shown_as_it_is(read):
 
 
 def test_a_row_of_the_wrong_length_of_marks_is_an_error(tmp_path):
-    table = page.PageTable(["a"], [["1"], ["2"]], marks=["good"])
+    table = html_page.PageTable(["a"], [["1"], ["2"]], marks=["good"])
     with pytest.raises(ValueError):
-        page.write(tmp_path / "p.html", "t", [page.Section("s", tables=[table])])
+        html_page.write(tmp_path / "p.html", "t", [html_page.Section("s", tables=[table])])

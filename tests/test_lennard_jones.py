@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kcons.comparison.scenes.lennard_jones import LennardJones
 from kcons.errors import InputError
-from kcons.scenes.lennard_jones import LennardJones
 
 
 def triatomics() -> tuple[LennardJones, np.ndarray]:

@@ -10,28 +10,28 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from kcons import measuring
+from kcons.comparison.study import scripts
 
 
 def test_calls_are_made_in_turn_and_timed_alone() -> None:
     made: list[str] = []
     ticks = count()
     calls = {name: lambda name=name: made.append(name) for name in "ab"}
-    seconds = measuring.in_turn(calls, 3, clock=lambda: float(next(ticks)))
+    seconds = scripts.in_turn(calls, 3, clock=lambda: float(next(ticks)))
     assert "".join(made) == "ababab"
     assert seconds == {"a": [1.0] * 3, "b": [1.0] * 3}
 
 
 def test_speeds_are_medians_over_the_turns() -> None:
     seconds = {"first": [1.0, 2.0, 9.0], "second": [2.0, 1.0, 3.0]}
-    assert measuring.ratio(*seconds.values()) == 2.0
-    found = measuring.speeds(seconds, 4)
+    assert scripts.ratio(*seconds.values()) == 2.0
+    found = scripts.speeds(seconds, 4)
     assert found["first"] == {"ms": 500.0, "ratio": 1.0}
     assert found["second"] == {"ms": 500.0, "ratio": 2.0}
 
 
 def test_table_sets_numbers_to_the_right() -> None:
-    made = measuring.table("Title", ("name", "ms"), {"name"}, [("a", "1")])
+    made = scripts.table("Title", ("name", "ms"), {"name"}, [("a", "1")])
     assert [column.justify for column in made.columns] == ["left", "right"]
     console = Console(width=40, file=StringIO())
     console.print(made)
@@ -40,15 +40,15 @@ def test_table_sets_numbers_to_the_right() -> None:
 
 def test_script_measures_writes_and_shows(tmp_path: Path) -> None:
     shown: list[dict] = []
-    parser = measuring.options("About", full="everything")
+    parser = scripts.options("About", full="everything")
     out = tmp_path / "result.json"
-    measuring.script(parser, lambda chosen: {"full": chosen.full}, shown.append, ["--full", "--out", str(out)])
+    scripts.script(parser, lambda chosen: {"full": chosen.full}, shown.append, ["--full", "--out", str(out)])
     assert shown == [{"full": True}] == [json.loads(out.read_text())]
 
     def never(chosen: object) -> dict:
         raise AssertionError("an earlier result is shown, not measured again")
 
-    measuring.script(parser, never, shown.append, ["--show", str(out)])
+    scripts.script(parser, never, shown.append, ["--show", str(out)])
     assert shown == [{"full": True}] * 2
 
 
@@ -63,7 +63,7 @@ def test_measurements_are_continued(tmp_path: Path, there: bool) -> None:
         keep({"parts": [1, 2]})
         return {"parts": [1, 2, 3]}
 
-    assert measuring.continued(out, measure, quick=True) == {"parts": [1, 2, 3]}
+    assert scripts.continued(out, measure, quick=True) == {"parts": [1, 2, 3]}
     kept = json.loads(out.read_text())
     assert kept["parts"] == [1, 2] and "cpu" in kept["environment"]
-    assert measuring.continued(None, lambda **given: {"none": given["earlier"]}, quick=True) == {"none": None}
+    assert scripts.continued(None, lambda **given: {"none": given["earlier"]}, quick=True) == {"none": None}

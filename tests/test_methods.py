@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons import compare, methods, report, scenes, steppers
+from kcons import steppers
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.methods.method import Method
+from kcons.comparison.work_precision import measure, report
 from kcons.errors import InputError, UnsupportedError
-from kcons.runs import Method
 from kcons.steppers import Rattle, State
 
 
@@ -92,7 +95,7 @@ def test_every_stepper_is_a_method():
 def test_every_stepper_runs_dependent_rows_and_finds_the_trajectory(name):
     # 21 rows of rank 19.
     scene = scenes.build("ethanol", forces="emt").shortened(4)
-    found = compare.compare(scene.with_time_steps([0.5, 0.25]), methods=[name])
+    found = measure.compare(scene.with_time_steps([0.5, 0.25]), methods=[name])
     assert [m.status for m in found.measurements] == ["ok", "ok"]
     assert found.measurements[-1].error < 1e-4
 
@@ -133,7 +136,7 @@ def registered(monkeypatch, *kinds):
 
 def test_registered_stepper_is_compared(monkeypatch, pendulum, tmp_path):
     registered(monkeypatch, Triple)
-    result = compare.compare(pendulum.with_time_steps([0.0125, 0.00625]), methods=["rattle", "triple"])
+    result = measure.compare(pendulum.with_time_steps([0.0125, 0.00625]), methods=["rattle", "triple"])
     assert result.observed_order("rattle") == pytest.approx(2.0, abs=0.1)
     assert result.observed_order("triple") == pytest.approx(4.0, abs=0.15)
     for plain, high in zip(result.of("rattle"), result.of("triple"), strict=True):
@@ -145,7 +148,7 @@ def test_registered_stepper_is_compared(monkeypatch, pendulum, tmp_path):
 
 def test_onlookers_do_not_save_a_stepper_its_evaluations(monkeypatch, pendulum):
     registered(monkeypatch, Euler)
-    result = compare.compare(pendulum, methods=["euler"])
+    result = measure.compare(pendulum, methods=["euler"])
     for m in result.of("euler"):
         # The forces at the start are in place; between steps the energy is written down, which must not help.
         assert m.evaluations_per_time * result.scene["horizon"] == pytest.approx(m.steps - 1)
@@ -165,7 +168,7 @@ def test_energies_are_read_without_being_counted(pendulum):
 
 def test_what_a_stepper_does_not_support_is_not_run(monkeypatch, pendulum):
     registered(monkeypatch, Unable)
-    (only,) = compare.compare(pendulum, methods=["unable"]).measurements
+    (only,) = measure.compare(pendulum, methods=["unable"]).measurements
     assert only.status == "not run"
     assert only.note == "no such constraints here; use Rattle"
 
@@ -195,7 +198,7 @@ def test_hosts_fix_the_atoms_of_the_slab():
 def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name):
     # Along a constraint that moves, too.
     scene = scenes.build(name)
-    found = compare.compare(scene, methods=["dop853", "dop853-projected"])
+    found = measure.compare(scene, methods=["dop853", "dop853-projected"])
     for free, held in zip(found.of("dop853"), found.of("dop853-projected"), strict=True):
         assert held.evaluations_per_time == pytest.approx(free.evaluations_per_time, rel=0.05)
         assert held.error < free.error

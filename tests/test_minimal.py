@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from kcons.comparison.scenes.minimal import integrated, single, spin, turned
 from kcons.errors import InputError
-from kcons.scenes.minimal import integrated, single, spin, turned
 
 
 def test_quaternions_turn_vectors():

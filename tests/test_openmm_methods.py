@@ -9,8 +9,11 @@ import openmm
 import pytest
 from openmm import unit
 
-from kcons import compare, methods, openmm_methods, report, scenes
-from kcons.scenes.openmm_host import OpenMMHost, system_of
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.methods import openmm as openmm_methods
+from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
+from kcons.comparison.work_precision import measure, report
 
 HOSTED = {
     "chain": 4,
@@ -40,7 +43,7 @@ def rotor():
 
 
 def errors(scene, *names, **options):
-    found = compare.compare(scene, methods=names, **options)
+    found = measure.compare(scene, methods=names, **options)
     assert {m.status for m in found.measurements} <= {"ok", "thermostat"}, [m.note for m in found.measurements]
     return found, [[m.error for m in found.of(name)] for name in names]
 
@@ -251,7 +254,7 @@ def test_constraints_are_timed_where_kcons_solves_them(rotor):
 def test_set_up_beyond_the_budget_is_refused_from_then_on(rotor):
     rotor.openmm._waited = 50.0
     try:
-        found = compare.compare(rotor, methods=["openmm-verlet", "openmm-held-rattle"], budget=20)
+        found = measure.compare(rotor, methods=["openmm-verlet", "openmm-held-rattle"], budget=20)
     finally:
         rotor.openmm._waited = 0.0
     refused, *others = found.measurements
@@ -263,7 +266,7 @@ def test_set_up_beyond_the_budget_is_refused_from_then_on(rotor):
 def test_failure_is_told(rotor):
     scene = build("alanine")
     scene = replace(scene, time_steps=(scene.horizon / 4,))
-    found = compare.compare(scene, methods=["openmm-kcons-rattle"])
+    found = measure.compare(scene, methods=["openmm-kcons-rattle"])
     (m,) = found.measurements
     assert m.status == "failed"
     assert "Error" in m.note
@@ -302,5 +305,5 @@ def test_refusals(monkeypatch, rotor):
     monkeypatch.setattr(openmm_methods, "find_spec", lambda name: None)
     assert "not installed" in methods.METHODS["openmm-verlet"].refuses(rotor)
     assert not [m for m in methods.chosen(None, rotor) if m.host == "openmm"]
-    (only,) = compare.compare(rotor, methods=["openmm-verlet"]).measurements
+    (only,) = measure.compare(rotor, methods=["openmm-verlet"]).measurements
     assert only.status == "not run"

@@ -4,8 +4,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from kcons import report
-from kcons.results import Comparison
+from kcons.comparison.work_precision import report
+from kcons.comparison.work_precision.measurement import Comparison
 from kcons.terminal import rendered
 
 ROOT = Path(__file__).parents[1]

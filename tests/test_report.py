@@ -8,8 +8,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from kcons import compare, report
-from kcons.compare import Comparison, Measurement
+from kcons.comparison.work_precision import measure, report
+from kcons.comparison.work_precision.measure import Comparison, Measurement
 
 UNITS = {"length": "Å", "energy": "eV", "time": "fs", "long_time": "ps"}
 
@@ -182,7 +182,7 @@ def test_plot_has_both_panels_with_units(tmp_path, monkeypatch):
 
 
 def test_methods_differ_in_colour_and_marker(monkeypatch):
-    from kcons import methods
+    from kcons.comparison.methods import methods
 
     assert set(report.STYLES) <= set(methods.METHODS)
     many = dict.fromkeys([*methods.METHODS, *(f"stepper-{k}" for k in range(len(report.SPARE)))])
@@ -206,4 +206,4 @@ def test_plot_without_any_error(tmp_path):
 
 
 def test_environment_is_json(tmp_path):
-    json.dumps(compare.environment())
+    json.dumps(measure.environment())

@@ -7,22 +7,22 @@ import re
 import pytest
 from committed_pages import FOLDER, ROOT, page
 
-from kcons import comparison_page, everything
-from kcons.parts import PLAN
-from kcons.results import Comparison
+from kcons.comparison.work_precision import whole, whole_page
+from kcons.comparison.work_precision.measurement import Comparison
+from kcons.comparison.work_precision.parts_of_the_whole import PLAN
 
-PARTS = everything.parts(FOLDER / "report")
+PARTS = whole.parts(FOLDER / "report")
 PAGE = page("report.md")
 
 
 def test_page_shows_the_committed_results():
-    assert comparison_page.results(PARTS) in PAGE
+    assert whole_page.results(PARTS) in PAGE
 
 
 def test_page_shows_the_pictures_of_these_parts():
     shown = re.findall(r"^!\[(.*)\]\(figures/report-(.*)\.png\)$", PAGE, re.MULTILINE)
-    assert sorted(shown) == sorted((part.heading, part.key) for part in PARTS if part.key in comparison_page.PICTURES)
-    assert {key for _, key in shown} == set(comparison_page.PICTURES)
+    assert sorted(shown) == sorted((part.heading, part.key) for part in PARTS if part.key in whole_page.PICTURES)
+    assert {key for _, key in shown} == set(whole_page.PICTURES)
     for _, key in shown:
         assert (ROOT / "docs" / "figures" / f"report-{key}.png").read_bytes().startswith(b"\x89PNG")
 

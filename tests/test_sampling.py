@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from kcons import sampling, scenes
+from kcons.comparison import scenes
+from kcons.comparison.averages import sampling
 from kcons.errors import InputError
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic, configurational_temperature, mean, thermal_velocities

@@ -8,8 +8,8 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from kcons import sampling_report
-from kcons.sampling import Moment, Sampled, SamplingComparison
+from kcons.comparison.averages import report
+from kcons.comparison.averages.sampling import Moment, Sampled, SamplingComparison
 
 
 def measured(**changes):
@@ -62,7 +62,7 @@ ROWS = (
 
 def shown(result):
     page = StringIO()
-    Console(file=page, width=150, color_system=None).print(sampling_report.table(result))
+    Console(file=page, width=150, color_system=None).print(report.table(result))
     return page.getvalue()
 
 
@@ -84,17 +84,17 @@ def test_table():
 
 
 def test_distance_in_standard_errors():
-    assert sampling_report.off(measured()) == pytest.approx(0.0123 / 0.0061)
-    assert sampling_report.off(measured(energy_error=0.123)) == pytest.approx(10)
+    assert report.off(measured()) == pytest.approx(0.0123 / 0.0061)
+    assert report.off(measured(energy_error=0.123)) == pytest.approx(10)
 
 
 @pytest.mark.parametrize(("error", "digits"), [(23.0, 0), (9.96, 0), (9.6, 1), (0.996, 1), (0.95, 2), (0.0123, 3)])
 def test_two_digits_of_the_error(error, digits):
-    assert sampling_report._digits(error) == digits
+    assert report._digits(error) == digits
 
 
 def test_explanation():
-    text = sampling_report.explanation(comparison(*ROWS))
+    text = report.explanation(comparison(*ROWS))
     assert text.startswith("[1] step 3: oh\n[2] 9 samples are too few\n")
     assert "Metropolis sampling, -2.527 ± 0.005 ε" in text
     assert "2K = 3N kT is off by +33.3%" in text and "g = 37" in text
@@ -102,7 +102,7 @@ def test_explanation():
 
 def test_files(tmp_path):
     result = comparison(*ROWS)
-    paths = sampling_report.write(result, tmp_path / "new", tables=["a", "b"])
+    paths = report.write(result, tmp_path / "new", tables=["a", "b"])
     assert [path.name for path in paths] == ["compare.json", "compare.png", "compare.txt"]
     assert json.loads(paths[0].read_text(encoding="utf-8")) == json.loads(json.dumps(result.to_dict()))
     assert paths[1].read_bytes().startswith(b"\x89PNG")
@@ -110,12 +110,12 @@ def test_files(tmp_path):
 
 
 def test_plot_without_anything_to_show(tmp_path):
-    sampling_report.plot(comparison(ROWS[2]), tmp_path / "a.png")
+    report.plot(comparison(ROWS[2]), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_every_thermostat_has_a_style():
-    from kcons.sampling import METHODS
+    from kcons.comparison.averages.sampling import METHODS
 
-    assert set(sampling_report.STYLES) == set(METHODS)
-    assert len(set(sampling_report.STYLES.values())) == len(METHODS)
+    assert set(report.STYLES) == set(METHODS)
+    assert len(set(report.STYLES.values())) == len(METHODS)

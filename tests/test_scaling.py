@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from kcons import scaling
+from kcons.comparison.solvers_alone import scaling
 
 
 def points(solver, field, power, kind="chain", sizes=(100, 1000, 10_000, 100_000)):

@@ -13,14 +13,15 @@ from ase import units
 from scipy.integrate import solve_ivp
 from test_reference_orders import EPS, sensitivities
 
-from kcons import projection, scenes
+from kcons import projection
+from kcons.comparison import scenes
+from kcons.comparison.scenes import chain, dumbbells, molecule, water
+from kcons.comparison.scenes.minimal import COARSER, FINEST
+from kcons.comparison.scenes.potential import Potential
+from kcons.comparison.scenes.scene import converged, thermal_velocities
+from kcons.comparison.scenes.sphere import swing
 from kcons.errors import InputError
 from kcons.motion import Motion
-from kcons.scenes import chain, dumbbells, molecule, water
-from kcons.scenes.minimal import COARSER, FINEST
-from kcons.scenes.potential import Potential
-from kcons.scenes.scene import converged, thermal_velocities
-from kcons.scenes.sphere import swing
 from kcons.steppers import State, System, run
 from tests.reference import cases
 
@@ -318,7 +319,7 @@ def test_cut_water_has_no_overlaps():
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 def test_openmm_forces_of_water_agree_with_ewald_in_double_precision():
-    from kcons.scenes import openmm_potential
+    from kcons.comparison.scenes import openmm_potential
 
     scene = scenes.build("water", 27, forces="openmm")
     import openmm

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from kcons import bare_solvers, solver_precision
-from kcons.bare_solvers import Candidate, Timing
+from kcons.comparison.solvers_alone import bare_solvers, solver_precision
+from kcons.comparison.solvers_alone.bare_solvers import Candidate, Timing
 from kcons.errors import UnsupportedError
 
 

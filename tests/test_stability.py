@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from kcons import cli
+from kcons.comparison.stability import SCENES, attempt, drift, fuzz, largest_step, pages, put_into, reversal, run, trial
+from kcons.comparison.stability.runs import Copies
 from kcons.errors import InputError
-from kcons.stability import SCENES, attempt, drift, fuzz, largest_step, pages, put_into, reversal, run, trial
-from kcons.stability.runs import Copies
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results" / "stability.json"

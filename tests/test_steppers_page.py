@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from kcons import compare, methods, scenes, steppers
+from kcons import steppers
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.work_precision import measure
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "steppers.md").read_text(encoding="utf-8")
@@ -88,7 +91,7 @@ def test_ten_times_fewer_evaluations_here_and_now(name):
     curve = example.curve(scene, scene.reference(), "blanes-moan6", full=False)
     best = next(p for p in curve if p["error"] < example.GOAL)
     steps = 10 * int(best["evaluations"])
-    plain = compare.compare(scene.with_time_steps([scene.horizon / steps]), methods=["rattle"], budget=120)
+    plain = measure.compare(scene.with_time_steps([scene.horizon / steps]), methods=["rattle"], budget=120)
     (measured,) = plain.of("rattle")
     assert measured.evaluations_per_time * scene.horizon == pytest.approx(steps, rel=1e-3)
     assert measured.error > example.GOAL

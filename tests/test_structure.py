@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from openmm import app, unit
 
-from kcons import compare, scenes
+from kcons.comparison import scenes
+from kcons.comparison.scenes import structure
+from kcons.comparison.work_precision import measure
 from kcons.errors import InputError, UnsupportedError
-from kcons.scenes import structure
 
 ALANINE = Path(__file__).parent / "data" / "alanine-dipeptide-implicit.pdb"
 
@@ -140,7 +141,7 @@ def test_box_decides_about_the_forces(tmp_path, alanine):
     assert scene.constraint_set.n_rows == 3
     np.testing.assert_allclose(scene.cell, 20 * np.eye(3), atol=1e-9)
     # Lengths are those that SETTLE holds, in single precision.
-    found = compare.compare(scene.with_time_steps([1.0]), methods=["openmm-verlet", "openmm-kcons-rattle"])
+    found = measure.compare(scene.with_time_steps([1.0]), methods=["openmm-verlet", "openmm-kcons-rattle"])
     assert all(m.status == "ok" and m.constraint_residual < 1e-12 for m in found.measurements)
     placeholder = "CRYST1    1.000    1.000    1.000  90.00  90.00  90.00 P 1           1\n"
     scene = scenes.from_file(changed(tmp_path / "nmr.pdb", head=placeholder))

@@ -8,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons import cli, compare, methods, recommendation, scenes, snippets
-from kcons.compare import Watcher
+from kcons import cli
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods, snippets
+from kcons.comparison.work_precision import measure, recommendation
+from kcons.comparison.work_precision.measure import Watcher
+from kcons.comparison.work_precision.measurement import Measurement
+from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError
-from kcons.results import Measurement
-from kcons.timing_rounds import Rounds
 
 CHAIN = 'scenes.build("chain", 4)'
 
@@ -76,7 +79,7 @@ def reference(chain):
 @pytest.fixture(scope="module")
 def found(chain, reference):
     names = ["rattle", "blanes-moan4", "ase-kcons", "ase-bonds"]
-    plain = compare.compare(chain, methods=names, reference=reference, budget=20)
+    plain = measure.compare(chain, methods=names, reference=reference, budget=20)
     return recommendation.recommend(chain, plain, 3e-7, reference=reference, made_by=CHAIN, budget=20)
 
 
@@ -129,7 +132,7 @@ def test_an_error_below_that_of_the_reference_is_refused_with_the_reason(chain, 
 
 
 def test_what_no_method_reaches_is_said_with_the_best(chain, reference):
-    plain = compare.compare(chain, methods=["rattle"], reference=reference, budget=20)
+    plain = measure.compare(chain, methods=["rattle"], reference=reference, budget=20)
     entry = recommendation.recommend(chain, plain, 1e-11, reference=reference, made_by=CHAIN).recommendation
     assert not entry["reached"]
     assert entry["best"]["error"] == min(m.error for m in plain.of("rattle"))
@@ -156,7 +159,7 @@ def test_reach_stops_where_shorter_steps_do_not_help(chain, reference, monkeypat
 
 def test_sharpening_tries_longer_steps_where_another_method_seems_ahead(chain, reference):
     fine = chain.with_time_steps([1.25, 0.625])
-    plain = compare.compare(fine, methods=["blanes-moan4"], reference=reference, budget=20)
+    plain = measure.compare(fine, methods=["blanes-moan4"], reference=reference, budget=20)
     fake = point(1e-5, 0.1, method="dop853", title="SciPy DOP853", evaluations_per_time=120.0, seconds_per_time=1e-3)
     there = replace(plain, measurements=[*plain.measurements, fake])
     sharper = recommendation.sharpen(fine, there, reference=reference, budget=20)
@@ -165,9 +168,11 @@ def test_sharpening_tries_longer_steps_where_another_method_seems_ahead(chain, r
 
 
 def test_points_are_timed_as_the_comparison_was(chain, reference, monkeypatch):
-    monkeypatch.setattr("kcons.timing_rounds.marched", lambda run, m, holds, pass_seconds: 7.0)
+    monkeypatch.setattr(
+        "kcons.comparison.work_precision.timing_rounds.marched", lambda run, m, holds, pass_seconds: 7.0
+    )
     rounds = Rounds(least=1, most=1)
-    plain = compare.compare(chain, methods=["rattle", "ase-bonds"], reference=reference, rounds=rounds)
+    plain = measure.compare(chain, methods=["rattle", "ase-bonds"], reference=reference, rounds=rounds)
     found = recommendation.recommend(chain, plain, 1e-4, reference=reference, made_by=CHAIN, rounds=rounds)
     new = [m for m in found.measurements if m not in plain.measurements]
     assert new and {m.step_seconds for m in new} == {7.0}
@@ -191,7 +196,7 @@ def test_lines_of_code_run_to_the_end_of_the_trajectory(chain, reference, name):
     else:
         end = space["atoms"].positions
     internal = setting if method.adaptive else setting * chain.units.time_unit
-    wanted = compare.measure(chain, method, internal, reference, 20.0).error
+    wanted = measure.measure(chain, method, internal, reference, 20.0).error
     assert chain.deviation(end, reference.positions) == pytest.approx(wanted, rel=0.05, abs=1e-12)
 
 

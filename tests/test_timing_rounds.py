@@ -8,12 +8,23 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons import compare, methods, scenes
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.methods.method import STRETCH, OverBudgetError, Run, Stopwatch
+from kcons.comparison.methods.peers import lammps_shake, shake
+from kcons.comparison.work_precision import measure
+from kcons.comparison.work_precision.measurement import Measurement
+from kcons.comparison.work_precision.timing_rounds import (
+    FLOOR_BLOCK,
+    FULL_ROUNDS,
+    QUICK_ROUNDS,
+    WARM_STEPS,
+    Rounds,
+    interleaved,
+    marched,
+    margin,
+)
 from kcons.errors import ConvergenceError, KconsError
-from kcons.peers import lammps_shake, shake
-from kcons.results import Measurement
-from kcons.runs import STRETCH, OverBudgetError, Run, Stopwatch
-from kcons.timing_rounds import FLOOR_BLOCK, FULL_ROUNDS, QUICK_ROUNDS, WARM_STEPS, Rounds, interleaved, marched, margin
 
 #: Few and short.
 SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
@@ -107,7 +118,7 @@ def test_openmm_goes_back_to_the_start_and_one_step_on(chain, name):
 
 
 def test_sweeps_that_do_not_converge_are_an_error_without_onlookers(chain, monkeypatch):
-    monkeypatch.setattr("kcons.peers.gauss_seidel.MANY_SWEEPS", 2)
+    monkeypatch.setattr("kcons.comparison.methods.peers.gauss_seidel.MANY_SWEEPS", 2)
     run = shake.Shake("shake", "sweeps", tolerance=1e-12).start(chain, max(chain.time_steps))
     with pytest.raises(ConvergenceError, match="SHAKE did not converge to 1e-12 in 2 sweeps"):
         run.march(3)
@@ -265,7 +276,7 @@ def test_rounds_take_turns():
 
 def test_long_ones_have_the_least_number_of_rounds(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr("kcons.timing_rounds.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("kcons.comparison.work_precision.timing_rounds.perf_counter", lambda: clock[0])
 
     def taking(seconds):
         def task():
@@ -315,8 +326,8 @@ def test_times_are_medians_over_rounds(chain, monkeypatch):
         mine = seen.setdefault((m.method, m.setting), [1.0, 3.0])
         return mine.pop(0)
 
-    monkeypatch.setattr("kcons.timing_rounds.marched", fake)
-    found = compare.compare(chain, methods=["rattle", "ase-kcons", "verlet"], rounds=SHORT)
+    monkeypatch.setattr("kcons.comparison.work_precision.timing_rounds.marched", fake)
+    found = measure.compare(chain, methods=["rattle", "ase-kcons", "verlet"], rounds=SHORT)
     assert len(seen) == 3 * len(chain.time_steps)
     assert {m.step_seconds for m in found.measurements} == {2.0}
     for m in found.of("rattle"):
@@ -337,7 +348,7 @@ def test_whole_runs_are_made_again_where_steps_cannot_be(chain, monkeypatch):
         return run
 
     monkeypatch.setattr(methods.ProjectedOde, "start", noted)
-    found = compare.compare(chain, methods=["dop853"], rounds=SHORT)
+    found = measure.compare(chain, methods=["dop853"], rounds=SHORT)
     settings = len(found.measurements)
     assert settings > 1 and len(runs) == 3 * settings
     assert all(run.finished for run, _ in runs)
@@ -348,19 +359,19 @@ def test_whole_runs_are_made_again_where_steps_cannot_be(chain, monkeypatch):
 
 
 def test_without_rounds_nothing_is_made_again(chain, monkeypatch):
-    monkeypatch.setattr("kcons.timing_rounds.timed", None)
-    found = compare.compare(chain, methods=["rattle"])
+    monkeypatch.setattr("kcons.comparison.work_precision.timing_rounds.timed", None)
+    found = measure.compare(chain, methods=["rattle"])
     assert found.timing["repeats"] == 0 and found.timing["margin"] is None
 
 
 def test_what_fails_in_a_round_is_said(chain, monkeypatch):
-    plain = compare.compare(chain, methods=["rattle"])
+    plain = measure.compare(chain, methods=["rattle"])
 
     def failing(self, steps):
         raise ConvergenceError("not this time")
 
     monkeypatch.setattr(methods._CoreRun, "march", failing)
-    found = compare.compare(chain, methods=["rattle"], rounds=SHORT)
+    found = measure.compare(chain, methods=["rattle"], rounds=SHORT)
     for before, m in zip(plain.measurements, found.measurements, strict=True):
         assert m.status == "ok" and m.error == before.error and m.step_seconds > 0
         assert m.note == "time as observed: round 1: ConvergenceError: not this time"
@@ -374,7 +385,7 @@ def test_a_round_that_does_not_come_back_is_interrupted(chain, monkeypatch):
 
     monkeypatch.setattr(methods._CoreRun, "march", endless)
     scene = replace(chain, time_steps=chain.time_steps[:1])
-    (only,) = compare.compare(scene, methods=["rattle"], rounds=SHORT, budget=0.5).measurements
+    (only,) = measure.compare(scene, methods=["rattle"], rounds=SHORT, budget=0.5).measurements
     assert only.status == "ok"
     assert "round 1: OverBudgetError: not done after 1.5 s" in only.note
 
@@ -397,7 +408,7 @@ def test_openmm_makes_many_steps_at_a_stretch(chain):
 def test_openmm_is_timed_in_rounds():
     scene = scenes.build("chain", 4)
     scene = replace(scene, time_steps=scene.time_steps[:1])
-    found = compare.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
+    found = measure.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
     assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
     assert not any(m.note for m in found.measurements)
     assert found.timing["margin"] is not None

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons import compare
+from kcons.comparison.work_precision import measure
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
@@ -360,7 +360,7 @@ def main() -> None:
         result = json.loads(options.out.read_text(encoding="utf-8"))
         result[options.part] = parts[options.part]()
     else:
-        result = {"machine": compare.environment(), "full": full} | {name: part() for name, part in parts.items()}
+        result = {"machine": measure.environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     show(result)

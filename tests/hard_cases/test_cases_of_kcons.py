@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kcons.hard_cases import OURS, all_cases, run_cell
+from kcons.comparison.hard_cases import OURS, all_cases, run_cell
 
 CASES = all_cases()
 #: Costly judges: the same numbers are tested in test_hard_cases_*.py of the core.

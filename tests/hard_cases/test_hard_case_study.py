@@ -8,9 +8,9 @@ import re
 import pytest
 
 from kcons import cli
+from kcons.comparison.hard_cases import chosen, load, pages, run
+from kcons.comparison.hard_cases.worker import Worker
 from kcons.errors import InputError
-from kcons.hard_cases import chosen, load, pages, run
-from kcons.hard_cases.worker import Worker
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kcons.hard_cases import OURS, load, pages
+from kcons.comparison.hard_cases import OURS, load, pages
 
 ROOT = Path(__file__).parent.parent.parent
 RESULTS = ROOT / "docs" / "results" / "hard_cases.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.hard_cases import Problem, truths
+from kcons.comparison.hard_cases import Problem, truths
 
 MASSES = np.array([16.0, 1.0, 2.0])
 WATER = truths.rotated([[0.0, 0, 0], [0.8, 0.6, 0], [-0.8, 0.6, 0]])

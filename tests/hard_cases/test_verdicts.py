@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kcons.comparison.hard_cases import CannotExpressError, Case, judge, outcome
 from kcons.errors import InputError
-from kcons.hard_cases import CannotExpressError, Case, judge, outcome
 
 
 def case_of(kind):

@@ -12,10 +12,11 @@ import pytest
 from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
 
-from kcons import cli, scenes
+from kcons import cli
+from kcons.comparison import scenes
+from kcons.comparison.scenes import any_file
 from kcons.constraints import LinearRelation
 from kcons.errors import InputError, UnsupportedError
-from kcons.scenes import any_file
 
 
 @pytest.fixture

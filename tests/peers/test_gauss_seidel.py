@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons import scenes
+from kcons.comparison import scenes
+from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
 from kcons.errors import ConvergenceError, InputError
-from kcons.peers.gauss_seidel import GaussSeidel
 
 
 def sweeps(scene, tolerance):

@@ -7,9 +7,11 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons import compare, methods, scenes
-from kcons.peers import PEERS, dae, lammps_shake, mici_leapfrog
-from kcons.peers.smallness import dense_rows
+from kcons.comparison import scenes
+from kcons.comparison.methods import methods
+from kcons.comparison.methods.peers import PEERS, dae, lammps_shake, mici_leapfrog
+from kcons.comparison.methods.peers.smallness import dense_rows
+from kcons.comparison.work_precision import measure
 
 PACKAGES = {"mici": "mici", "mici-tight": "mici", "dae-radau": "scipy_dae", "dae-ida": "sksundae"}
 
@@ -24,7 +26,7 @@ def need(name):
 
 def measured(scene, name):
     need(name)
-    found = compare.compare(scene, methods=[name], budget=60)
+    found = measure.compare(scene, methods=[name], budget=60)
     assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
     return found
 
@@ -48,7 +50,7 @@ def test_order_two(name, scene):
     found = measured(built, name)
     assert found.observed_order(name) == pytest.approx(2.0, abs=0.1)
     # RATTLE, whoever does it: the same trajectory to the last digits that are asked for.
-    ours = compare.compare(built, methods=["rattle"]).of("rattle")
+    ours = measure.compare(built, methods=["rattle"]).of("rattle")
     for mine, theirs in zip(ours, found.of(name), strict=True):
         assert theirs.error == pytest.approx(mine.error, rel=1e-5)
         assert theirs.evaluations_per_time == pytest.approx(mine.evaluations_per_time)
@@ -77,7 +79,7 @@ def test_lammps_holds_rigid_water(name):
     assert len(held.angles) == 8
     assert held.degrees == pytest.approx([104.52])
     last = measured(scene.with_time_steps([1.0]), name).measurements[-1]
-    (ours,) = compare.compare(scene.with_time_steps([1.0]), methods=["rattle"]).of("rattle")
+    (ours,) = measure.compare(scene.with_time_steps([1.0]), methods=["rattle"]).of("rattle")
     assert last.error == pytest.approx(ours.error, rel=1e-5)
     assert last.constraint_residual < 1e-9
     assert (last.velocity_residual < 1e-9) == (name == "lammps-rattle-1e-10")

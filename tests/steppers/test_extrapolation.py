@@ -11,7 +11,8 @@ import pytest
 import test_reference_orders as references
 from reference import cases
 
-from kcons import compare, scenes
+from kcons.comparison import scenes
+from kcons.comparison.work_precision import measure
 from kcons.constraints import Distance, FixedAtoms
 from kcons.steppers import (
     Extrapolation,
@@ -111,7 +112,7 @@ def test_fewer_evaluations_than_dop853(name) -> None:
     """As the page says."""
     tolerances = 10.0 ** -np.arange(6, 11)
     scene = replace(scenes.build(name), tolerances=tuple(tolerances))
-    theirs = compare.compare(scene, methods=["dop853"], budget=60.0).of("dop853")
+    theirs = measure.compare(scene, methods=["dop853"], budget=60.0).of("dop853")
     exact = scene.reference().positions
     system, times = scene_system(scene)
     errors, calls = [], []

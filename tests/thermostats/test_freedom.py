@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kcons.comparison.scenes.lennard_jones import LennardJones
 from kcons.constraints import (
     CenterOfMass,
     Cylinder,
@@ -19,7 +20,6 @@ from kcons.constraints import (
 )
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.scenes.lennard_jones import LennardJones
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
 from kcons.thermostats.freedom import drift_velocity, open_directions

@@ -1,0 +1,456 @@
+"""The methods: steppers of kcons on arrays, ASE's dynamics, SciPy, and by name those of OpenMM."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from ase import Atoms
+from ase.constraints import FixAtoms, FixBondLengths, FixInternals
+from ase.md.verlet import VelocityVerlet
+from scipy.integrate import DOP853
+
+from kcons import steppers
+from kcons.ase import Constraints
+from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
+from kcons.comparison.methods.openmm import OPENMM_METHODS
+from kcons.comparison.methods.peers import PEERS
+from kcons.comparison.scenes import Scene
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError
+from kcons.motion.motion import Motion
+from kcons.steppers import Rattle, State, Stepper, System
+
+#: The steppers of kcons by the names they have as methods, the plain one first, those for comparison last.
+STEPPERS: Mapping[str, type[Stepper]] = {
+    "rattle": steppers.Rattle,
+    "geodesic": steppers.Geodesic,
+    "suzuki4": steppers.Suzuki4,
+    "yoshida4": steppers.Yoshida4,
+    "kahan-li6": steppers.KahanLi6,
+    "blanes-moan4": steppers.BlanesMoan4,
+    "blanes-moan6": steppers.BlanesMoan6,
+    "blanes-moan6a": steppers.BlanesMoan6a,
+    "projected-verlet": steppers.ProjectedVerlet,
+    "projected-rk4": steppers.ProjectedRungeKutta4,
+    "baumgarte": steppers.Baumgarte,
+}
+
+#: The steppers that run unless methods are named: the plain one, and of each order a composition and a splitting.
+USUAL_STEPPERS = ("rattle", "suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
+
+#: Rate of a stepper's feedback, in inverse time steps: fast, and well within what is stable.
+FEEDBACK = 0.1
+
+#: ASE's hooks.
+ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribute_forces_md")
+
+
+# -- kcons ------------------------------------------------------------------------------------------
+
+
+class _StateRun(Run):
+    """A run of `State`s."""
+
+    _state: State
+
+    @property
+    def positions(self) -> FloatArray:
+        return self._state.positions
+
+    @property
+    def velocities(self) -> FloatArray:
+        return self._state.velocities
+
+
+class _CoreRun(_StateRun):
+    def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
+        super().__init__()
+        self.constraints.watch(motion, ENGINE_CALLS)
+        stepper.check(system := System(motion, scene.potential.forces, friction=scene.friction))
+        self._system = system
+        self._stepper = stepper
+        self._start = self._system.with_forces(State(scene.positions, scene.velocities))
+        self._state = self._start
+        self._potential = scene.potential
+        self._dt = dt
+        self._done = 0
+        self._steps = round(scene.horizon / dt)
+
+    def advance(self) -> None:
+        self._state = self._stepper.step(self._system, self._state, self._dt)
+        self._done += 1
+        self.time = self._done * self._dt
+        # Rigid water and few distances take a step in kernels that do not call the engine.
+        self.divided = self.constraints.seconds > 0.0
+
+    def march(self, steps: int) -> None:
+        self._state = steppers.run(self._system, self._state, self._dt, steps, stepper=self._stepper)
+        self._done += steps
+        self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._state = self._start
+        # The end of the last step is no longer the last point known.
+        self._potential.forces(self._start.positions)
+
+    @property
+    def finished(self) -> bool:
+        return self._done >= self._steps
+
+
+@dataclass(frozen=True)
+class CoreStepper(Method):
+    """A stepper of `kcons.steppers`, arrays in and arrays out.
+
+    A stepper with s force evaluations a step takes steps s times as long as RATTLE, so that all cost about the same.
+
+    Attributes
+    ----------
+    make : callable
+        The stepper for a given time step.
+    """
+
+    marches: ClassVar[bool] = True
+
+    make: Callable[[float], Stepper] = lambda dt: Rattle()
+    damps: bool = True
+
+    @property
+    def stepper(self) -> Stepper:
+        """The stepper for a step of 1: order, cost and name are the same for all."""
+        return self.make(1.0)
+
+    def settings(self, scene: Scene) -> tuple[float, ...]:
+        return matched_steps(scene, self.stepper.force_evaluations)
+
+    def warm_up(self, scene: Scene) -> None:
+        dt = min(scene.time_steps)
+        system = System(scene.motion, scene.potential.forces, friction=scene.friction)
+        start = State(scene.positions, scene.velocities)
+        stepper = self.make(dt)
+        stepper.step(system, start, dt)
+        steppers.run(system, start, dt, 2, stepper=stepper)
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        # What does not keep the positions on the surface cannot have rows that depend on each other there.
+        held = scene.constraint_set if self.stepper.symplectic else independent_rows(scene)
+        stepper = self.make(setting)
+        return _CoreRun(scene, Motion(held, scene.positions), stepper, setting)
+
+
+class CoreVerlet(Method):
+    """RATTLE with nothing held: what a step costs before any constraint."""
+
+    marches = True
+
+    def warm_up(self, scene: Scene) -> None:
+        run = self.start(scene, min(scene.time_steps))
+        run.advance()
+        run.march(2)
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
+        return _CoreRun(scene, nothing, Rattle(), setting)
+
+
+def of_steppers(found: Any) -> list[CoreStepper]:
+    """A method for each stepper of a registry, RATTLE first.
+
+    Parameters
+    ----------
+    found : mapping of name to stepper, or iterable of steppers
+        Objects, or classes that can do without arguments; the `rate` of a feedback is filled in. Without a name,
+        that of the class is taken: KahanLi6 is `kahan-li6`.
+    """
+    named = found.items() if isinstance(found, Mapping) else ((None, item) for item in found)
+    methods = {"rattle": CoreStepper("rattle", "kcons RATTLE")}
+    for given, item in named:
+        kind = item.__name__ if isinstance(item, type) else type(item).__name__
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", str(given or kind)).lower()
+        if name not in methods:
+            methods[name] = CoreStepper(name, f"kcons {kind}", usual=name in USUAL_STEPPERS, make=_maker(item))
+    return list(methods.values())
+
+
+def _maker(item: Any) -> Callable[[float], Stepper]:
+    if not isinstance(item, type):
+        return lambda dt: item  # type: ignore[no-any-return]
+    if "rate" in inspect.signature(item).parameters:
+        return lambda dt: item(rate=FEEDBACK / dt)  # type: ignore[no-any-return]
+    return lambda dt: item()  # type: ignore[no-any-return]
+
+
+class _ExtrapolatedRun(_StateRun):
+    def __init__(self, scene: Scene, tolerance: float) -> None:
+        super().__init__()
+        motion = Motion(scene.constraint_set, scene.positions)
+        self.constraints.watch(motion, ENGINE_CALLS)
+        system = System(motion, scene.potential.forces, friction=scene.friction)
+        self._state = State(scene.positions, scene.velocities)
+        self._horizon = scene.horizon
+        self._states = steppers.Extrapolation(tolerance).states(system, self._state, scene.horizon)
+
+    def advance(self) -> None:
+        self._state = next(self._states)
+        self.time = self._state.time
+        self.divided = self.constraints.seconds > 0.0
+
+    @property
+    def finished(self) -> bool:
+        return self.time == self._horizon
+
+
+class Extrapolated(Method):
+    """`kcons.steppers.Extrapolation`, by itself of the size and order of its steps; its settings are tolerances."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _ExtrapolatedRun(scene, setting)
+
+
+# -- ASE --------------------------------------------------------------------------------------------
+
+
+class _AseRun(Run):
+    def __init__(self, scene: Scene, dt: float, *constraints: Any) -> None:
+        super().__init__()
+        self._scene = scene
+        self._atoms = scene.atoms()
+        self._momenta = self._atoms.get_momenta()
+        self._atoms.set_constraint(constraints)
+        # set_constraint keeps the objects themselves, so that their hooks can be timed.
+        for item in self._atoms.constraints:
+            self.constraints.watch(item, ASE_HOOKS)
+        self._dynamics = VelocityVerlet(self._atoms, timestep=dt)
+        self._dt = dt
+        self._done = 0
+        self._steps = round(scene.horizon / dt)
+        scene.potential.forces(self._atoms.positions)
+
+    def advance(self) -> None:
+        self._dynamics.step()
+        self._done += 1
+        self.time = self._done * self._dt
+
+    def march(self, steps: int) -> None:
+        step = self._dynamics.step  # as ASE's own loop calls it
+        for _ in range(steps):
+            step()
+        self._done += steps
+        self.time = self._done * self._dt
+
+    def rewind(self) -> None:
+        self._atoms.positions[:] = self._scene.positions
+        # Constraints would change them by what rounding leaves.
+        self._atoms.set_momenta(self._momenta, apply_constraint=False)
+        self._scene.potential.forces(self._scene.positions)
+
+    @property
+    def finished(self) -> bool:
+        return self._done >= self._steps
+
+    @property
+    def positions(self) -> FloatArray:
+        return np.asarray(self._atoms.get_positions())
+
+    @property
+    def velocities(self) -> FloatArray:
+        return np.asarray(self._atoms.get_velocities())
+
+
+class AseMethod(Method):
+    """ASE's VelocityVerlet."""
+
+    marches = True
+
+
+class AseKcons(AseMethod):
+    """ASE's VelocityVerlet with `kcons.ase.Constraints`."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        held = Constraints(scene.constraint_set.constraints)
+        return _AseRun(scene, setting, held)
+
+
+class AseVerlet(AseMethod):
+    """ASE's VelocityVerlet with nothing held."""
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _AseRun(scene, setting)
+
+
+class AseBonds(AseMethod):
+    """ASE's VelocityVerlet with FixBondLengths at its own tolerance, angles held by their end distances."""
+
+    def refuses(self, scene: Scene) -> str | None:
+        return super().refuses(scene) or (None if scene.bonds is not None else "it holds distances only")
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        assert scene.bonds is not None
+        lengths = _distances(scene.atoms(), scene.bonds)
+        return _AseRun(scene, setting, *_fixed(scene), FixBondLengths(scene.bonds, bondlengths=lengths))
+
+
+class AseInternals(AseMethod):
+    """ASE's VelocityVerlet with FixInternals at its own tolerance."""
+
+    def refuses(self, scene: Scene) -> str | None:
+        return super().refuses(scene) or (None if scene.bonds is not None else "it holds internal coordinates only")
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        bonds = scene.bonds if scene.angle_bonds is None else scene.angle_bonds
+        assert bonds is not None
+        atoms = scene.atoms()
+        lengths = _distances(atoms, bonds)
+        pairs = [[float(d), [int(i), int(j)]] for d, (i, j) in zip(lengths, bonds, strict=True)]
+        triples = [[float(atoms.get_angle(*t)), [int(a) for a in t]] for t in scene.angles]
+        return _AseRun(scene, setting, *_fixed(scene), FixInternals(bonds=pairs, angles_deg=triples or None))
+
+
+def _fixed(scene: Scene) -> list[FixAtoms]:
+    return [FixAtoms(scene.fixed)] if len(scene.fixed) else []
+
+
+def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
+    x = atoms.positions
+    return np.asarray(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1))
+
+
+# -- SciPy ------------------------------------------------------------------------------------------
+
+
+class _OdeRun(Run):
+    def __init__(self, scene: Scene, rtol: float, *, project: bool) -> None:
+        super().__init__()
+        # Off the surface, where this equation drifts, rows that depend on each other contradict each other.
+        motion = Motion(independent_rows(scene), scene.positions)
+        self.constraints.watch(motion, ENGINE_CALLS)
+        shape, half = scene.positions.shape, scene.positions.size
+
+        def rate(t: float, y: FloatArray) -> FloatArray:
+            x, v = y[:half].reshape(shape), y[half:].reshape(shape)
+            f = self._force = scene.potential.forces(x, t)
+            if scene.friction:
+                f = f - scene.friction * scene.masses[:, None] * v
+            return np.concatenate([y[half:], motion.acceleration(x, v, f, t).ravel()])
+
+        speed = float(np.sqrt(np.mean(scene.velocities**2)))
+        # Errors are measured against one unit of length and the thermal speed, not against each entry.
+        scale = np.concatenate([np.ones(half), np.full(half, speed if speed > 0 else 1.0)])
+        start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])
+        self._shape, self._half = shape, half
+        self._motion, self._project, self._damping = motion, project, scene.friction * scene.masses[:, None]
+        self._solver = DOP853(rate, 0.0, start, scene.horizon, rtol=max(rtol, 1e-13), atol=rtol * scale)
+
+    def advance(self) -> None:
+        message = self._solver.step()
+        if self._solver.status == "failed":
+            raise KconsError(f"DOP853 gave up at t = {self._solver.t:g}: {message}")
+        self.time = float(self._solver.t)
+        if self._project:
+            self._land()
+
+    def _land(self) -> None:
+        """Back onto the constraints, by less than the tolerance: the force known there need not be computed again."""
+        motion, t = self._motion, self.time
+        x = motion.project_positions(self.positions, self.positions, time=t)
+        v = motion.project_velocities(x, self.velocities, time=t)
+        a = motion.acceleration(x, v, self._force - self._damping * v, t)
+        self._solver.y = np.concatenate([x.ravel(), v.ravel()])
+        self._solver.f = np.concatenate([v.ravel(), a.ravel()])
+
+    @property
+    def finished(self) -> bool:
+        return bool(self._solver.status == "finished")
+
+    @property
+    def positions(self) -> FloatArray:
+        return np.asarray(self._solver.y[: self._half]).reshape(self._shape)
+
+    @property
+    def velocities(self) -> FloatArray:
+        return np.asarray(self._solver.y[self._half :]).reshape(self._shape)
+
+
+@dataclass(frozen=True)
+class ProjectedOde(Method):
+    """SciPy's DOP853 on a = M_par^+ f + M^-1 A^T (A M^-1 A^T)^-1 b (notes eq. 105).
+
+    Attributes
+    ----------
+    project : bool
+        Whether the engine brings positions and velocities back onto the constraints after each step (Hairer, Lubich
+        and Wanner, Geometric Numerical Integration, IV.4); otherwise nothing stops a drift.
+    """
+
+    project: bool = False
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return _OdeRun(scene, setting, project=self.project)
+
+
+METHODS: Mapping[str, Method] = {
+    method.name: method
+    for method in (
+        *of_steppers(STEPPERS),
+        Extrapolated("extrapolation", "kcons Extrapolation", adaptive=True, damps=True),
+        AseKcons("ase-kcons", "ASE Verlet + kcons", host="ase"),
+        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
+        AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
+        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
+        ProjectedOde("dop853-projected", "kcons + DOP853, projected", adaptive=True, damps=True, project=True),
+        CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
+        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
+        *OPENMM_METHODS,
+        *PEERS,
+    )
+}
+
+
+def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> list[Method]:
+    """Methods by name, by default the usual ones for the scene.
+
+    'all' alone stands for all, 'openmm' for the usual ones of OpenMM that can run the scene.
+
+    Raises
+    ------
+    InputError
+        Unknown name.
+    """
+    if names is None:
+        return usual(scene)
+    wanted = list(names)
+    if wanted == ["all"]:
+        return list(METHODS.values())
+    picked: dict[str, Method] = {}
+    for name in wanted:
+        if name == "openmm":
+            group = [m for m in METHODS.values() if m.usual and m.host == name]
+            able = [m for m in group if scene is None or m.refuses(scene) is None]
+            picked |= {m.name: m for m in able or group}
+        elif name in METHODS:
+            picked[name] = METHODS[name]
+        else:
+            known = ", ".join((*METHODS, "openmm", "all"))
+            raise InputError(f"there is no method {name!r}; there are {known}", item="methods")
+    if not picked:
+        raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
+    return list(picked.values())
+
+
+def usual(scene: Scene | None = None) -> list[Method]:
+    """What runs where no method is named: the usual ones, of guests only those that can run the scene.
+
+    All of OpenMM's on scenes that are at home there, and nothing else.
+    """
+    found = [method for method in METHODS.values() if method.usual]
+    if scene is not None and scene.openmm is not None and scene.openmm.home:
+        return [method for method in found if method.host == "openmm" and method.refuses(scene) is None]
+    hosts = [m for m in found if m.host != "openmm" or m.guest]
+    return [m for m in hosts if not m.guest or (scene is not None and m.refuses(scene) is None)]

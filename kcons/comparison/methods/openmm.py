@@ -1,0 +1,442 @@
+"""Methods of OpenMM: its own integrators over tolerances, and those of kcons in it.
+
+OpenMM runs by itself, several steps at a time; its Context starts where the scene does, on the platform of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, matched_steps
+from kcons.comparison.scenes import Scene
+from kcons.comparison.scenes.openmm_host import OpenMMHost
+from kcons.constraints.target import FloatArray
+
+if TYPE_CHECKING:
+    import openmm
+
+#: Tolerances of OpenMM's own solvers; the second is the default of its integrators.
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-10, 1e-12)
+DEFAULT = 1e-5
+#: Tolerance under the integrators of kcons.
+TIGHT = 1e-12
+#: Of the thermostats: K, and collisions a ps.
+TEMPERATURE, COLLISIONS = 300.0, 1.0
+
+#: A run is watched at about so many times.
+RECORDS = 12
+#: Steps that take less than this are timed in blocks: of so many seconds, and of so few and so many steps. A call of
+#: `step` has costs of its own, which those who make a million steps do not see.
+SHORT_STEP, BLOCK_SECONDS, BLOCK_STEPS = 0.03, 0.05, (500, 2000)
+BLOCKS = 3
+#: Fewer steps a block where these would take longer, but no fewer than that.
+LONG_BLOCK, LEAST_STEPS = 0.6, 10
+
+HALF_STEP = (
+    "OpenMM's own integrators keep velocities half a step off the positions; |Av| is that of the velocities that "
+    "OpenMM gives."
+)
+NO_TRAJECTORY = "thermostat: a trajectory of its own, so that no error can be stated."
+SETTLE = "SETTLE stores its distances in single precision: water is off by up to 6e-8 of them at any tolerance."
+
+
+class _HostRun(Run):
+    """A Context that is stepped to the horizon.
+
+    Parameters
+    ----------
+    evaluations : int
+        Force evaluations a step.
+    half_step : bool
+        Whether velocities are kept half a step behind.
+    """
+
+    divided = False
+
+    def __init__(
+        self,
+        scene: Scene,
+        context: openmm.Context,
+        integrator: openmm.Integrator,
+        dt: float,
+        *,
+        evaluations: int = 1,
+        half_step: bool = False,
+        records: int | None = RECORDS,
+    ) -> None:
+        super().__init__()
+        host = scene.openmm
+        assert host is not None
+        self._scene, self._host, self._context, self._integrator = scene, host, context, integrator
+        self._dt, self._evaluations, self._half_step = dt, evaluations, half_step
+        self._done, self._planned = 0, round(scene.horizon / dt)
+        self._stride = 1 if records is None else max(1, self._planned // records)
+        self._groups = integrator.getIntegrationForceGroups()
+        self._end: tuple[FloatArray, FloatArray] | None = None
+        self._spent = 0.0
+        self._x, self._v = scene.positions * host.length, scene.velocities * host.speed
+        context.setPositions(self._x)
+        if half_step:
+            # Then the first position is the one that RATTLE reaches.
+            self._v = self._v - 0.5 * dt * host.time * self._forces() / scene.masses[:, None]
+        context.setVelocities(self._v)
+
+    def advance(self) -> None:
+        # The first step stands alone: it pays for what is set up lazily.
+        self.steps = min(self._stride if self._done else 1, self._planned - self._done)
+        begun = perf_counter()
+        self._integrator.step(self.steps)
+        if self._done:
+            self._spent += perf_counter() - begun
+        self._done += self.steps
+        self.time = self._done * self._dt
+        if self.finished and hasattr(self._integrator, "check"):
+            self._integrator.check()  # what OpenMM's solvers do not tell
+
+    def march(self, steps: int) -> None:
+        self._integrator.step(steps)
+        self._done += steps
+        self.time = self._done * self._dt
+
+    def stretch(self, step_seconds: float, pass_seconds: float) -> int:
+        return _block(step_seconds, pass_seconds)
+
+    def rewind(self) -> None:
+        self._context.setPositions(self._x)
+        self._context.setVelocities(self._v)
+
+    def settle(self) -> None:
+        self._integrator.step(1)
+
+    @property
+    def finished(self) -> bool:
+        return self._done >= self._planned
+
+    @property
+    def positions(self) -> FloatArray:
+        return (self._state()[0] if self._end is None else self._end[0]) / self._host.length
+
+    @property
+    def velocities(self) -> FloatArray:
+        return (self._state()[1] if self._end is None else self._end[1]) / self._host.speed
+
+    def own_energy(self) -> float | None:
+        if not self._half_step:
+            return None
+        if hasattr(self._integrator, "scheme"):
+            # To ask would compute the forces that the next step is to pay for.
+            return float("nan")
+        # OpenMM's own integrators compute forces anew in every step. They know how to move velocities by half a step.
+        state = self._context.getState(energy=True, groups=self._groups)
+        energy = state.getKineticEnergy() + state.getPotentialEnergy()
+        return float(energy._value) / self._host.speed**2
+
+    def own_evaluations(self) -> int:
+        return self._done * self._evaluations
+
+    def own_step_seconds(self) -> float | None:
+        # Without the first step.
+        timed = self._planned - 1
+        if not self.finished or not timed or self._spent > SHORT_STEP * timed:
+            return None
+        self._end = self._state()
+        if not np.isfinite(self._end[0]).all():
+            return None
+        size = _block(self._spent / timed, BLOCK_SECONDS)
+        found = []
+        try:
+            for _ in range(BLOCKS):
+                begun = perf_counter()
+                self._integrator.step(size)
+                found.append((perf_counter() - begun) / size)
+        except Exception:  # beyond the horizon anything may happen
+            return None
+        return float(np.median(found))
+
+    def _state(self) -> tuple[FloatArray, FloatArray]:
+        state = self._context.getState(positions=True, velocities=True)
+        return (
+            np.asarray(state.getPositions(asNumpy=True)._value),
+            np.asarray(state.getVelocities(asNumpy=True)._value),
+        )
+
+    def _forces(self) -> FloatArray:
+        state = self._context.getState(forces=True, groups=self._groups)
+        return np.asarray(state.getForces(asNumpy=True)._value)
+
+
+def _block(step_seconds: float, seconds: float) -> int:
+    wanted = np.clip(seconds / step_seconds, *BLOCK_STEPS)
+    return int(max(min(wanted, LONG_BLOCK / step_seconds), LEAST_STEPS))
+
+
+class _CarriedRun(_HostRun):
+    """Rows carried to kcons' engine, which is asked through Python and can be timed."""
+
+    divided = True
+
+
+@dataclass(frozen=True)
+class OpenMMMethod(Method):
+    """What all methods of OpenMM have in common."""
+
+    marches: ClassVar[bool] = True
+
+    host: str = "openmm"
+
+    def refuses(self, scene: Scene) -> str | None:
+        reason = super().refuses(scene)
+        if reason is not None:
+            return reason
+        if find_spec("openmm") is None:
+            return "OpenMM is not installed; python -m pip install openmm"
+        if scene.openmm is None:
+            return "the scene has no OpenMM System"
+        return self._lacks(scene)
+
+    def _lacks(self, scene: Scene) -> str | None:
+        """What of the scene the method cannot hold."""
+        return None if scene.bonds is not None else "a System holds distances only"
+
+
+def _host(scene: Scene) -> OpenMMHost:
+    assert scene.openmm is not None
+    return scene.openmm
+
+
+# -- OpenMM's own -----------------------------------------------------------------------------------
+
+
+def verlet() -> openmm.Integrator:
+    import openmm
+
+    return openmm.VerletIntegrator(0.001)
+
+
+def middle() -> openmm.Integrator:
+    import openmm
+
+    return openmm.LangevinMiddleIntegrator(TEMPERATURE, 0.0, 0.001)
+
+
+def nose_hoover() -> openmm.Integrator:
+    import openmm
+
+    return openmm.NoseHooverIntegrator(0.001)
+
+
+def middle_bath() -> openmm.Integrator:
+    import openmm
+
+    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, COLLISIONS, 0.001)
+    integrator.setRandomNumberSeed(1)
+    return integrator
+
+
+def nose_hoover_bath() -> openmm.Integrator:
+    import openmm
+
+    return openmm.NoseHooverIntegrator(TEMPERATURE, COLLISIONS, 0.001)
+
+
+@dataclass(frozen=True)
+class BuiltIn(OpenMMMethod):
+    """An integrator of OpenMM with the System's constraints held by SETTLE, SHAKE and CCMA.
+
+    Attributes
+    ----------
+    make : callable
+    tolerance : float
+    """
+
+    make: Callable[[], Any] = verlet
+    tolerance: float = DEFAULT
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        host, integrator = _host(scene), self.make()
+        integrator.setStepSize(setting * host.time)
+        integrator.setConstraintTolerance(self.tolerance)
+        context = host.context(host.system if self.holds else host.copy(constraints=False), integrator)
+        records = RECORDS if self.holds else None
+        return _HostRun(scene, context, integrator, setting, half_step=True, records=records)
+
+    def _lacks(self, scene: Scene) -> str | None:
+        if not self.follows and scene.units.energy != "eV":
+            return "the units of the scene know no kelvin"
+        return super()._lacks(scene) if self.holds else None
+
+
+# -- kcons in OpenMM --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Projected(OpenMMMethod):
+    """`ProjectedIntegrator` on the System's constraints.
+
+    Attributes
+    ----------
+    scheme : str
+    """
+
+    scheme: str = "rattle"
+
+    def settings(self, scene: Scene) -> tuple[float, ...]:
+        return matched_steps(scene, self._evaluations)
+
+    @property
+    def _evaluations(self) -> int:
+        from kcons.openmm.integrator.schemes import to_scheme
+
+        scheme = to_scheme(self.scheme)
+        return 1 if scheme is None else scheme.force_evaluations
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        from kcons.openmm import ProjectedIntegrator
+
+        host = _host(scene)
+        integrator = ProjectedIntegrator(setting * host.time, self.scheme, tolerance=TIGHT)
+        context = host.context(host.system, integrator)
+        return self._run(_HostRun, scene, context, integrator, setting)
+
+    def _run(self, kind: type[_HostRun], scene: Scene, context: openmm.Context, integrator: Any, dt: float) -> _HostRun:
+        return kind(scene, context, integrator, dt, evaluations=self._evaluations, half_step=integrator.scheme is None)
+
+
+@dataclass(frozen=True)
+class Compiled(OpenMMMethod):
+    """`RattleIntegrator`: OpenMM's own leapfrog steps, with both ends at the positions.
+
+    Attributes
+    ----------
+    tolerance : float
+    """
+
+    tolerance: float = TIGHT
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        from kcons.openmm import RattleIntegrator
+
+        host = _host(scene)
+        integrator = RattleIntegrator(setting * host.time, tolerance=self.tolerance)
+        context = host.context(host.system, integrator)
+        # Each time somebody looks costs a force evaluation: only the end is looked at.
+        return _HostRun(scene, context, integrator, setting, records=1)
+
+
+@dataclass(frozen=True)
+class Held(Projected):
+    """`ProjectedIntegrator` with the constraints carried to kcons' own solver by `hold`.
+
+    Rigid water stays with OpenMM, unless there is nothing else.
+    """
+
+    def _lacks(self, scene: Scene) -> str | None:
+        return None if _host(scene).surfaces else super()._lacks(scene)
+
+    def warm_up(self, scene: Scene) -> None:
+        self.start(scene, min(scene.time_steps)).advance()
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        from kcons.openmm import ProjectedIntegrator, hold
+        from kcons.openmm.carried.hold import take_constraints
+
+        host, system = _host(scene), _host(scene).copy()
+        only_water = not host.surfaces and not take_constraints(host.copy())
+        rows: Sequence[Any] = host.surfaces
+        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water)
+        integrator = ProjectedIntegrator(setting * host.time, self.scheme, parts=[part], tolerance=TIGHT)
+        context = host.context(system, integrator)
+        run = self._run(_CarriedRun, scene, context, integrator, setting)
+        run.constraints.watch(part.motion, ENGINE_CALLS)
+        return run
+
+
+@dataclass(frozen=True)
+class OnSurfaces(Projected):
+    """`SurfaceIntegrator`: surfaces computed by OpenMM itself."""
+
+    def _lacks(self, scene: Scene) -> str | None:
+        return None if _host(scene).surfaces else "no particle is held on a surface"
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        from kcons.openmm import SurfaceIntegrator
+
+        host, system = _host(scene), _host(scene).copy()
+        integrator = SurfaceIntegrator(
+            setting * host.time, self.scheme, surfaces=host.surfaces, system=system, tolerance=TIGHT
+        )
+        return self._run(_HostRun, scene, host.context(system, integrator), integrator, setting)
+
+
+# -- by name ----------------------------------------------------------------------------------------
+
+_KINDS = {
+    "openmm-verlet": ("OpenMM Verlet", verlet),
+    "openmm-middle": ("OpenMM LangevinMiddle, no friction", middle),
+    "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", nose_hoover),
+}
+
+
+def _built_in() -> list[OpenMMMethod]:
+    found: list[OpenMMMethod] = []
+    for kind, (title, make) in _KINDS.items():
+        for tolerance in TOLERANCES:
+            plain = tolerance == DEFAULT
+            exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+            found.append(
+                BuiltIn(
+                    kind if plain else f"{kind}-{exponent}",
+                    f"{title}, {exponent}",
+                    usual=kind == "openmm-verlet" or plain,
+                    guest=kind == "openmm-verlet" and plain,
+                    remark=HALF_STEP,
+                    make=make,
+                    tolerance=tolerance,
+                )
+            )
+    baths = (
+        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", middle_bath),
+        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", nose_hoover_bath),
+    )
+    found += [BuiltIn(name, title, follows=False, remark=NO_TRAJECTORY, make=make) for name, title, make in baths]
+    return found
+
+
+def _of_kcons() -> list[OpenMMMethod]:
+    usual = ("rattle", "suzuki4", "blanes-moan4", "kahan-li6", "blanes-moan6")
+    others = ("geodesic", "yoshida4", "blanes-moan6a", "leapfrog")
+    found: list[OpenMMMethod] = []
+    for scheme in (*usual, *others):
+        projected = Projected(
+            f"openmm-kcons-{scheme}",
+            f"OpenMM + kcons {scheme}",
+            usual=scheme in usual,
+            guest=scheme == "rattle",
+            remark=HALF_STEP if scheme == "leapfrog" else "",
+            scheme=scheme,
+        )
+        found.append(projected)
+    for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
+        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{exponent}"
+        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {exponent}", tolerance=tolerance))
+    for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
+        title = f"OpenMM + kcons {scheme}, own solver"
+        found.append(Held(f"openmm-held-{scheme}", title, usual=scheme != "blanes-moan4", scheme=scheme))
+    for scheme in ("rattle", "geodesic", "suzuki4", "blanes-moan6"):
+        title = f"OpenMM + kcons {scheme}, surfaces"
+        found.append(OnSurfaces(f"openmm-surface-{scheme}", title, guest=scheme == "rattle", scheme=scheme))
+    return found
+
+
+OPENMM_METHODS: tuple[OpenMMMethod, ...] = (
+    *_built_in(),
+    *_of_kcons(),
+    BuiltIn("openmm-free", "floor: OpenMM Verlet, nothing held", holds=False),
+)

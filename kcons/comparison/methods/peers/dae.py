@@ -1,0 +1,216 @@
+"""Solvers of differential-algebraic equations: Radau IIA of scipy-dae, and SUNDIALS' IDA from scikit-sundae.
+
+Both get the stabilised formulation of index 2 of Gear, Gupta and Leimkuhler, J. Comput. Appl. Math. 12, 77 (1985), with
+the multipliers as derivatives of unknowns, which lowers the index by one more::
+
+    x' = v + M^-1 A^T gamma',   v' = M^-1 (f + A^T Lambda'),   sigma(x) = 0,   A v = 0
+
+and a Jacobian in which the derivative of f alone is left out: the simplified Newton iteration converges as long as
+steps resolve the motion, and no force is spent on differences.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from kcons.comparison.methods.method import Method, Run
+from kcons.comparison.methods.peers.smallness import dense_rows, one_thread, plain_set, too_much
+from kcons.comparison.scenes import Scene
+from kcons.constraints.target import FloatArray
+from kcons.errors import KconsError
+from kcons.motion.motion import Motion
+
+#: A run is watched at about so many times: the first steps of these solvers are far shorter than the later ones.
+RECORDS = 40
+#: Step of the differences of A.
+DIFFERENCE = 1e-6
+#: What an unknown may be off by, beside the relative tolerance, as a fraction of its scale.
+LEAST = 1e-13
+
+
+class _Equations:
+    """F(t, y, y') = 0 with y = (x, v, Lambda, gamma), its start and its Jacobians."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.held = plain_set(scene)
+        self.value, self.gradient = dense_rows(self.held)
+        self.scene, self.shape = scene, scene.positions.shape
+        self.n, self.m = scene.positions.size, self.held.n_rows
+        self.weights = np.repeat(1.0 / scene.masses, 3)
+        self.size = 2 * (self.n + self.m)
+        speed = float(np.sqrt(np.mean(scene.velocities**2))) or 1.0
+        impulse = speed * float(np.mean(scene.masses))
+        parts = ((self.n, 1.0), (self.n, speed), (self.m, impulse), (self.m, impulse))
+        self.scale = np.concatenate([np.full(count, size) for count, size in parts])
+
+    def start(self) -> tuple[FloatArray, FloatArray]:
+        scene = self.scene
+        x, v, f = scene.positions, scene.velocities, self.forces(scene.positions, scene.velocities.ravel(), 0.0)
+        motion = Motion(self.held, x)
+        a, lam = motion.acceleration(x, v, f.reshape(self.shape)), motion.multipliers(x, v, f.reshape(self.shape))
+        y = np.concatenate([x.ravel(), v.ravel(), np.zeros(2 * self.m)])
+        return y, np.concatenate([v.ravel(), a.ravel(), lam, np.zeros(self.m)])
+
+    def forces(self, x: FloatArray, v: FloatArray, t: float) -> FloatArray:
+        f = self.scene.potential.forces(x, t).ravel()
+        if self.scene.friction:
+            f -= self.scene.friction * v / self.weights
+        return f
+
+    def residual(self, t: float, y: FloatArray, rate: FloatArray) -> FloatArray:
+        n, m = self.n, self.m
+        x, v, lam, gamma = y[:n].reshape(self.shape), y[n : 2 * n], rate[2 * n : 2 * n + m], rate[2 * n + m :]
+        a = self.gradient(y[:n])
+        return np.concatenate(
+            [
+                rate[:n] - v - self.weights * (a.T @ gamma),
+                rate[n : 2 * n] - self.weights * (self.forces(x, v, t) + a.T @ lam),
+                self.value(y[:n]),
+                a @ v,
+            ]
+        )
+
+    def jacobians(self, t: float, y: FloatArray, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """dF/dy and dF/dy', each of shape (size, size)."""
+        n, m = self.n, self.m
+        a = self.gradient(y[:n])
+        lam, gamma = rate[2 * n : 2 * n + m], rate[2 * n + m :]
+        by_y, by_rate = np.zeros((self.size, self.size)), np.zeros((self.size, self.size))
+        for j in range(n):
+            step = np.zeros(n)
+            step[j] = DIFFERENCE
+            change = (self.gradient(y[:n] + step) - self.gradient(y[:n] - step)) / (2.0 * DIFFERENCE)
+            by_y[:n, j] = -self.weights * (gamma @ change)
+            by_y[n : 2 * n, j] = -self.weights * (lam @ change)
+            by_y[2 * n + m :, j] = change @ y[n : 2 * n]
+        by_y[:n, n : 2 * n] = -np.eye(n)
+        by_y[n : 2 * n, n : 2 * n] = self.scene.friction * np.eye(n)
+        by_y[2 * n : 2 * n + m, :n] = a
+        by_y[2 * n + m :, n : 2 * n] = a
+        by_rate[: 2 * n, : 2 * n] = np.eye(2 * n)
+        pull = -self.weights[:, None] * a.T
+        by_rate[n : 2 * n, 2 * n : 2 * n + m] = pull
+        by_rate[:n, 2 * n + m :] = pull
+        return by_y, by_rate
+
+
+class _DaeRun(Run):
+    """Constraints cannot be told from the rest: all is one system of equations."""
+
+    divided = False
+
+    def __init__(self, scene: Scene, equations: _Equations) -> None:
+        super().__init__()
+        self._equations, self._horizon = equations, scene.horizon
+        self._y, self._rate = equations.start()
+
+    def advance(self) -> None:
+        until = min(self.time + self._horizon / RECORDS, self._horizon * (1.0 - 1e-14))
+        self.steps = 0
+        while self.time < until:
+            self._step()
+            self.steps += 1
+
+    @abstractmethod
+    def _step(self) -> None:
+        """One step of the solver."""
+
+    @property
+    def finished(self) -> bool:
+        return self.time >= self._horizon * (1.0 - 1e-14)
+
+    @property
+    def positions(self) -> FloatArray:
+        n = self._equations.n
+        return np.array(self._y[:n]).reshape(self._equations.shape)
+
+    @property
+    def velocities(self) -> FloatArray:
+        n = self._equations.n
+        return np.array(self._y[n : 2 * n]).reshape(self._equations.shape)
+
+
+class _RadauRun(_DaeRun):
+    def __init__(self, scene: Scene, rtol: float) -> None:
+        from scipy_dae.integrate import RadauDAE
+
+        one_thread("scipy-dae")
+        equations = _Equations(scene)
+        super().__init__(scene, equations)
+        self._solver = RadauDAE(
+            equations.residual, 0.0, self._y, self._rate, scene.horizon,
+            rtol=rtol, atol=np.maximum(rtol, LEAST) * equations.scale, jac=equations.jacobians,
+        )  # fmt: skip
+
+    def _step(self) -> None:
+        message = self._solver.step()
+        if self._solver.status == "failed":
+            raise KconsError(f"Radau gave up at t = {self._solver.t:g}: {message}")
+        self.time, self._y = float(self._solver.t), self._solver.y
+
+
+class _IdaRun(_DaeRun):
+    def __init__(self, scene: Scene, rtol: float) -> None:
+        from sksundae.ida import IDA
+
+        one_thread("scikit-sundae")
+        equations = _Equations(scene)
+        super().__init__(scene, equations)
+
+        def residual(t: float, y: FloatArray, rate: FloatArray, out: FloatArray) -> None:
+            out[:] = equations.residual(t, y, rate)
+
+        def jacobian(t: float, y: FloatArray, rate: FloatArray, f: FloatArray, cj: float, out: FloatArray) -> None:
+            by_y, by_rate = equations.jacobians(t, y, rate)
+            out[:] = by_y + cj * by_rate
+
+        self._solver: Any = IDA(
+            residual, jacfn=jacobian, rtol=rtol, atol=np.maximum(rtol, LEAST) * equations.scale, max_num_steps=100_000
+        )
+        self._solver.init_step(0.0, self._y, self._rate)
+
+    def _step(self) -> None:
+        found = self._solver.step(self._horizon, method="onestep", tstop=self._horizon)
+        if not found.success:
+            raise KconsError(f"IDA gave up at t = {self.time:g}: {found.message}")
+        self.time, self._y = float(np.ravel(found.t)[-1]), np.ravel(found.y)
+
+
+@dataclass(frozen=True)
+class Dae(Method):
+    """A DAE solver at relative tolerances.
+
+    Attributes
+    ----------
+    package, module : str
+        What to install, and what it is then called.
+    make : callable
+        A run from the scene and the tolerance.
+    """
+
+    package: str = "scipy-dae"
+    module: str = "scipy_dae"
+    make: Callable[[Scene, float], Run] = _RadauRun
+
+    def refuses(self, scene: Scene) -> str | None:
+        if find_spec(self.module) is None:
+            return f"{self.package} is not installed; python -m pip install {self.package}"
+        return super().refuses(scene) or too_much(scene)
+
+    def start(self, scene: Scene, setting: float) -> Run:
+        return self.make(scene, setting)
+
+
+def dae_methods() -> list[Method]:
+    """Radau and IDA."""
+    common: dict[str, Any] = dict(adaptive=True, host="peer", guest=True, damps=True)
+    return [
+        Dae("dae-radau", "scipy-dae Radau, index 2", **common),
+        Dae("dae-ida", "SUNDIALS IDA, index 2", package="scikit-sundae", module="sksundae", make=_IdaRun, **common),
+    ]

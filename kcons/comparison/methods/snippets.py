@@ -1,0 +1,235 @@
+"""The lines of code that run a method on a scene, to be pasted and changed.
+
+Each snippet runs as it stands, from the start of the scene to its horizon. What is to be replaced for a system of
+one's own is named in comments.
+"""
+
+from __future__ import annotations
+
+import inspect
+
+from kcons.comparison.methods.method import Method
+from kcons.comparison.methods.methods import METHODS, AseBonds, AseKcons, CoreStepper, Extrapolated, ProjectedOde
+from kcons.comparison.methods.openmm import (
+    TIGHT,
+    BuiltIn,
+    Compiled,
+    Held,
+    OnSurfaces,
+    Projected,
+    middle,
+    nose_hoover,
+    verlet,
+)
+from kcons.comparison.scenes import Scene
+from kcons.errors import InputError
+
+_OPENMM_KINDS = {
+    verlet: "VerletIntegrator({dt})",
+    middle: "LangevinMiddleIntegrator(300, 0, {dt})",
+    nose_hoover: "NoseHooverIntegrator({dt})",
+}
+
+
+_ON_ARRAYS = (
+    "scene = SCENE",
+    "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet and positions",
+    "system = System(motion, scene.potential.forces)  # a function of positions and time",
+    "start = State(scene.positions, scene.velocities)",
+)
+
+
+def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
+    """Python for one method.
+
+    Parameters
+    ----------
+    scene : Scene
+    method : str
+        A key of `kcons.comparison.methods.methods.METHODS`.
+    setting : float
+        Time step in the unit the scene shows, or tolerance.
+    made_by : str
+        The expression that makes the scene after ``from kcons import scenes``, such as ``scenes.build("chain", 10)``.
+
+    Raises
+    ------
+    InputError
+        Unknown method.
+    """
+    if method not in METHODS:
+        raise InputError(f"there is no method {method!r}", item="method")
+    found = METHODS[method]
+    steps = 0 if found.adaptive else round(scene.horizon / (setting * scene.units.time_unit))
+    molecular = scene.units.energy == "eV"
+    # All digits: steps divide the horizon.
+    dt = repr(float(f"{setting:.15g}"))
+    if getattr(scene, "friction", 0.0):
+        lines = _any(method, setting if found.adaptive else setting * scene.units.time_unit)
+    elif isinstance(found, CoreStepper) and _plain(found):
+        stepper = type(found.make(1.0)).__name__
+        lines = _ase_stepper(dt, steps, stepper) if molecular else _arrays(dt, steps, stepper)
+    elif isinstance(found, Extrapolated):
+        lines = _extrapolated(setting)
+    elif isinstance(found, AseKcons):
+        lines = _ase_kcons(dt, steps)
+    elif isinstance(found, AseBonds):
+        lines = _ase_bonds(dt, steps)
+    elif isinstance(found, ProjectedOde) and not found.project:
+        lines = _scipy(setting)
+    elif isinstance(found, BuiltIn | Compiled | Projected) and not isinstance(found, OnSurfaces):
+        assert scene.openmm is not None
+        step = repr(float(f"{setting * scene.units.time_unit * scene.openmm.time:.15g}"))
+        lines = _openmm(found, step, steps, keep_water=not _only_water(scene))
+    else:
+        lines = _any(method, setting if found.adaptive else setting * scene.units.time_unit)
+    return "\n".join(lines).replace("SCENE", made_by) + "\n"
+
+
+def _plain(method: CoreStepper) -> bool:
+    """Whether its class can do without arguments, and keeps to the constraints."""
+    stepper = method.make(1.0)
+    needed = [p for p in inspect.signature(type(stepper)).parameters.values() if p.default is p.empty]
+    return stepper.symplectic and not [p for p in needed if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+
+
+def _ase_stepper(dt: str, steps: int, stepper: str) -> list[str]:
+    return [
+        "from ase import units",
+        "",
+        "from kcons import scenes",
+        "from kcons.ase import ConstrainedDynamics",
+        f"from kcons.steppers import {stepper}",
+        "",
+        "scene = SCENE",
+        "atoms = scene.atoms()  # yours, with a calculator and velocities",
+        "held = scene.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]",
+        f"dynamics = ConstrainedDynamics(atoms, {dt} * units.fs, {stepper}(), constraints=held)",
+        f"dynamics.run({steps})",
+    ]
+
+
+def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
+    return [
+        "from kcons import Motion, State, System, run, scenes",
+        f"from kcons.steppers import {stepper}",
+        "",
+        *_ON_ARRAYS,
+        f"end = run(system, start, {dt}, {steps}, stepper={stepper}())",
+    ]
+
+
+def _extrapolated(tolerance: float) -> list[str]:
+    return [
+        "from kcons import Motion, State, System, scenes",
+        "from kcons.steppers import Extrapolation",
+        "",
+        *_ON_ARRAYS,
+        f"for end in Extrapolation({tolerance!r}).states(system, start, until=scene.horizon):",
+        "    pass  # each state is the end of a step",
+    ]
+
+
+def _ase_kcons(dt: str, steps: int) -> list[str]:
+    return [
+        "from ase import units",
+        "from ase.md.verlet import VelocityVerlet",
+        "",
+        "from kcons import scenes",
+        "from kcons.ase import Constraints",
+        "",
+        "scene = SCENE",
+        "atoms = scene.atoms()  # yours, with a calculator and velocities",
+        "atoms.set_constraint(Constraints(scene.constraint_set.constraints))",
+        f"VelocityVerlet(atoms, {dt} * scene.units.time_unit).run({steps})",
+    ]
+
+
+def _ase_bonds(dt: str, steps: int) -> list[str]:
+    return [
+        "from ase.constraints import FixAtoms, FixBondLengths",
+        "from ase.md.verlet import VelocityVerlet",
+        "",
+        "from kcons import scenes",
+        "",
+        "scene = SCENE",
+        "atoms = scene.atoms()  # yours, with a calculator and velocities",
+        "atoms.set_constraint([FixAtoms(scene.fixed), FixBondLengths(scene.bonds)])",
+        f"VelocityVerlet(atoms, {dt} * scene.units.time_unit).run({steps})",
+    ]
+
+
+def _scipy(rtol: float) -> list[str]:
+    return [
+        "import numpy as np",
+        "from scipy.integrate import solve_ivp",
+        "",
+        "from kcons import Motion, scenes",
+        "",
+        "scene = SCENE",
+        "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet, rows independent",
+        "",
+        "",
+        "def rate(t, y):",
+        "    x, v = y.reshape(2, -1, 3)",
+        "    return np.concatenate([v, motion.acceleration(x, v, scene.potential.forces(x, t), t)]).ravel()",
+        "",
+        "",
+        "start = np.concatenate([scene.positions, scene.velocities]).ravel()",
+        "scale = np.repeat([1.0, np.sqrt(np.mean(scene.velocities**2)) or 1.0], start.size // 2)",
+        f"options = dict(method='DOP853', rtol={max(rtol, 1e-13):g}, atol={rtol:g} * scale)",
+        "end = solve_ivp(rate, (0, scene.horizon), start, **options)",
+        "assert end.success",
+    ]
+
+
+def _only_water(scene: Scene) -> bool:
+    """Whether OpenMM's System holds nothing but rigid water."""
+    from kcons.openmm.carried.hold import take_constraints
+
+    assert scene.openmm is not None
+    return not scene.openmm.surfaces and not take_constraints(scene.openmm.copy())
+
+
+def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str]:
+    lines = ["from kcons import scenes"]
+    made = ["scene = SCENE", "host = scene.openmm", "system = host.system  # yours, with its constraints"]
+    if isinstance(found, BuiltIn):
+        lines = ["import openmm", "", *lines]
+        kind = _OPENMM_KINDS[found.make].format(dt=dt)
+        made += [f"integrator = openmm.{kind}", f"integrator.setConstraintTolerance({found.tolerance:g})"]
+    elif isinstance(found, Held):
+        lines += ["from kcons.openmm import ProjectedIntegrator, hold"]
+        made[-1] = "system = host.copy()  # yours; its constraints move to kcons"
+        made += [
+            f'part = hold(system, host.surfaces, scene.positions * host.length, take="all", keep_water={keep_water})',
+            f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", parts=[part], tolerance={TIGHT:g})',
+        ]
+    elif isinstance(found, Compiled):
+        lines += ["from kcons.openmm import RattleIntegrator"]
+        made += [f"integrator = RattleIntegrator({dt}, tolerance={found.tolerance:g})"]
+    elif isinstance(found, Projected):
+        lines += ["from kcons.openmm import ProjectedIntegrator"]
+        made += [f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", tolerance={TIGHT:g})']
+    return [
+        *lines,
+        "",
+        *made,
+        "context = host.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
+        "context.setPositions(scene.positions * host.length)",
+        "context.setVelocities(scene.velocities * host.speed)",
+        f"integrator.step({steps})",
+    ]
+
+
+def _any(method: str, setting: float) -> list[str]:
+    return [
+        "from kcons import scenes",
+        "from kcons.comparison.methods.methods import METHODS",
+        "",
+        "scene = SCENE",
+        f'run = METHODS["{method}"].start(scene, {setting!r})',
+        "while not run.finished:",
+        "    run.advance()",
+        "print(run.positions)",
+    ]

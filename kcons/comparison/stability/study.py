@@ -1,0 +1,144 @@
+"""The whole stability study, kept as it comes in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from kcons import __version__
+from kcons.comparison.hard_cases.study import fingerprint
+from kcons.comparison.stability import fuzz, runs
+from kcons.comparison.stability.scenes import SCENES
+from kcons.comparison.work_precision.measure import Watcher, environment
+from kcons.errors import InputError
+from kcons.steppers.files import in_one_piece
+
+FORMAT = "kcons-stability-1"
+PARTS = ("steps", "drift", "reversal", "fuzz")
+#: Trials that are kept together.
+BATCH = 500
+
+
+def run(
+    *,
+    only: Iterable[str] | None = None,
+    scenes: Iterable[str] | None = None,
+    quick: bool = False,
+    kept: Path | None = None,
+    watcher: Watcher | None = None,
+) -> dict[str, Any]:
+    """Run the parts of the study.
+
+    Parameters
+    ----------
+    only : iterable of str, optional
+        Of 'steps' (largest stable step), 'drift', 'reversal', 'fuzz'.
+    scenes : iterable of str, optional
+        Of `SCENES`, for all parts but 'fuzz'.
+    quick : bool
+        1e4 steps instead of 1e6, 300 trials instead of 10,000.
+    kept : Path, optional
+        JSON file that is written after every piece of work. Pieces it holds already are taken over where they were
+        made by the same code with the same settings.
+    watcher : Watcher, optional
+
+    Raises
+    ------
+    InputError
+        An unknown part or scene.
+    """
+    parts = list(PARTS) if only is None else list(only)
+    for part in parts:
+        if part not in PARTS:
+            raise InputError(f"there is no part {part!r}; there are {', '.join(PARTS)}", item="only")
+    chosen = list(SCENES) if scenes is None else list(scenes)
+    for scene in chosen:
+        if scene not in SCENES:
+            raise InputError(f"there is no scene {scene!r}; there are {', '.join(SCENES)}", item="scenes")
+    made_by = {"version": __version__, "code": fingerprint(), "quick": quick}
+    result: dict[str, Any] = {"format": FORMAT, "made_by": made_by, "environment": environment(), "pieces": {}}
+    if kept is not None and kept.is_file():
+        before = json.loads(kept.read_text(encoding="utf-8"))
+        if before.get("format") == FORMAT and before["made_by"] == made_by:
+            result["pieces"] = before["pieces"]
+    watcher = watcher or Watcher()
+    work = [piece for part in parts for piece in _pieces(part, quick, chosen)]
+    watcher.begin("stability", len(work))
+    for done, (name, call) in enumerate(work):
+        watcher.advance(done)
+        if name not in result["pieces"]:
+            result["pieces"][name] = call()
+            if kept is not None:
+                save(result, kept)
+    watcher.end()
+    return result
+
+
+def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> list[tuple[str, Callable[[], Any]]]:
+    both = [(method, scene) for scene in scenes for method in runs.METHODS]
+    if part == "steps":
+        return [(f"steps/{s}/{m}", lambda m=m, s=s: runs.largest_step(m, s, quick)) for m, s in both]  # type: ignore[misc]
+    if part == "drift":
+        seeds, steps = (8, 10_000) if quick else (8, 1_000_000)
+        return [(f"drift/{s}", lambda s=s: runs.drift(s, seeds, steps)) for s in scenes]  # type: ignore[misc]
+    if part == "reversal":
+        steps = 200 if quick else 2000
+        return [
+            (f"reversal/{s}/{m}", lambda m=m, s=s: runs.reversal(m, s, steps // (10 if m == "ASE" else 1)))  # type: ignore[misc]
+            for m, s in both
+        ]
+    trials = 300 if quick else 10_000
+    batch = min(BATCH, trials)
+    return [
+        (f"fuzz/{k}", lambda k=k: [asdict(fuzz.trial(seed)) for seed in range(k, min(k + batch, trials))])  # type: ignore[misc]
+        for k in range(0, trials, batch)
+    ]
+
+
+def save(result: dict[str, Any], path: Path) -> None:
+    """Write in one piece."""
+    with in_one_piece(path) as file:
+        file.write((json.dumps(result, indent=1) + "\n").encode())
+
+
+def digest(result: dict[str, Any]) -> dict[str, Any]:
+    """The result with all trials of the fuzz run summed up: what is committed."""
+    trials = [fuzz.Trial(**t) for name, batch in result["pieces"].items() if name.startswith("fuzz/") for t in batch]
+    pieces = {name: piece for name, piece in result["pieces"].items() if not name.startswith("fuzz/")}
+    found = {**result, "pieces": pieces}
+    if trials:
+        found["fuzz"] = fuzz.summary(trials)
+    return found
+
+
+def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Add pieces to results that are there already, without those made quickly.
+
+    Returns
+    -------
+    before, after : dict
+        The results at `path`. Under 'added' it says by which code and on which machine a piece was made, where that is
+        not what the others were made by.
+
+    Raises
+    ------
+    InputError
+        Quick results; a file that holds something else.
+    """
+    if result["made_by"]["quick"]:
+        raise InputError("these results are quick ones; run without --quick", item="into")
+    before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    if before.get("format") != FORMAT:
+        raise InputError(f"{path} has no results of the stability study", item="into")
+    made = {"made_by": result["made_by"], "environment": result["environment"]}
+    names = [name for name in result["pieces"] if not name.startswith("fuzz/")]
+    after = {
+        **before,
+        "pieces": {**before["pieces"], **{name: result["pieces"][name] for name in names}},
+        "added": {**before.get("added", {}), **dict.fromkeys(names, made)},
+    }
+    save(after, path)
+    return before, after

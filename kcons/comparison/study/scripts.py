@@ -1,0 +1,138 @@
+"""What scripts share that measure and print: calls timed in turn, tables, and the options by which they are run."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from time import process_time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kcons.comparison.study.machine import environment
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def in_turn(
+    calls: Mapping[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = process_time
+) -> dict[str, list[float]]:
+    """Seconds of each call, `repeats` times, one after the other: what disturbs the machine meets all of them.
+
+    Parameters
+    ----------
+    calls : mapping of name to callable
+    repeats : int
+    clock : callable, optional
+        Seconds; CPU time of this process by default.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            begun = clock()
+            call()
+            seconds[name].append(clock() - begun)
+    return seconds
+
+
+def ratio(first: Sequence[float], second: Sequence[float]) -> float:
+    """Median over the turns of first/second."""
+    return float(np.median(np.array(first) / np.array(second)))
+
+
+def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict[str, float]]:
+    """Median milliseconds of one of the `steps` of a call, and the speed relative to the first of them all.
+
+    Parameters
+    ----------
+    seconds : mapping of name to sequence of float
+        From `in_turn`.
+    steps : int
+    """
+    first = next(iter(seconds.values()))
+    return {
+        name: {"ms": 1e3 * float(np.median(found)) / steps, "ratio": ratio(first, found)}
+        for name, found in seconds.items()
+    }
+
+
+def table(
+    title: str, headings: Sequence[str], words: Collection[str] = (), rows: Iterable[Sequence[str]] = ()
+) -> Table:
+    """A table whose columns are numbers, but for those whose headings are in `words`.
+
+    Parameters
+    ----------
+    title : str
+    headings : sequence of str
+    words : collection of str, optional
+    rows : iterable of sequence of str, optional
+    """
+    from rich.table import Table
+
+    made = Table(title=title)
+    for heading in headings:
+        made.add_column(heading, justify="left" if heading in words else "right")
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def options(about: str | None, *, full: str) -> argparse.ArgumentParser:
+    """The parser of a script: ``--full`` (explained by `full`), ``--out`` and ``--show``."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help=full)
+    parser.add_argument("--out", type=Path, help="JSON file for the results")
+    parser.add_argument("--show", type=Path, help="print what an earlier result has and stop")
+    return parser
+
+
+def script(
+    parser: argparse.ArgumentParser,
+    measure: Callable[[argparse.Namespace], dict[str, Any]],
+    show: Callable[[dict[str, Any]], None],
+    arguments: Sequence[str] | None = None,
+) -> None:
+    """Measure, write the result as JSON and show it; with ``--show`` only show an earlier one.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        From `options`.
+    measure : callable
+        Gets what was chosen.
+    show : callable
+    arguments : sequence of str, optional
+        Those of the command line by default.
+    """
+    chosen = parser.parse_args(arguments)
+    if chosen.show:
+        show(json.loads(chosen.show.read_text(encoding="utf-8")))
+        return
+    result = measure(chosen)
+    if chosen.out:
+        chosen.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    show(result)
+
+
+def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick: bool) -> dict[str, Any]:
+    """A measurement that goes on from what the file `out` has, and is written to it after each of its parts.
+
+    Parameters
+    ----------
+    out : Path or None
+        None: from the beginning, and nothing is written.
+    measure : callable
+        Gets `quick`, `keep`, which takes what has been measured so far, and `earlier`, what the file has or None.
+    quick : bool
+    """
+
+    def keep(result: dict[str, Any]) -> None:
+        if out:
+            out.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n", encoding="utf-8")
+
+    earlier = json.loads(out.read_text(encoding="utf-8")) if out and out.exists() else None
+    return measure(quick=quick, keep=keep, earlier=earlier)

@@ -1,0 +1,10 @@
+"""Cost against error: measured, judged, shown.
+
+- `measurement`: what was found, as plain data
+- `timing_rounds`: times of steps that nobody looks at
+- `measure`: a test system run through methods
+- `fronts`: the Pareto front
+- `recommendation`: which method and step for a wanted error
+- `report`: table, plot and file of one comparison
+- `parts_of_the_whole`, `whole`, `whole_page`: all test systems at once
+"""

@@ -1,0 +1,460 @@
+"""Run a scene through methods and measure, for each, what error it makes for what cost.
+
+Every method starts from the same state with the same forces and is compared with the same reference
+solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded; with `rounds`,
+those of short runs are medians over rounds in which nobody looks on (`kcons.comparison.work_precision.timing_rounds`).
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from kcons.comparison.methods.method import Method, OverBudgetError, Run, first_line, interrupted_after
+from kcons.comparison.methods.methods import METHODS, chosen
+from kcons.comparison.scenes import Reference, Scene
+from kcons.comparison.scenes.potential import Potential
+from kcons.comparison.study.machine import environment, kernels_cached
+from kcons.comparison.work_precision import timing_rounds
+from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status, duration
+from kcons.comparison.work_precision.timing_rounds import Rounds
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle, State, System
+
+#: A first step below so many seconds, or this part of the budget, may be slow only because it is the first.
+FIRST_STEP_DOUBT, FIRST_STEP_SHARE = 0.5, 0.25
+
+#: A run is timed again if it takes at most this part of a method's budget, and so many seconds.
+REPEAT_SHARE, REPEAT_SECONDS = 0.2, 2.0
+#: Points at which the forces are timed, and for how many seconds at most.
+FORCE_POINTS, FORCE_SECONDS = 15, 0.5
+
+#: A host is interrupted within a step after so many budgets.
+PATIENCE = 3
+
+
+class Watcher:
+    """Told what is going on. This one keeps silent; the command line shows progress bars."""
+
+    def begin(self, what: str, total: float) -> None:
+        """A piece of work of `total` units starts."""
+
+    def advance(self, done: float) -> None:
+        """So much of it is done."""
+
+    def end(self) -> None:
+        """It is over."""
+
+    def overall(self, what: str, done: float, total: float) -> None:
+        """A part of something larger starts; of its `total` expected seconds `done` are over."""
+
+
+def compare(
+    scene: Scene,
+    *,
+    methods: Iterable[str] | None = None,
+    budget: float = 30.0,
+    watcher: Watcher | None = None,
+    settings: Mapping[str, Any] | None = None,
+    rounds: Rounds | None = None,
+    reference: Reference | None = None,
+) -> Comparison:
+    """Run `scene` through `methods`.
+
+    Parameters
+    ----------
+    scene : Scene
+    methods : iterable of str, optional
+        Names out of `kcons.comparison.methods.methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
+        ones for the scene.
+    budget : float
+        Seconds for each method over all its time steps. One that is predicted to exceed it is stopped
+        after a step, which is reported as such.
+    watcher : Watcher, optional
+    settings : mapping, optional
+        What else to record with the result.
+    rounds : Rounds, optional
+        Runs that are short enough are timed again in rounds, after all others; how well times repeat is then known.
+    reference : Reference, optional
+        If it is known.
+
+    Raises
+    ------
+    InputError
+        Unknown method; a budget that is not positive.
+    KconsError
+        If the reference solution cannot be computed.
+    """
+    if not budget > 0:
+        raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
+    picked = chosen(methods, scene)
+    if scene.openmm is not None:
+        scene.openmm.patience = budget
+    watching = watcher or Watcher()
+    watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
+    warm_up(scene, picked)
+    watching.advance(1)
+    watching.end()
+
+    if reference is None:
+        reference = reference_of(scene, watching)
+
+    measurements: list[Measurement] = []
+    for method in picked:
+        reason = method.refuses(scene)
+        if reason is not None:
+            measurements.append(Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason))
+            continue
+        measurements += _all_settings(scene, method, reference, budget, watching)
+    measurements, margin = timed_again(scene, measurements, reference, budget, rounds, watching)
+    unit = scene.units.time_unit
+    return Comparison(
+        scene={
+            "name": scene.name,
+            "title": scene.title,
+            "atoms": scene.n_atoms,
+            "rows": scene.motion.constraint_set.n_rows,
+            "rank": scene.motion.rank,
+            "degrees_of_freedom": scene.motion.degrees_of_freedom,
+            "horizon": scene.horizon / unit,
+            "units": {
+                "length": scene.units.length,
+                "energy": scene.units.energy,
+                "time": scene.units.time,
+                "long_time": scene.units.long_time,
+            },
+            "forces": scene.potential.name,
+            **({"error": "energy above the optimum"} if scene.shortfall is not None else {}),
+        },
+        reference={"how": reference.how, "error": reference.error},
+        settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {})},
+        remarks=list(dict.fromkeys(m.remark for m in picked if m.remark)),
+        environment=environment(),
+        measurements=measurements,
+        timing={
+            "force_seconds": force_seconds(scene),
+            "repeats": 0 if rounds is None else rounds.least,
+            "margin": margin,
+        },
+    )
+
+
+def reference_of(scene: Scene, watcher: Watcher) -> Reference:
+    """The reference solution, with its progress shown."""
+    watcher.begin("reference solution", 1)
+    try:
+        return scene.reference(lambda done, total: watcher.advance(done / total))
+    finally:
+        watcher.end()
+
+
+def force_seconds(scene: Scene) -> float:
+    """Median wall time of the scene's forces beyond that of a spring on one atom, which is that of a call of NumPy.
+
+    They take turns: a machine that slows down in between does it to both.
+    """
+    spring = Potential(lambda x: (0.5 * float(np.sum(x * x)), -x), "one spring")
+    both = ((scene.potential, scene.positions), (spring, np.ones((1, 3))))
+    for potential, x in both:
+        potential.watched_energy(x)
+        potential.forget()
+    found: list[float] = []
+    spent = 0.0
+    while len(found) < FORCE_POINTS and spent < FORCE_SECONDS:
+        times = []
+        for potential, x in both:
+            begun = perf_counter()
+            potential.watched_energy(x)
+            times.append(perf_counter() - begun)
+        spent += sum(times)
+        found.append(times[0] - times[1])
+    return max(0.0, float(np.median(found)))
+
+
+def measure(
+    scene: Scene,
+    method: Method,
+    setting: float,
+    reference: Reference,
+    budget: float,
+    watcher: Watcher | None = None,
+    *,
+    watched: bool = True,
+) -> Measurement:
+    """One method at one setting, a time step in internal units or a tolerance; `warm_up` comes first.
+
+    Parameters
+    ----------
+    scene : Scene
+    method : Method
+    setting : float
+    reference : Reference
+    budget : float
+        Seconds.
+    watcher : Watcher, optional
+    watched : bool
+        Whether the constraints' part is timed, which costs a little.
+    """
+    watching = watcher or Watcher()
+    shown = setting if method.adaptive else setting / scene.units.time_unit
+    planned = None if method.adaptive else round(scene.horizon / setting)
+    common: dict[str, Any] = dict(
+        method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
+    )
+    watching.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
+    try:
+        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common, watched)
+    finally:
+        watching.end()
+
+
+def timed_again(
+    scene: Scene,
+    measurements: list[Measurement],
+    reference: Reference,
+    budget: float,
+    rounds: Rounds | None,
+    watcher: Watcher | None = None,
+) -> tuple[list[Measurement], float | None]:
+    """Times of short runs from rounds that nobody observes, and how well they repeat (`kcons.comparison.work_precision.timing_rounds`).
+
+    Parameters
+    ----------
+    scene : Scene
+    measurements : list of Measurement
+    reference : Reference
+    budget : float
+        Seconds for each method.
+    rounds : Rounds or None
+        None: everything stays as it is.
+    watcher : Watcher, optional
+
+    Returns
+    -------
+    measurements : list of Measurement
+    margin : float or None
+        See `kcons.comparison.work_precision.timing_rounds.margin`.
+    """
+    if rounds is None:
+        return measurements, None
+    watching = watcher or Watcher()
+    watching.begin("times of short runs, in rounds", rounds.most)
+    try:
+        return timing_rounds.timed(
+            scene,
+            measurements,
+            METHODS,
+            rounds,
+            limit=min(REPEAT_SHARE * budget, REPEAT_SECONDS),
+            patience=PATIENCE * budget,
+            whole=lambda method, setting: measure(scene, method, setting, reference, budget, watched=False),
+            told=watching.advance,
+        )
+    finally:
+        watching.end()
+
+
+def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
+    """Compile or load every kernel that the scene and these methods need, outside of any timing."""
+    motion = scene.motion
+    x, v = scene.positions, scene.velocities
+    f = scene.potential.forces(x)
+    Rattle().step(System(motion, scene.potential.forces), State(x, v), min(scene.time_steps))
+    motion.acceleration(x, v, f)
+    motion.project_forces(x, f)
+    for method in methods:
+        if method.refuses(scene) is None:
+            with suppress(Exception):  # what goes wrong is shown where it is measured
+                method.warm_up(scene)
+
+
+# -- one method -------------------------------------------------------------------------------------
+
+
+def _all_settings(
+    scene: Scene, method: Method, reference: Reference, budget: float, watcher: Watcher
+) -> list[Measurement]:
+    found: list[Measurement] = []
+    begun = perf_counter()
+    given_up: Measurement | None = None
+    for setting in method.settings(scene):
+        shown = setting if method.adaptive else setting / scene.units.time_unit
+        planned = None if method.adaptive else round(scene.horizon / setting)
+        common: dict[str, Any] = dict(
+            method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
+        )
+        if found and perf_counter() - begun > budget:
+            note = f"the budget of {budget:g} s is used up"
+            found.append(Measurement(status="not run", note=note, **common))
+            continue
+        last = given_up or (found[-1] if found else None)
+        if last is not None and last.step_seconds is not None:
+            # A tighter tolerance takes at least as many steps as a looser one.
+            left = budget - (perf_counter() - begun)
+            if given_up is not None or last.step_seconds * (planned or last.steps) > left:
+                given_up = last
+                found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
+                continue
+        watcher.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
+        found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher, common))
+        watcher.end()
+        if found[-1].status == "not run":  # it cannot run this scene at any step
+            break
+        if found[-1].status == "partial":
+            given_up = found[-1]
+            if given_up.step_seconds is None:  # not one step was done: no use in trying shorter ones
+                break
+    return found
+
+
+@dataclass
+class _Log:
+    """What is written down at every advance: by one step, or by several of a host that runs by itself."""
+
+    times: list[float] = field(default_factory=list)
+    energies: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    constraints: list[float] = field(default_factory=list)
+    evaluations: int = 0
+    steps: int = 0
+
+
+def _measure(
+    scene: Scene,
+    method: Method,
+    setting: float,
+    reference: Reference,
+    budget: float,
+    deadline: float,
+    watcher: Watcher,
+    common: dict[str, Any],
+    watched: bool = True,
+) -> Measurement:
+    log = _Log()
+    note = ""
+    status: Status = "ok"
+    run: Run | None = None
+    begun = perf_counter()
+    setup = None
+    scene.potential.forget()
+    try:
+        with interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
+            run = method.start(scene, setting)
+            setup = perf_counter() - begun
+            if not watched:
+                run.constraints.release()
+            note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, watcher)
+            status = "partial" if note else "ok"
+    except OverBudgetError:
+        status = "partial"
+        note = f"step {log.steps + 1} was not done after {duration(perf_counter() - begun)}"
+    except UnsupportedError as error:
+        return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
+    except Exception as error:  # whatever a peer raises is a result, and is shown
+        status = "failed"
+        note = f"step {log.steps + 1}: {first_line(error)}"
+    common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
+    if run is None or not log.seconds:
+        return Measurement(status=status, note=note, **common)
+    if not method.holds:
+        return Measurement(status="floor" if status == "ok" else status, note=note, **common)
+    x, v = run.positions, run.velocities
+    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
+        return Measurement(status="failed", note="positions are not finite", **common)
+    sigma, tangency = scene.residuals(x, v, run.time)
+    if not method.follows:
+        shown: Status = "thermostat" if status == "ok" else status
+        return Measurement(status=shown, note=note, constraint_residual=sigma, velocity_residual=tangency, **common)
+    slope, slope_error = _energy_slope(scene, log)
+    return Measurement(
+        status=status,
+        note=note,
+        error=scene.deviation(x, reference.positions) if status == "ok" else None,
+        constraint_residual=sigma,
+        velocity_residual=tangency,
+        energy_slope=slope,
+        energy_slope_error=slope_error,
+        **common,
+    )
+
+
+def _run_to_horizon(
+    scene: Scene, run: Run, holds: bool, log: _Log, budget: float, deadline: float, watcher: Watcher
+) -> str:
+    """Advance to the horizon; the reason if it was given up for the budget."""
+    potential, masses = scene.potential, scene.masses[:, None]
+
+    def write_down() -> None:
+        log.times.append(run.time)
+        energy = run.own_energy()
+        if energy is None:
+            v = run.velocities
+            energy = potential.watched_energy(run.positions) + 0.5 * float(np.sum(masses * v * v))
+        log.energies.append(energy)
+
+    def evaluations_so_far() -> int:
+        own = run.own_evaluations()
+        return potential.evaluations if own is None else own
+
+    write_down()
+    while not run.finished:
+        if not holds:
+            run.rewind()
+        evaluations, held = evaluations_so_far(), run.constraints.seconds
+        start = perf_counter()
+        run.advance()
+        now = perf_counter()
+        log.seconds.append((now - start) / run.steps)
+        log.constraints.append((run.constraints.seconds - held) / run.steps)
+        log.evaluations += evaluations_so_far() - evaluations
+        log.steps += run.steps
+        write_down()
+        watcher.advance(run.time)
+        if run.finished:
+            break
+        first = len(log.seconds) == 1
+        to_go = run.steps * (scene.horizon - run.time) / (run.time - log.times[-2])
+        doubtful = first and log.seconds[0] < max(FIRST_STEP_DOUBT, FIRST_STEP_SHARE * budget)
+        if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
+            return _too_slow(log.seconds[-1], budget)
+    return ""
+
+
+def _too_slow(step_seconds: float, budget: float) -> str:
+    return f"at {duration(step_seconds)} a step, the steps to the horizon exceed the budget of {budget:.3g} s"
+
+
+def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str, float | None]:
+    if run is None or not log.seconds or run.time <= 0:
+        return {}
+    # The first step pays for what a host sets up lazily.
+    counted = slice(1, None) if len(log.seconds) > 1 else slice(None)
+    run.constraints.release()
+    step = run.own_step_seconds() or float(np.median(log.seconds[counted]))
+    elapsed = run.time / scene.units.long_time_unit
+    return {
+        "step_seconds": step,
+        "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds and run.divided else None,
+        "evaluations_per_time": log.evaluations / elapsed,
+        "seconds_per_time": step * log.steps / elapsed,
+    }
+
+
+def _energy_slope(scene: Scene, log: _Log) -> tuple[float | None, float | None]:
+    """Least-squares slope of the energy and its standard error, a degree of freedom and `long_time`."""
+    if len(log.times) < 4:
+        return None, None
+    if not np.all(np.isfinite(log.energies)):
+        return None, None
+    t = np.array(log.times) / scene.units.long_time_unit
+    e = np.array(log.energies) / max(scene.motion.degrees_of_freedom, 1)
+    t, e = t - t.mean(), e - e.mean()
+    slope = float(t @ e / (t @ t))
+    left_over = float(np.sum((e - slope * t) ** 2))
+    return slope, float(np.sqrt(left_over / (len(t) - 2) / (t @ t)))

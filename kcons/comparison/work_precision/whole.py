@@ -1,0 +1,294 @@
+"""The whole comparison: every scene through every method, into one folder and one page.
+
+What is measured is written after every part, and is not measured again while code, scene and settings stay the same:
+an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from kcons import __version__
+from kcons.comparison import scenes
+from kcons.comparison.methods.methods import METHODS
+from kcons.comparison.scenes import Scene
+from kcons.comparison.study.machine import code_digest, environment
+from kcons.comparison.work_precision import whole_page
+from kcons.comparison.work_precision.measure import Watcher, compare, reference_of
+from kcons.comparison.work_precision.measurement import Comparison
+from kcons.comparison.work_precision.parts_of_the_whole import PLAN, Item
+from kcons.comparison.work_precision.recommendation import sharpen
+from kcons.comparison.work_precision.timing_rounds import FULL_ROUNDS, QUICK_ROUNDS
+from kcons.errors import InputError, KconsError
+
+FORMAT = "kcons-report-1"
+#: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
+QUICK_SECONDS = 280.0
+
+
+def run(
+    items: Sequence[Item],
+    folder: Path,
+    *,
+    quick: bool = False,
+    fresh: bool = False,
+    watcher: Watcher | None = None,
+    limit: float | None = None,
+) -> Path:
+    """Measure what is not there yet, and draw everything that is.
+
+    Parameters
+    ----------
+    items : sequence of Item
+    folder : path
+    quick : bool
+        Smaller scenes, short budgets, large scenes left out; five minutes in all.
+    fresh : bool
+        Measure again what is there.
+    watcher : Watcher, optional
+    limit : float, optional
+        Seconds after which nothing more is begun; by default those of a quick run, otherwise none.
+
+    Returns
+    -------
+    path : Path
+        The page.
+    """
+    watching = watcher or Watcher()
+    limit = QUICK_SECONDS if quick and limit is None else limit
+    begun = time.perf_counter()
+    expected = {item.key: item.quick_seconds if quick else item.seconds for item in items}
+    pending = []
+    for item in items:
+        old = read(folder, item.key)
+        unfinished = old is None or "failed" in old or "unfinished" in old
+        if not fresh and old is not None and old["key"] == key_of(item, quick) and not unfinished:
+            watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
+            expected.pop(item.key)
+        else:
+            pending.append(item)
+    done = spent = 0.0
+    try:
+        for number, item in enumerate(pending, 1):
+            elapsed = time.perf_counter() - begun
+            pace = spent / done if done else 1.0
+            left = pace * sum(expected[i.key] for i in pending[number - 1 :] if not _excluded(i, quick))
+            watching.overall(f"{number} of {len(pending)}: {item.heading}", elapsed, elapsed + left)
+            share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
+            started = time.perf_counter()
+            found = _part(item, quick, share, watching, folder, fresh)
+            _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
+            if "seconds" in found:
+                done += expected[item.key]
+                spent += time.perf_counter() - started
+            gc.collect()
+    finally:
+        # An interrupted run has a page, too, and it shows whatever is in the folder.
+        path = _page(folder)
+    return path
+
+
+def key_of(item: Item, quick: bool) -> dict[str, Any]:
+    """What a measurement depends on: code, scene, settings."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(item)))
+    for name in ("heading", "seconds", "quick_seconds"):
+        plain.pop(name)
+    return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
+
+
+def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
+    """Measure one part; what keeps it from being measured is its result."""
+    reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
+    if reason:
+        return {"not run": reason, "environment": environment()}
+    begun = time.perf_counter()
+    try:
+        if item.module:
+            found = {"result": _by_module(item, quick, watcher, folder, fresh)}
+        else:
+            found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
+    except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
+        return {"failed": f"{type(error).__name__}: {error}", "environment": environment()}
+    return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
+
+
+def _by_module(item: Item, quick: bool, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
+    """A part with a module of its own; what it has measured is kept from time to time."""
+    head = {"format": FORMAT, "key": key_of(item, quick), "unfinished": True}
+    old = None if fresh else read(folder, item.key)
+    earlier = old["result"] if old is not None and "result" in old and old["key"] == head["key"] else None
+
+    def keep(result: dict[str, Any]) -> None:
+        _put(folder, item, {**head, "result": result, "environment": environment()})
+
+    result: dict[str, Any] = import_module(item.module).measure(
+        quick=quick, keep=keep, watcher=watcher, earlier=earlier
+    )
+    return result
+
+
+def _excluded(item: Item, quick: bool) -> str:
+    """Why a part is not measured here; '' if it is."""
+    if quick and not item.quick_seconds:
+        return "in the full run only"
+    if item.module and find_spec(item.module) is None:
+        return f"this version of kcons has no {item.module}"
+    if item.scene and item.scene not in scenes.SCENES:
+        return f"this version of kcons has no scene {item.scene!r}"
+    if item.needs and find_spec(item.needs) is None:
+        return f"{item.needs} is not installed; python -m pip install {item.needs}"
+    return ""
+
+
+def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
+    watcher.begin("building the scene", 1)
+    scene = scene_of(item, quick)
+    watcher.end()
+    budget = (item.quick_seconds / 12 if quick else item.budget) * share
+    names, left_out = methods_of(item, scene, quick)
+    reference = reference_of(scene, watcher)
+    rounds = QUICK_ROUNDS if quick else FULL_ROUNDS
+    found = compare(
+        scene,
+        methods=names,
+        budget=budget,
+        watcher=watcher,
+        reference=reference,
+        rounds=rounds,
+        settings={"part": item.key, "quick": quick},
+    )
+    reasons = dict.fromkeys(left_out.values())
+    remarks = [f"not run: {', '.join(n for n in left_out if left_out[n] == why)} ({why})" for why in reasons]
+    found = replace(found, remarks=[*found.remarks, *remarks])
+    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher, rounds=rounds)
+
+
+def scene_of(item: Item, quick: bool) -> Scene:
+    """The scene of a part."""
+    size = item.quick_size if quick and item.quick_size is not None else item.size
+    scene = scenes.build(item.scene, size, quick=quick, **item.options)
+    if item.steps is not None and not quick:
+        scene = scene.with_time_steps(item.steps)
+    return scene if item.pace is None else replace(scene, reference_pace=item.pace)
+
+
+def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[str, str]]:
+    """Names of the methods that run, and of those that are left out though they could, with the reasons.
+
+    All steppers of kcons on arrays, in a quick run the usual ones; of other hosts the usual ones, those that refuse
+    with their reasons; of OpenMM and of guests those that can run the scene.
+    """
+    kept: list[str] = []
+    out: dict[str, str] = {}
+    for method in METHODS.values():
+        usual = method.usual or (not quick and method.host == "kcons")
+        guest = method.guest or method.host == "openmm"
+        if not usual or not method.follows or (guest and method.refuses(scene) is not None):
+            continue
+        why = next((why for beginning, why in item.without.items() if method.name.startswith(beginning)), None)
+        if why is None:
+            kept.append(method.name)
+        else:
+            out[method.name] = why
+    return kept, out
+
+
+# -- files ------------------------------------------------------------------------------------------
+
+
+def read(folder: Path, key: str) -> dict[str, Any] | None:
+    """What was measured of a part; None where there is nothing that can be read."""
+    try:
+        data: dict[str, Any] = json.loads((folder / f"{key}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return unpacked(data) if data.get("format") == FORMAT else None
+
+
+def _put(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
+    # Aside and then into place: a run that is interrupted leaves no half of a file.
+    path = folder / f"{item.key}.json"
+    beside = path.with_suffix(".part")
+    beside.write_text(packed(found), encoding="utf-8")
+    beside.replace(path)
+
+
+def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
+    _put(folder, item, found)
+    whole_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
+
+
+def packed(found: Mapping[str, Any]) -> str:
+    """JSON, four digits, measurements one a line under the names of their columns."""
+    data = _slim(found)
+    lines: list[str] = []
+    if "comparison" in data:
+        measurements = found["comparison"]["measurements"]
+        columns = list(measurements[0]) if measurements else []
+        rows = [[_slim(m[name]) for name in columns] for m in measurements]
+        lines = [json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows]
+        data["comparison"] = {**data["comparison"], "columns": columns, "measurements": "ROWS"}
+    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+    return text.replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]") + "\n"
+
+
+def unpacked(data: dict[str, Any]) -> dict[str, Any]:
+    """What `packed` made, as it was."""
+    if "comparison" not in data:
+        return data
+    comparison = dict(data["comparison"])
+    columns = comparison.pop("columns")
+    comparison["measurements"] = [
+        {name: value for name, value in zip(columns, row, strict=True) if value is not None}
+        for row in comparison["measurements"]
+    ]
+    return {**data, "comparison": comparison}
+
+
+def _slim(value: Any) -> Any:
+    from kcons.comparison.work_precision.report import plain
+
+    value = plain(value)
+    if isinstance(value, dict):
+        return {key: _slim(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_slim(item) for item in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+def redraw(folder: Path, into: Path | None = None) -> list[Path]:
+    """Pictures, tables and the page from the numbers in a folder; the table of winners goes `into` a page, too.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    found = [(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+    if not found:
+        raise InputError(f"there are no results of kcons compare --all in {folder}", item="redraw")
+    made = [
+        path
+        for item, data in found
+        for path in whole_page.write_part(folder, item.key, item.heading, item.module, data)
+    ]
+    filled = [] if into is None else whole_page.fill(into, parts(folder))
+    return [_page(folder), *made, *filled]
+
+
+def parts(folder: Path) -> list[whole_page.Part]:
+    """All parts that are in a folder, in the order of the plan."""
+    found = ((item, read(folder, item.key)) for item in PLAN)
+    return [whole_page.Part(i.key, i.heading, i.module, data) for i, data in found if data is not None]
+
+
+def _page(folder: Path) -> Path:
+    return whole_page.write(folder / "index.html", parts(folder))

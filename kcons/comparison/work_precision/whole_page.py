@@ -1,0 +1,300 @@
+"""The page of the whole comparison, and the picture and the table of each of its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kcons.comparison.study import html_page
+from kcons.comparison.study.html_page import PageTable, Section
+from kcons.comparison.work_precision import report
+from kcons.comparison.work_precision.fronts import (
+    COSTS,
+    EVERY_HOST,
+    LEAST_MARGIN,
+    NO_FORCE,
+    overtaken,
+    summary,
+    verdict,
+)
+from kcons.comparison.work_precision.measurement import Comparison, duration
+from kcons.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TITLE = "Constraints in molecular dynamics: error against cost"
+
+INTRODUCTION = (
+    "Every scene is run through every method that can run it: the same start, the same forces, the same reference "
+    "solution at the same moment, so early that chaos has not begun to decide. Each point is one method at one time "
+    "step or tolerance, after kernels were compiled, on one thread; times are medians over steps. Every method has its "
+    "own best settings: steps of high-order methods are longer, tolerances of hosts are varied.",
+    "Fronts are drawn for each host, whose methods share forces and overhead: plain arrays, ASE, OpenMM. A "
+    "point is on the front if no other one of its host is both cheaper and more accurate. Across hosts, force "
+    f"evaluations can be compared. Where forces take less than {1e6 * NO_FORCE:g} µs beyond the call from Python, "
+    "evaluations decide and wall time stands beside.",
+)
+
+WINNERS_NOTE = (
+    "gain: how many times cheaper the best method of kcons is than the cheapest other one, at the error of a point of "
+    "that one, where the ratio is largest. Between points of one method, logarithms are interpolated. A method "
+    f"is ahead beyond the margin of the timings, to which times repeat, and by {100 * LEAST_MARGIN:g} % at least."
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part and what was measured of it, as read from its file."""
+
+    key: str
+    heading: str
+    module: str
+    data: Mapping[str, Any]
+
+
+def write(path: Path, parts: Sequence[Part]) -> Path:
+    """The page of all parts."""
+    sentences, close = _lost_and_won(parts)
+    sections = [
+        Section("Where and with what", tables=[_machines(parts)]),
+        Section("Who wins where", [WINNERS_NOTE, *sentences, *close], tables=[winners(parts)]),
+        *(_section(part) for part in parts),
+    ]
+    return html_page.write(path, TITLE, sections, introduction=INTRODUCTION)
+
+
+def write_part(folder: Path, key: str, heading: str, module: str, data: Mapping[str, Any]) -> list[Path]:
+    """Picture and table of one part, as far as there is something to show; the paths written."""
+    part = Part(key, heading, module, data)
+    figure, table, text = shown(part)
+    written = []
+    if figure is not None:
+        figure.savefig(folder / f"{key}.png", dpi=150)
+        written.append(folder / f"{key}.png")
+    if table is not None:
+        (folder / f"{key}.txt").write_text(f"{heading}\n\n{plain_text(table)}\n{text}\n", encoding="utf-8")
+        written.append(folder / f"{key}.txt")
+    return written
+
+
+def shown(part: Part) -> tuple[Figure | None, PageTable | None, str]:
+    """Figure, table and explanation of a part; nothing where nothing was measured."""
+    if "comparison" in part.data:
+        found = Comparison.from_dict(part.data["comparison"])
+        return report.figure(found), report.page_table(found), report.explanation(found)
+    if "result" in part.data and find_spec(part.module) is not None:
+        module = import_module(part.module)
+        return module.figure(part.data["result"]), module.table(part.data["result"]), ""
+    return None, None, ""
+
+
+def _section(part: Part) -> Section:
+    for word in ("not run", "failed"):
+        if word in part.data:
+            return Section(part.heading, [f"{word}: {part.data[word]}"])
+    figure, table, text = shown(part)
+    if figure is None or table is None:
+        return Section(part.heading, ["this version of kcons cannot show it"])
+    notes: list[str] = []
+    if "comparison" in part.data:
+        notes = _notes(Comparison.from_dict(part.data["comparison"]))
+    return Section(part.heading, notes, [figure], [table], text)
+
+
+def _notes(found: Comparison) -> list[str]:
+    judged = verdict(found)
+    scene, timing = found.scene, found.timing
+    forces = timing.get("force_seconds")
+    margin = timing.get("margin")
+    lines = [
+        f"{scene['title']}. {scene['atoms']} atoms, {scene['rows']} rows of rank {scene['rank']}, "
+        f"{scene['degrees_of_freedom']} degrees of freedom; horizon {scene['horizon']:g} {scene['units']['time']}.",
+        f"Decided by {COSTS[judged.decides][1]}"
+        + (f": forces take {duration(forces)} beyond the call" if forces is not None else "")
+        + (f"; times of short runs repeat to within {100 * margin:.0f} %" if margin is not None else "")
+        + ".",
+        *(
+            f"{host} has forces of its own, and takes less than a microsecond for a step with nothing held: there "
+            "force evaluations decide."
+            for host in sorted(judged.without_forces)
+        ),
+    ]
+    for row in summary(found):
+        if not row["rivals"]:
+            continue
+        lost = "; ".join(row["losses"])
+        beside = "; ".join(row["beside"])
+        text = f"{row['host'].capitalize() if row['host'] == 'arrays' else row['host']}, {row['cost']}: "
+        text += f"ahead of kcons: {lost}." if lost else "no other method is ahead of kcons at any error."
+        lines.append(text + (f" Beside, in the other cost: {beside}." if beside else ""))
+    return lines
+
+
+def _machines(parts: Sequence[Part]) -> PageTable:
+    """Every machine, version and commit that measured a part, as a rule one."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for part in parts:
+        environment = part.data.get("environment")
+        if environment is None:
+            continue
+        versions = ", ".join(f"{name} {value}" for name, value in environment["versions"].items() if value)
+        processor = f"{environment['cpu']}, {environment['cores']} cores, {environment['threads']} thread used"
+        what = "quick" if part.data["key"]["quick"] else "full"
+        commit = environment["commit"] or "not from a repository"
+        row = (processor, f"{environment['system']}, Python {environment['python']}", versions, commit, what)
+        rows.setdefault(row, []).append(environment["date"])
+    headings = ["processor", "system", "versions", "commit", "run", "parts", "from", "to"]
+    cells = [[*row, str(len(dates)), min(dates), max(dates)] for row, dates in rows.items()]
+    return PageTable(headings, cells, text_columns=(0, 1, 2, 3, 4, 6, 7))
+
+
+def winners(parts: Sequence[Part]) -> PageTable:
+    """Who wins where: a line for each scene and host with a method of kcons and another one."""
+    headings = [
+        "scene",
+        "host",
+        "decided by",
+        "times repeat to",
+        "gain",
+        "at an error of",
+        "ahead of kcons",
+        "of",
+        "over",
+    ]
+    headings += ["ahead in the other cost", "on the front"]
+    rows: list[list[str]] = []
+    marks: list[str] = []
+    for part in parts:
+        if "comparison" not in part.data:
+            continue
+        found = Comparison.from_dict(part.data["comparison"])
+        length = found.scene["units"]["length"]
+        margin = found.timing.get("margin")
+        for row in summary(found):
+            if not row["rivals"]:
+                continue
+            gain = row["gain"]
+            by_time = row["cost"] == COSTS["wall"][1]
+            rows.append(
+                [
+                    *(part.heading, row["host"], row["cost"]),
+                    f"{100 * margin:.0f} %" if by_time and margin is not None else "",
+                    "" if gain is None else factor(gain),
+                    "" if gain is None else f"{row['gain_error']:.0e} {length}",
+                    row["lost"] or "none",
+                    *(row["ours"] or "", row["rival"] or ""),
+                    row["lost_beside"] or ("" if row["host"] == EVERY_HOST else "none"),
+                    ", ".join(row["front"]),
+                ]
+            )
+            marks.append("bad" if row["losses"] else "good")
+    return PageTable(headings, rows, text_columns=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
+
+
+#: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
+BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+PICTURES = (
+    *("dumbbells", "rotor", "water-216", "chain-1e3", "alanine-allbonds", "dhfr-allbonds", "ethanol"),
+    *("solver-precision", "scaling"),
+)
+#: Columns of the table of winners that go there.
+SHORT = (0, 1, 2, 3, 4, 5, 6)
+
+
+def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
+    """Put the table of winners and some figures between the marks of a page in Markdown; the paths written.
+
+    Raises
+    ------
+    InputError
+        The page has no marks.
+    """
+    text = path.read_text(encoding="utf-8")
+    if BEGIN not in text or END not in text:
+        raise InputError(f"{path} has no place for results, {BEGIN} and {END}", item="into")
+    before, after = text.split(BEGIN)[0], text.split(END)[1]
+    (path.parent / "figures").mkdir(exist_ok=True)
+    written = [path]
+    pictures = []
+    for part in parts:
+        figure = shown(part)[0] if part.key in PICTURES else None
+        if figure is not None:
+            target = path.parent / "figures" / f"report-{part.key}.png"
+            figure.savefig(target, dpi=75)
+            pictures.append(f"![{part.heading}](figures/{target.name})")
+            written.append(target)
+    path.write_text(f"{before}{BEGIN}\n{results(parts)}\n" + "\n".join(pictures) + f"\n{END}{after}", encoding="utf-8")
+    return written
+
+
+def results(parts: Sequence[Part]) -> str:
+    """The table of winners in Markdown, with where and with what it was measured."""
+    machines = _machines(parts)
+    where = [f"{row[0]}; {row[2]}; commit {row[3]}; {row[4]} run, {row[6]} to {row[7]}." for row in machines.rows]
+    sentences, close = _lost_and_won(parts)
+    listed = ["\n".join(f"- {line}" for line in close)] if close else []
+    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts), SHORT), ""])
+
+
+def factor(ratio: float) -> str:
+    """'12 ×', two digits."""
+    return f"{ratio:.2g} ×" if ratio < 100 else f"{ratio:,.0f} ×" if ratio < 1e5 else f"{ratio:.0e} ×"
+
+
+def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
+    """Sentences on all lines of the table, and those lines in which others are close."""
+    compared = [
+        (part.heading, Comparison.from_dict(part.data["comparison"])) for part in parts if "comparison" in part.data
+    ]
+    judged = [row for _, found in compared for row in summary(found) if row["rivals"]]
+    if not judged:
+        return ["No scene has both a method of kcons and another one yet."], []
+    won = sum(not row["losses"] for row in judged)
+    both = sum(bool(pairs) for _, found in compared for pairs in overtaken(found).values())
+    close = [
+        f"{heading}: {row['lost']}"
+        for heading, found in compared
+        for known, row in zip(summary(found), summary(_at_least_margin(found)), strict=True)
+        if row["rivals"] and row["losses"] and not known["losses"]
+    ]
+    percent = f"{100 * LEAST_MARGIN:g} %"
+    return [
+        f"In {len(judged) - both} of {len(judged)} lines of this table no other method is both cheaper and more "
+        f"accurate, by more than {percent} each, than a point on kcons' own front. At the same error, and beyond the "
+        f"margin to which times repeat, no other method is cheaper than kcons in {won} of them.",
+        f"Within that margin, another method measured more than {percent} cheaper at the same error somewhere in "
+        f"{len(close)} lines: ties at best, not wins." + (" These are:" if close else ""),
+    ], close
+
+
+def _at_least_margin(found: Comparison) -> Comparison:
+    """The same, as if times repeated to within `LEAST_MARGIN`."""
+    return replace(found, timing={**found.timing, "margin": None})
+
+
+def plain_text(table: PageTable) -> str:
+    """The table in columns of characters."""
+    rows = [list(table.headings), *[list(row) for row in table.rows]]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(table.headings))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = (
+            cell.ljust(width) if k in table.text_columns else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        )
+        return "  ".join(padded).rstrip()
+
+    return "\n".join(line(row) for row in rows)
+
+
+def markdown(table: PageTable, columns: Sequence[int]) -> str:
+    """Some columns of a table as a table of Markdown, for the documentation."""
+    heads = [table.headings[k] for k in columns]
+    ruler = ["---" if k in table.text_columns else "---:" for k in columns]
+    lines = [heads, ruler, *([row[k].replace("|", "\\|") for k in columns] for row in table.rows)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
