@@ -25,13 +25,13 @@ from typing import Any
 import openmm
 from rich.console import Console
 
+from kcons.cli.progress import Bars
 from kcons.comparison import scenes
 from kcons.comparison.scenes import Scene
 from kcons.comparison.study import scripts
 from kcons.comparison.work_precision import measure, report
 from kcons.comparison.work_precision.measure import Comparison, Measurement
 from kcons.openmm import ProjectedIntegrator, hold
-from kcons.progress import Bars
 
 #: Scenes, the errors in Å that they are asked for, and steps a turn.
 FULL = {"alanine": (1e-3, 1e-5, 1e-7), "dhfr": (1e-3, 1e-4, 1e-5), "villin": (1e-3, 1e-4, 2e-5)}

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from kcons import cli
+from kcons.cli import main
 
 needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 
 
 def run(*arguments):
-    return cli.main([str(a) for a in arguments])
+    return main.main([str(a) for a in arguments])
 
 
 def test_compare_writes_table_plot_and_json(tmp_path, capsys):
@@ -163,7 +163,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_scene", stop)
+    monkeypatch.setattr(main, "_scene", stop)
     assert run("plan", "chain") == 130
     assert capsys.readouterr().err == "kcons: interrupted\n"
 

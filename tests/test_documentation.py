@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from kcons import cli, projection
+from kcons import projection
+from kcons.cli import main
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
@@ -59,7 +60,7 @@ def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
     for command in commands:
         program, *arguments = shlex.split(command, comments=True)
         assert program == "kcons", f"only kcons commands can be tested, not {command!r}"
-        assert cli.main(arguments) == 0, capsys.readouterr().err
+        assert main.main(arguments) == 0, capsys.readouterr().err
 
 
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)

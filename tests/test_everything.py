@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from kcons import cli
+from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
 from kcons.comparison.work_precision import parts_of_the_whole, timing_rounds, whole, whole_page
@@ -250,7 +250,7 @@ def test_a_scene_that_cannot_be_built_is_a_failure_and_is_tried_again(tmp_path):
 def test_redraw_makes_the_same_page_from_the_numbers(finished, tmp_path, capsys):
     for path in finished.glob("*.json"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    assert cli.main(["compare", "--all", "--redraw", str(tmp_path)]) == 0
+    assert main.main(["compare", "--all", "--redraw", str(tmp_path)]) == 0
     assert f"wrote {tmp_path / 'index.html'}" in capsys.readouterr().out
     texts = []
     for folder in (finished, tmp_path):
@@ -262,11 +262,11 @@ def test_redraw_makes_the_same_page_from_the_numbers(finished, tmp_path, capsys)
 
 
 def test_command(tmp_path, capsys):
-    assert cli.main(["compare", "--all", "--only", "sphere", "--out", str(tmp_path / "o")]) == 0
+    assert main.main(["compare", "--all", "--only", "sphere", "--out", str(tmp_path / "o")]) == 0
     printed = capsys.readouterr()
     assert "index.html" in printed.out
     assert "1 of 1: Spheres; about 1.00 s left" in printed.err
-    assert cli.main(["compare", "--all", "--list"]) == 0
+    assert main.main(["compare", "--all", "--list"]) == 0
     assert "chain-3" in capsys.readouterr().out
 
 
@@ -280,7 +280,7 @@ def test_command(tmp_path, capsys):
 )
 def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(arguments) == 2
+    assert main.main(arguments) == 2
     assert text in capsys.readouterr().err
 
 

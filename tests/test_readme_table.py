@@ -4,9 +4,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+from kcons.cli.terminal import rendered
 from kcons.comparison.work_precision import report
 from kcons.comparison.work_precision.measurement import Comparison
-from kcons.terminal import rendered
 
 ROOT = Path(__file__).parents[1]
 SHOWN = ("rattle", "suzuki4", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcons import cli
+from kcons.cli import main
 from kcons.comparison.stability import SCENES, attempt, drift, fuzz, largest_step, pages, put_into, reversal, run, trial
 from kcons.comparison.stability.runs import Copies
 from kcons.errors import InputError
@@ -96,7 +96,7 @@ def test_study_goes_on(tmp_path, monkeypatch):
 
 def test_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(fuzz, "trial", lambda seed: fuzz.Trial(seed, "tree", "solved"))
-    assert cli.main(["stability", "--quick", "--only", "fuzz", "--out", str(tmp_path)]) == 0
+    assert main.main(["stability", "--quick", "--only", "fuzz", "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "300 random molecules" in shown and "stability.html" in shown
 

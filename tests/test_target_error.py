@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons import cli
+from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.methods import methods, snippets
 from kcons.comparison.work_precision import measure, recommendation
@@ -249,7 +249,7 @@ def test_command(tmp_path, capsys):
         "--target-error",
         "1e-5",
     ]
-    assert cli.main([*arguments, "--out", str(out)]) == 0
+    assert main.main([*arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "For an error of at most 1e-05 R at 2 τ" in printed
     entry = json.loads((out / "compare.json").read_text(encoding="utf-8"))["recommendation"]
@@ -268,5 +268,5 @@ def test_command(tmp_path, capsys):
 )
 def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(arguments) == 2
+    assert main.main(arguments) == 2
     assert text in capsys.readouterr().err

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from kcons.terminal import patient_streams
+from kcons.cli.terminal import patient_streams
 
 C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
 

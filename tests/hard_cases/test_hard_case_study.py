@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from kcons import cli
+from kcons.cli import main
 from kcons.comparison.hard_cases import chosen, load, pages, run
 from kcons.comparison.hard_cases.worker import Worker
 from kcons.errors import InputError
@@ -80,10 +80,10 @@ def test_pages(result, tmp_path):
 
 
 def test_command(tmp_path, capsys):
-    assert cli.main(["hardcases", "--list", "--only", "H14,X06"]) == 0
+    assert main.main(["hardcases", "--list", "--only", "H14,X06"]) == 0
     assert capsys.readouterr().out.startswith("H14  Pendulum at 2 rad, 1e7 steps")
-    assert cli.main(["hardcases", "--quick", "--only", "X06", "--out", str(tmp_path / "out")]) == 0
+    assert main.main(["hardcases", "--quick", "--only", "X06", "--out", str(tmp_path / "out")]) == 0
     shown = capsys.readouterr().out
     assert "as asked for" in shown and "hard_cases.html" in shown
-    assert cli.main(["hardcases", "--only", "nothing", "--out", str(tmp_path / "other")]) == 2
+    assert main.main(["hardcases", "--only", "nothing", "--out", str(tmp_path / "other")]) == 2
     assert not (tmp_path / "other").exists()

@@ -12,7 +12,7 @@ import pytest
 from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
 
-from kcons import cli
+from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.scenes import any_file
 from kcons.constraints import LinearRelation
@@ -38,7 +38,7 @@ def alanine(tmp_path):
 
 
 def plan(*arguments, capsys):
-    status = cli.main(["plan", *map(str, arguments)])
+    status = main.main(["plan", *map(str, arguments)])
     told = capsys.readouterr()
     return status, told.out, told.err
 
@@ -134,7 +134,7 @@ def test_forces_that_do_not_fit(ethanol, alanine):
 def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments = ["compare", str(ethanol), "--forces", "emt", "--constrain", "allbonds", "--quick", "--budget", "0.5"]
-    status = cli.main([*arguments, "--methods", "rattle", "--dt", "4"])
+    status = main.main([*arguments, "--methods", "rattle", "--dt", "4"])
     told = capsys.readouterr()
     assert status == 0, told.err
     assert "kcons: 8 bonds were guessed" in told.err
@@ -195,7 +195,7 @@ def test_compare_runs_on_a_protein_in_water(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
     arguments = ["compare", str(VILLIN), "--constrain", "hbonds", "--forces", "amber14-all,amber14/tip3p", "--quick"]
-    status = cli.main([*arguments, "--budget", "1", "--methods", "openmm-kcons-rattle", "--dt", "4"])
+    status = main.main([*arguments, "--budget", "1", "--methods", "openmm-kcons-rattle", "--dt", "4"])
     told = capsys.readouterr()
     assert status == 0, told.err
     assert "test.pdb, 8867 atoms, hbonds" in told.out

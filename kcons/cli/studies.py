@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from kcons.terminal import console, names, say_written, show
+from kcons.cli.terminal import console, names, say_written, show
 
 
 def add(commands: Any) -> None:
@@ -38,9 +38,9 @@ def add(commands: Any) -> None:
 
 
 def _hard_cases(chosen: argparse.Namespace) -> int:
+    from kcons.cli.progress import Bars
     from kcons.comparison import hard_cases
     from kcons.comparison.hard_cases import pages
-    from kcons.progress import Bars
 
     cases = hard_cases.chosen(chosen.only)
     if chosen.list:
@@ -57,9 +57,9 @@ def _hard_cases(chosen: argparse.Namespace) -> int:
 
 
 def _stability(chosen: argparse.Namespace) -> int:
+    from kcons.cli.progress import Bars
     from kcons.comparison import stability
     from kcons.comparison.stability import pages
-    from kcons.progress import Bars
 
     chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"

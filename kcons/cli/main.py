@@ -11,9 +11,10 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcons import __version__, cli_check, cli_studies
+from kcons import __version__
+from kcons.cli import check, studies
+from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError
-from kcons.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 
 if TYPE_CHECKING:
     from kcons.comparison.methods.method import Method
@@ -134,8 +135,8 @@ def _parser() -> argparse.ArgumentParser:
         description="What the engine will do for a scene, before any run.",
     )
     plan.set_defaults(run=_plan)
-    cli_check.add(commands)
-    cli_studies.add(commands)
+    check.add(commands)
+    studies.add(commands)
 
     return parser
 
@@ -162,10 +163,10 @@ def _compare(chosen: argparse.Namespace) -> int:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
         return _compare_averages(chosen, budget, folder, asked)
+    from kcons.cli.progress import Bars
     from kcons.comparison.methods import methods
     from kcons.comparison.work_precision import measure, recommendation, report
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
-    from kcons.progress import Bars
 
     methods.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
@@ -229,8 +230,8 @@ def _literal(value: Any) -> str:
 
 
 def _compare_all(chosen: argparse.Namespace) -> int:
+    from kcons.cli.progress import Bars
     from kcons.comparison.work_precision import parts_of_the_whole, whole
-    from kcons.progress import Bars
 
     if chosen.list:
         print("parts of the whole comparison")
@@ -252,9 +253,9 @@ def _compare_all(chosen: argparse.Namespace) -> int:
 
 
 def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, asked: dict[str, Any]) -> int:
+    from kcons.cli.progress import Bars
     from kcons.comparison.averages import report as sampling_report
     from kcons.comparison.averages import sampling
-    from kcons.progress import Bars
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)

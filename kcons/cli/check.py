@@ -10,8 +10,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kcons.cli.terminal import console, rendered, say_written
 from kcons.errors import InputError, OccupiedError, UnreadableError
-from kcons.terminal import console, rendered, say_written
 
 if TYPE_CHECKING:
     from kcons.mdanalysis.check.result import CheckResult

@@ -1,0 +1,10 @@
+"""The command `kcons`.
+
+- `terminal`, `progress`: what is written to the terminal
+- `check`, `studies`: `kcons check`, `kcons hardcases`, `kcons stability`
+- `main`: all others
+"""
+
+from kcons.cli.main import main
+
+__all__ = ["main"]
