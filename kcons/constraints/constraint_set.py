@@ -401,7 +401,7 @@ class ConstraintSet:
     # -- sigma, A, b ----------------------------------------------------------------------------
 
     def whole(self, x: FloatArray) -> FloatArray:
-        """Positions in which atoms of whole rows stand in the images that these rows mean; see `kcons.constraints.images`.
+        """Positions in which atoms of whole rows stand in the images that these rows mean; see `constraints.images`.
 
         `x` itself where all rows are plain.
         """

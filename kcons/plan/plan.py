@@ -104,7 +104,7 @@ class Plan:
     late : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
-        For each solver, whether it takes positions that were made whole, without a cell (see `kcons.constraints.images`).
+        For each solver, whether it takes positions that were made whole, without a cell (see `constraints.images`).
     """
 
     constraint_set: ConstraintSet

@@ -2,7 +2,7 @@
 
 A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
 compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
-time (`kcons.solvers.rigid_triangles`), long chains (`kcons.solvers.chains.chains`), and whatever else is held by sparse elimination
+time (`solvers.rigid_triangles`), long chains (`chains.chains`), and whatever else is held by sparse elimination
 (`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes.
 """
 

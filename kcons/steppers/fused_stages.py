@@ -60,7 +60,7 @@ class Flights:
     ----------
     motion : Motion
     found : tuple
-        All its rows, from `kcons.solvers.fused_distances`, 1/m for each coordinate, the atoms that show whether the system is
+        All its rows, from `solvers.fused_distances`, 1/m for each coordinate, the atoms that show whether the system is
         far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
     """
 

@@ -5,12 +5,11 @@ Judges: the law that the entropy production prescribes, closed forms, and number
 
 from __future__ import annotations
 
-import importlib.util
 import math
 
 import numpy as np
 
-from kcons.comparison.hard_cases.case import CannotExpressError, Outcome, case, outcome
+from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.problem import Array
 from kcons.comparison.hard_cases.programs import Program
 from kcons.comparison.hard_cases.steps import each_refused
@@ -21,11 +20,6 @@ EXCESS = 0.334407148154132
 START = np.array([0.6, 0.1, 0.1, 0.1, 0.1])
 TAU = 30.0
 MU0 = 0.1 + 0.05 * np.arange(1, 6)
-
-
-def _need(module: str) -> None:
-    if importlib.util.find_spec(f"kcons.{module}") is None:
-        raise CannotExpressError(f"this kcons has no kcons.{module}")
 
 
 def _equilibrium(total: float = 1.0) -> Array:
@@ -47,7 +41,6 @@ def _excess(log_x: Array, total: float = 1.0) -> float:
     hosts=NONE,
 )
 def near_equilibrium(program: Program, quick: bool) -> Outcome:
-    _need("growth")
     from kcons.models.growth import Hypercycle, solve
 
     times = [300.0, 600.0, 900.0]
@@ -61,7 +54,6 @@ def near_equilibrium(program: Program, quick: bool) -> Outcome:
 
 @case("H34", "Entropy budget 10 % and 50 % too large, 10 % too small", "refused before the start", "raise", hosts=NONE)
 def wrong_budget(program: Program, quick: bool) -> Outcome:
-    _need("growth")
     from kcons.models.growth import Hypercycle, solve
 
     def run(factor: float) -> float:
@@ -78,7 +70,6 @@ def wrong_budget(program: Program, quick: bool) -> Outcome:
     hosts=NONE,
 )
 def near_extinction(program: Program, quick: bool) -> Outcome:
-    _need("growth")
     from kcons.models.growth import Hypercycle, solve
 
     known = {
@@ -105,7 +96,6 @@ def near_extinction(program: Program, quick: bool) -> Outcome:
     hosts=NONE,
 )
 def at_equilibrium(program: Program, quick: bool) -> Outcome:
-    _need("growth")
     from kcons.models.growth import Hypercycle, solve
 
     x_eq = _equilibrium()
@@ -115,7 +105,6 @@ def at_equilibrium(program: Program, quick: bool) -> Outcome:
 
 @case("H37", "Populations that sum to 2", "x at t = 10 as found with 45 digits, to 1e-7", hosts=NONE)
 def sum_of_two(program: Program, quick: bool) -> Outcome:
-    _need("growth")
     from kcons.models.growth import Hypercycle, solve
 
     known = np.array(
@@ -128,7 +117,6 @@ def sum_of_two(program: Program, quick: bool) -> Outcome:
 
 @case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", hosts=NONE)
 def defective(program: Program, quick: bool) -> Outcome:
-    _need("flows")
     from kcons.models.flows import LinearFlow
 
     w, start = 2.0, np.array([1.0, 0.5])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -12,7 +11,8 @@ from typing import Any
 from kcons import __version__
 from kcons.comparison.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.comparison.hard_cases.worker import Worker
-from kcons.comparison.work_precision.measure import Watcher, environment
+from kcons.comparison.study.machine import code_digest, environment
+from kcons.comparison.work_precision.measure import Watcher
 from kcons.errors import InputError
 from kcons.steppers.files import in_one_piece
 
@@ -70,7 +70,7 @@ def run(
     cases = chosen(only)
     systems = list(systems)
     watcher = watcher or Watcher()
-    made_by = {"version": __version__, "code": fingerprint(), "quick": quick, "versions": environment()["versions"]}
+    made_by = {"version": __version__, "code": code_digest(), "quick": quick, "versions": environment()["versions"]}
     before = _earlier(kept, made_by)
     result: dict[str, Any] = {
         "format": FORMAT,
@@ -136,16 +136,6 @@ def _earlier(kept: Path | None, made_by: Mapping[str, Any]) -> dict[str, Any]:
     except InputError:
         return {}
     return dict(found["cells"]) if found["made_by"] == json.loads(json.dumps(made_by)) else {}
-
-
-def fingerprint() -> str:
-    """A short hash of the package's source: results of other code are not taken over."""
-    total = hashlib.sha256()
-    root = Path(__file__).parent.parent
-    for path in sorted(root.rglob("*.py")):
-        total.update(path.relative_to(root).as_posix().encode())
-        total.update(path.read_bytes())
-    return total.hexdigest()[:16]
 
 
 def _described(case: Case) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """The contract of a method: what it is, what it cannot run, and a run that advances step by step.
 
-`kcons.comparison.methods.methods` and `kcons.comparison.methods.openmm` fulfil it; `kcons.comparison.work_precision.measure` knows nothing else of them.
+`methods.methods` and `methods.openmm` fulfil it; `work_precision.measure` knows nothing else of them.
 """
 
 from __future__ import annotations

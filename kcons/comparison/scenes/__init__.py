@@ -167,7 +167,7 @@ def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options
     quick : bool
         Half the horizon.
     **options
-        What `kcons.comparison.scenes.structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax; or, for
+        What `structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax; or, for
         other files and where one of coordinates, forces, select, rigid_residues is given, what
         `kcons.comparison.scenes.any_file.from_file` takes.
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from kcons import __version__
-from kcons.comparison.hard_cases.study import fingerprint
 from kcons.comparison.stability import fuzz, runs
 from kcons.comparison.stability.scenes import SCENES
-from kcons.comparison.work_precision.measure import Watcher, environment
+from kcons.comparison.study.machine import code_digest, environment
+from kcons.comparison.work_precision.measure import Watcher
 from kcons.errors import InputError
 from kcons.steppers.files import in_one_piece
 
@@ -58,7 +58,7 @@ def run(
     for scene in chosen:
         if scene not in SCENES:
             raise InputError(f"there is no scene {scene!r}; there are {', '.join(SCENES)}", item="scenes")
-    made_by = {"version": __version__, "code": fingerprint(), "quick": quick}
+    made_by = {"version": __version__, "code": code_digest(), "quick": quick}
     result: dict[str, Any] = {"format": FORMAT, "made_by": made_by, "environment": environment(), "pieces": {}}
     if kept is not None and kept.is_file():
         before = json.loads(kept.read_text(encoding="utf-8"))

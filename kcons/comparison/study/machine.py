@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import os
 import platform
@@ -12,6 +13,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import kcons
+
+PACKAGE = Path(kcons.__file__).parent
 #: Packages whose versions go into a result.
 PACKAGES = (
     *("kcons", "numpy", "scipy", "numba", "ase", "openmm", "tblite", "matplotlib"),
@@ -41,7 +45,7 @@ def environment() -> dict[str, Any]:
 
 def kernels_cached() -> bool:
     """Whether compiled kernels of an earlier run are on disk beside the package (or where NUMBA_CACHE_DIR says)."""
-    here = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)
+    here = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE)
     return next(here.rglob("*.nbi"), None) is not None
 
 
@@ -59,11 +63,11 @@ def _commit() -> str | None:
     """Commit of the checkout this file belongs to, with '+' if it was changed since; None outside of one."""
 
     def git(*words: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *words]
+        command = ["git", "-C", str(PACKAGE), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)
+        git("ls-files", "--error-unmatch", "__init__.py")
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.SubprocessError):
         return None
@@ -71,9 +75,34 @@ def _commit() -> str | None:
 
 @cache
 def code_digest() -> str:
-    """Twelve digits of a hash over the sources of the package: other code, another digest."""
-    here = Path(__file__).parent
-    found = hashlib.sha256()
-    for path in sorted(here.rglob("*.py")):
-        found.update(path.relative_to(here).as_posix().encode() + b"\0" + path.read_bytes())
-    return found.hexdigest()[:12]
+    """Twelve digits of a hash over what the package does: other code, another digest.
+
+    Names of files, import statements, documentation and layout do not count, so that moving code makes nothing stale.
+    """
+    found = []
+    for path in PACKAGE.rglob("*.py"):
+        tree = _Bare().visit(ast.parse(path.read_bytes()))
+        found += [hashlib.sha256(ast.unparse(part).encode()).digest() for part in tree.body]
+    return hashlib.sha256(b"".join(sorted(found))).hexdigest()[:12]
+
+
+class _Bare(ast.NodeTransformer):
+    """Without imports and documentation."""
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            kept = [part for part in body if not _is_text(part)]
+            node.body = kept if kept or isinstance(node, ast.Module) else [ast.Pass()]  # type: ignore[attr-defined]
+        return node
+
+    def visit_Import(self, node: ast.Import) -> None:
+        """Dropped."""
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        """Dropped."""
+
+
+def _is_text(part: ast.AST) -> bool:
+    return isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)

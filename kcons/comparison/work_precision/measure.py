@@ -71,7 +71,7 @@ def compare(
     ----------
     scene : Scene
     methods : iterable of str, optional
-        Names out of `kcons.comparison.methods.methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
+        Names out of `methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
         ones for the scene.
     budget : float
         Seconds for each method over all its time steps. One that is predicted to exceed it is stopped
@@ -222,7 +222,7 @@ def timed_again(
     rounds: Rounds | None,
     watcher: Watcher | None = None,
 ) -> tuple[list[Measurement], float | None]:
-    """Times of short runs from rounds that nobody observes, and how well they repeat (`kcons.comparison.work_precision.timing_rounds`).
+    """Times of short runs from rounds that nobody observes, and how well they repeat (`work_precision.timing_rounds`).
 
     Parameters
     ----------

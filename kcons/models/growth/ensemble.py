@@ -1,6 +1,6 @@
 """Many trajectories of one model at once, each with time steps of its own.
 
-The same scheme as `kcons.models.growth.integration`: logarithms, the Runge-Kutta method of order 8 of Dormand and Prince, a
+The same scheme as `growth.integration`: logarithms, the Runge-Kutta method of order 8 of Dormand and Prince, a
 projection on the holonomic rows after each step. All trajectories of a batch take a step together, as columns of
 arrays; each accepts or rejects it for itself, and those that have arrived leave the batch.
 """

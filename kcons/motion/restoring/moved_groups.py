@@ -65,7 +65,7 @@ def restored(
     x : ndarray, shape (n_atoms, 3)
     time : float
     bonds : callable or None
-        Gives the bonds, shape (n, 2). None: see `kcons.motion.restoring.kept_geometry.bonds_of`. Where it gives none, other lengths and
+        Gives the bonds, shape (n, 2). None: see `kept_geometry.bonds_of`. Where it gives none, other lengths and
         angles may change.
     nearest : callable
         Gives the nearest point on the rows, or raises.

@@ -1,4 +1,4 @@
-"""The constraint objects of kcons in OpenMM, carried to the engine by PythonForces (see `kcons.openmm.carried.callbacks`)."""
+"""The constraint objects of kcons in OpenMM, carried to the engine by PythonForces (see `carried.callbacks`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Numbers two and four doubles wide for Numba kernels that work row by row.
 
-The narrow counterpart of `kcons.solvers.kernels.eight_wide`: a `Pair` holds what belongs to both triangles of a matrix, a
+The narrow counterpart of `kernels.eight_wide`: a `Pair` holds what belongs to both triangles of a matrix, a
 `Quad` a vector in space and one number more. Arrays are read and written without checks of the index, and
 handed to intrinsics only, for the reasons given there.
 """

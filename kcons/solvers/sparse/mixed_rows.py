@@ -101,7 +101,7 @@ class SparseRows:
         n = len(rows)
         self._lines = aligned(8 * int(slots[-1]))
         self._lines[6::8] = w[slot_atoms]
-        # By row: accumulated change of the pivot and right-hand side; by entry as in `kcons.solvers.sparse.substitution`.
+        # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
         self._state, self._entries = aligned(2 * n), aligned(4 * len(pattern.columns))
         self._pivots, self._values, self._floor = np.zeros(n), np.zeros(n), np.zeros(n)
         self._base, self._moves = aligned(4 * len(self._atoms)), aligned(4 * len(self._atoms))
