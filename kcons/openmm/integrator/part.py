@@ -90,7 +90,7 @@ class Part(Protocol):
     - `begin_early(program)`: the same where velocities are projected before the first drift.
     - `stays_finite = True`: after a failure x is still a place where forces can be computed; set-up is faster then.
 
-    Steps at whose end nobody looks may end without `project` (see `integrator.lean_step_writer`): the next drift absorbs
+    Steps at whose end nobody looks may end without `project` (see `lean_step_writer`): the next drift absorbs
     what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
     The optional `renew(program)` is called before each drift that follows one, where v is free to be used, and
     `passed(program)` at their ends. A part with `alone = True` knows that the System has no constraints; where there is

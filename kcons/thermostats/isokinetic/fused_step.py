@@ -33,7 +33,7 @@ class IsokineticStages:
     ----------
     system : System
     found : tuple
-        All its rows, from `solvers.fused_distances`; then 1/m for each coordinate, the masses of the thermostatted atoms,
+        All its rows, from `fused_distances`; then 1/m for each coordinate, the masses of the thermostatted atoms,
         and whether others move.
     """
 
