@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from constraint_cases import MASSES, scattered
 
 from kcons.constraints import CenterDistance, CenterOfMass, RadiusOfGyration, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
-
-from .cases import MASSES, scattered
 
 
 def test_center_of_mass_rows_come_group_after_group():

@@ -6,12 +6,11 @@ import json
 
 import numpy as np
 import pytest
+from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 
 from kcons.constraints import FAMILIES, Distance, FixedAtoms, MovingTarget, Sphere, from_dict
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-
-from .cases import CASES, MASSES, N_ATOMS, TIME, scattered
 
 STEPS = 2.0 ** -np.arange(5, 9)
 

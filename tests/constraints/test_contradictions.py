@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from constraint_cases import MASSES, scattered
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,8 +14,6 @@ from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.contradictions import _triangles
 from kcons.errors import ContradictionError, InfeasibleError
-
-from .cases import MASSES, scattered
 
 
 def test_one_pair_at_two_lengths():

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from constraint_cases import MASSES, TIME, hoop, saddle, scattered, spread
 
 from kcons.constraints import Custom, Distance, ImplicitSurface
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, SingularGeometryError
-
-from .cases import MASSES, TIME, hoop, saddle, scattered, spread
 
 
 def gap(r):

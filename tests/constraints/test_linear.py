@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from constraint_cases import MASSES, scattered
 
 from kcons.constraints import FixedAtoms, LinearCombination, LinearRelation, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-
-from .cases import MASSES, scattered
 
 
 def test_relation_is_three_rows_an_atom():

@@ -145,7 +145,7 @@ def test_a_run_that_is_killed_keeps_its_frames(tmp_path):
         endings.append("h5md")
     except ImportError:
         pass
-    code = KILLED.format(paths=[os.path.dirname(__file__)])
+    code = KILLED.format(paths=[os.path.dirname(__file__), str(Path(__file__).parents[1] / "systems")])
     code = code.replace("writer =", "writers = [").replace("interval=0.002)", "interval=0.002) for e in sys.argv[2:]]")
     code = code.replace("sys.argv[1],", 'sys.argv[1] + "/k" + e + "." + e,').replace("[writer]", "writers")
     done = subprocess.run(

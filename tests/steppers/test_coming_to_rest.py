@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_systems import gravity, system_of
 
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge
 from kcons.errors import CertificateError
@@ -21,7 +22,6 @@ from kcons.steppers import (
     Yoshida4,
     run,
 )
-from steppers.systems import gravity, system_of
 
 MASSES = np.array([1.0, 2.0, 0.5])
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
+from stepper_systems import rotor, skate, system_of
 
 from kcons.constraints import LinearVelocity, MovingTarget, Sphere
 from kcons.errors import InputError
 from kcons.steppers import Composition, KahanLi6, Rattle, Suzuki4, Yoshida4, run
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4, YOSHIDA_4
-from steppers.problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
-from steppers.systems import rotor, skate, system_of
 
 #: Coarser with velocity rows, where a projection takes ten milliseconds.
 STEPS = {4: [16, 24, 32], 6: [8, 12, 16]}

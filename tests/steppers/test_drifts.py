@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_systems import growing_rod, rotor, skate, system_of
 
 from kcons.constraints import (
     CustomVelocity,
@@ -17,7 +18,6 @@ from kcons.constraints import (
 from kcons.errors import ConvergenceError
 from kcons.steppers.compensated_steps import Point
 from kcons.steppers.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
-from steppers.systems import growing_rod, rotor, skate, system_of
 
 
 def flown(drift, system, state, h: float, *, exact: bool = True):

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import test_reference_orders as references
 from reference import cases
+from stepper_attempts import attempts, counted, end_of, scene_system
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
+from stepper_systems import gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
 
 from kcons.comparison import scenes
 from kcons.comparison.work_precision import measure
@@ -21,9 +23,7 @@ from kcons.steppers import (
     State,
 )
 from kcons.steppers.extrapolation import _Table
-from steppers.attempts import attempts, counted, end_of, scene_system
-from steppers.problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
-from steppers.systems import gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
+from tests.contracts import test_reference_orders as references
 
 PAGE = (Path(__file__).parents[2] / "docs" / "steppers.md").read_text(encoding="utf-8")
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stepper_attempts import attempts, counted, end_of
+from stepper_systems import gravity, rotor, spherical_pendulum
 
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.steppers import (
@@ -19,8 +21,6 @@ from kcons.steppers import (
     System,
 )
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
-from steppers.attempts import attempts, counted, end_of
-from steppers.systems import gravity, rotor, spherical_pendulum
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-9, 1e-14])

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from stepper_systems import SYMMETRIC, gravity, slope, system_of
 
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity, MovingTarget, Sphere
 from kcons.errors import InputError, UnsupportedError
@@ -27,7 +28,6 @@ from kcons.steppers import (
     run,
 )
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
-from steppers.systems import SYMMETRIC, gravity, slope, system_of
 
 MASSES = np.array([1.0, 2.0, 0.5])
 #: One rate for all; one for each atom of a molecule, which rows tie together.

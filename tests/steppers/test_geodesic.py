@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
+from stepper_systems import angle_of, growing_rod, rotor, spherical_pendulum, system_of
 
 from kcons.constraints import Distance, FixedAtoms, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import Geodesic, Rattle, run
-from steppers.problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
-from steppers.systems import angle_of, growing_rod, rotor, spherical_pendulum, system_of
 
 
 @pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)

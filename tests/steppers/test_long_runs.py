@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stepper_systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
 from kcons.constraints import Distance
 from kcons.steppers import (
@@ -31,7 +32,6 @@ from kcons.steppers import (
     Yoshida4,
     run,
 )
-from steppers.systems import PROJECTED, SYMMETRIC, planar_pendulum, spherical_pendulum, system_of
 
 REVERSIBLE = pytest.mark.parametrize("stepper", SYMMETRIC, ids=repr)
 #: So many digits of a figure are kept in the file.

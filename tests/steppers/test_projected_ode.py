@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named
+from stepper_systems import PROJECTED, rotor, slope, spherical_pendulum
 
 from kcons.errors import InputError
 from kcons.steppers import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet, run
-from steppers.problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named
-from steppers.systems import PROJECTED, rotor, slope, spherical_pendulum
 
 SCHEMES = pytest.mark.parametrize("stepper", PROJECTED, ids=repr)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
+from stepper_systems import angle_of, planar_pendulum, rotor, skate, spherical_pendulum, system_of, verlet
 
 from kcons.constraints import Angle, Distance
 from kcons.errors import ConvergenceError
 from kcons.steppers import Rattle, State, run
-from steppers.problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
-from steppers.systems import angle_of, planar_pendulum, rotor, skate, spherical_pendulum, system_of, verlet
 
 
 @pytest.mark.parametrize("problem", [*HOLONOMIC, *VELOCITY_ROWS, *FRICTION], ids=named)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepper_problems import HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
+from stepper_systems import NYSTROM, rotor, system_of
 
 from kcons.constraints import Sphere
 from kcons.errors import UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, Suzuki4, run
-from steppers.problems import HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
-from steppers.systems import NYSTROM, rotor, system_of
 
 SPLITTINGS = pytest.mark.parametrize("stepper", NYSTROM, ids=repr)
 #: Coarse, since these are so accurate that finer steps meet the round-off floor.

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stepper_systems import SYMMETRIC, gravity, rotor, spherical_pendulum, system_of
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget
 from kcons.errors import InputError
 from kcons.steppers import BlanesMoan6, State, run
-from steppers.systems import SYMMETRIC, gravity, rotor, spherical_pendulum, system_of
 
 
 def test_float32_input_is_cast():

@@ -6,6 +6,17 @@ import itertools
 
 import numpy as np
 import pytest
+from stepper_systems import (
+    EVERY,
+    NYSTROM,
+    PROJECTED,
+    SYMMETRIC,
+    gravity,
+    growing_rod,
+    rotor,
+    spherical_pendulum,
+    system_of,
+)
 
 from kcons.constraints import Angle, Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, ReversibilityError, UnsupportedError
@@ -19,17 +30,6 @@ from kcons.steppers import (
     State,
     System,
     run,
-)
-from steppers.systems import (
-    EVERY,
-    NYSTROM,
-    PROJECTED,
-    SYMMETRIC,
-    gravity,
-    growing_rod,
-    rotor,
-    spherical_pendulum,
-    system_of,
 )
 
 ALL = pytest.mark.parametrize("stepper", EVERY, ids=repr)

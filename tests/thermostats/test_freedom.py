@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
 from kcons.comparison.scenes.lennard_jones import LennardJones
 from kcons.constraints import (
@@ -23,7 +24,6 @@ from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import State
 from kcons.thermostats import Isokinetic, NoseHooverChain, freedom, thermal_velocities
 from kcons.thermostats.freedom import drift_velocity, open_directions
-from thermostats.systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
 RNG = np.random.default_rng(11)
 SCATTERED = 3.0 * RNG.standard_normal((12, 3))

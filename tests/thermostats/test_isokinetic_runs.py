@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from isokinetic_systems import ORDERS, water_and_more
+from thermostat_systems import dumbbells, swirling, system, waves, waves_potential
 
 from kcons.constraints import Distance, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import Isokinetic, Langevin, thermal_velocities
-from thermostats.isokinetic_systems import ORDERS, water_and_more
-from thermostats.systems import dumbbells, swirling, system, waves, waves_potential
 
 # -- parts, times, restarts -------------------------------------------------------------------------
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from thermostat_systems import METHANE, TEN, dumbbells, quartic, quartic_potential, swirling, system, waves
 
 from kcons.constraints import Distance, FixedAtoms, MovingTarget, Plane, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import State, System, run
 from kcons.thermostats import Isokinetic, Langevin, thermal_velocities
-from thermostats.systems import METHANE, TEN, dumbbells, quartic, quartic_potential, swirling, system, waves
 
 
 def started(n=2, **options):

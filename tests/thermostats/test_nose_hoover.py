@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 import pytest
+from thermostat_systems import METHANE, TEN, dumbbells, quartic, quartic_potential, system, waves
 
 from kcons.constraints import Distance, Plane
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.steppers import Geodesic, State, Suzuki4, System, run
 from kcons.thermostats import NoseHooverChain, thermal_velocities
-from thermostats.systems import METHANE, TEN, dumbbells, quartic, quartic_potential, system, waves
 
 
 def started(n=2, **options):

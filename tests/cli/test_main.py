@@ -1,0 +1,220 @@
+"""The command `kcons`: what it writes, and how it says that something is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from kcons.cli import main
+
+needs_openmm = pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
+
+
+def run(*arguments):
+    return main.main([str(a) for a in arguments])
+
+
+def test_compare_writes_table_plot_and_json(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("compare", "chain", "--size", 4, "--methods", "rattle,verlet", "--dt", "10,5", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert "chain of 4 rigid bonds" in printed.out
+    assert "kcons RATTLE" in printed.out
+    assert "error: root-mean-square distance" in printed.out
+    assert f"wrote {out / 'compare.json'}" in printed.out
+    assert "reference solution" in printed.err  # progress goes to the other stream
+    data = json.loads((out / "compare.json").read_text())
+    assert data["scene"]["atoms"] == 5
+    assert data["scene"]["rank"] == 4
+    assert data["settings"] == {
+        "methods": ["rattle", "verlet"],
+        "budget_seconds": 20.0,
+        "size": 4,
+        "seed": 1,
+        "quick": False,
+        "dt": [10.0, 5.0],
+    }
+    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [
+        ("rattle", 10.0),
+        ("rattle", 5.0),
+        ("verlet", 10.0),
+        ("verlet", 5.0),
+    ]
+    assert data["observed_order"]["rattle"] == pytest.approx(2.0, abs=0.1)
+    assert data["environment"]["cpu"]
+    assert "max |Av|" in (out / "compare.txt").read_text(encoding="utf-8")
+    assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_compare_samples_fluids(tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ["--size", 8, "--methods", "isokinetic,langevin", "--dt", "0.01", "--budget", "0.3", "--out", out]
+    assert run("compare", "thermostat", *options) == 0
+    printed = capsys.readouterr()
+    assert "8 Lennard-Jones atoms" in printed.out
+    assert "kT off by: temperature of the configurations" in printed.out
+    assert "Metropolis sampling\n" in printed.err
+    data = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    assert [(m["method"], m["setting"]) for m in data["measurements"]] == [("isokinetic", 0.01), ("langevin", 0.01)]
+    assert data["settings"]["size"] == 8 and data["settings"]["dt"] == [0.01]
+    assert (out / "compare.png").exists()
+    assert "isokinetic, 2K = (g - 1) kT" in (out / "compare.txt").read_text(encoding="utf-8")
+
+
+def test_plan_of_a_fluid(capsys):
+    assert run("plan", "thermostat-water") == 0
+    text = capsys.readouterr().out
+    assert "27 rigid TIP3P waters" in text and "rank 81" in text
+
+
+def test_default_folder_is_named_after_the_scene(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
+    assert (tmp_path / "compare-sphere" / "compare.json").exists()
+    data = json.loads((tmp_path / "compare-sphere" / "compare.json").read_text())
+    assert data["settings"]["quick"] is True
+    assert data["settings"]["budget_seconds"] == 5.0
+    assert data["scene"]["atoms"] == 2
+
+
+def test_seed_changes_the_trajectory(tmp_path, capsys):
+    errors = []
+    for seed in (1, 1, 2):
+        out = tmp_path / "out"
+        assert run("compare", "chain", "--size", 3, "--methods", "rattle", "--seed", seed, "--out", out) == 0
+        errors.append(json.loads((out / "compare.json").read_text())["measurements"][0]["error"])
+    assert errors[0] == errors[1] != errors[2]
+
+
+def test_plan_prints_clusters_rank_and_solver(capsys):
+    assert run("plan", "chain", "--size", 6) == 0
+    text = capsys.readouterr().out
+    assert "chain of 6 rigid bonds" in text
+    assert "rank 6" in text
+    assert "solver" in text
+
+
+@pytest.mark.parametrize("command", ["compare", "plan"])
+def test_list(command, capsys):
+    assert run(command, "--list") == 0
+    text = capsys.readouterr().out
+    for word in ("water", "chain-straight", "ethanol", "triple-pendulum", "bead-torus", "slab", "rattle", "dop853"):
+        assert word in text
+    for word in ("thermostat-dumbbells", "thermostat-water", "isokinetic-notes", "nose-hoover"):
+        assert f"  {word} " in text
+    for word in ("geodesic", "yoshida4", "blanes-moan6a", "projected-verlet", "projected-rk4", "baumgarte"):
+        (line,) = (line for line in text.splitlines() if line.startswith(f"  {word} "))
+        assert line.endswith("(only when named)")
+
+
+def test_without_command_prints_help(capsys):
+    assert run() == 0
+    assert "compare" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out.startswith("kcons ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["compare"], "name a scene: water"),
+        (["compare", "wat"], "there is no scene 'wat'"),
+        (["plan", "wat"], "there is no scene 'wat'"),
+        (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
+        (["compare", "chain", "--methods", ","], "no method"),
+        (["compare", "thermostat", "--methods", "rattle"], "there is no thermostat 'rattle'"),
+        (["compare", "thermostat", "--dt", "0.01,-1"], "give a positive number"),
+        (["compare", "thermostat-water", "--size", "8"], "use 27 or more"),
+        (["compare", "thermostat", "--budget", "0"], "positive number of seconds"),
+        (["compare", "chain", "--size", "0"], "at least one bond"),
+        (["compare", "chain", "--size", "3", "--dt", "3"], "does not divide the horizon"),
+        (["compare", "chain", "--size", "3", "--dt", ","], "--dt is empty"),
+        (["compare", "chain", "--seed", "-1"], "non-negative"),
+        (["compare", "chain", "--size", "3", "--budget", "-1"], "positive number of seconds"),
+        (["compare", "chain", "--size", "3", "--out", "/dev/null/x"], "/dev/null"),
+    ],
+)
+def test_mistakes_give_one_line_and_status_2(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("kcons: ")]
+    assert len(lines) == 1
+    assert text in lines[0]
+    assert not list(tmp_path.glob("**/compare.json"))
+
+
+@pytest.mark.parametrize("arguments", [["frobnicate"], ["compare", "chain", "--dt", "a,b"], ["compare", "--size", "x"]])
+def test_unreadable_arguments_leave_with_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        run(*arguments)
+    assert left.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_interrupt(monkeypatch, capsys):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main, "_scene", stop)
+    assert run("plan", "chain") == 130
+    assert capsys.readouterr().err == "kcons: interrupted\n"
+
+
+def test_importing_the_command_imports_no_host():
+    code = (
+        "import sys, kcons.cli; "
+        "print([m for m in ('ase', 'openmm', 'matplotlib', 'rich', 'tblite') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+# -- molecules in OpenMM ----------------------------------------------------------------------------
+
+ALANINE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
+
+
+@needs_openmm
+def test_own_file_in_openmm(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = "openmm-verlet,openmm-kcons-rattle"
+    assert run("compare", ALANINE, "--constrain", "allbonds", "--methods", names, "--dt", "2,1") == 0
+    printed = capsys.readouterr().out
+    assert "AllBonds: 21 distances" in printed
+    assert "OpenMM + kcons rattle" in printed
+    data = json.loads((tmp_path / f"compare-{ALANINE.stem}" / "compare.json").read_text())
+    assert data["settings"]["constrain"] == "allbonds"
+    assert data["observed_order"]["openmm-kcons-rattle"] == pytest.approx(2.0, abs=0.2)
+    assert data["remarks"]
+
+
+@needs_openmm
+def test_plan_of_own_file(capsys):
+    assert run("plan", ALANINE, "--constrain", "hangles") == 0
+    assert "HAngles: 30 distances" in capsys.readouterr().out
+
+
+@needs_openmm
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("compare", "missing.pdb"), "there is no file missing.pdb"),
+        (("compare", ALANINE, "--size", "3"), "leave --size out"),
+        (("compare", ALANINE, "--forcefield", "nowhere.xml"), "force field nowhere.xml"),
+        (("plan", ALANINE, "--platform", "Abacus"), "no platform 'Abacus'"),
+        (("compare", "chain", "--constrain", "hbonds"), "not for 'chain'"),
+        (("compare", "alanine", "--add-hydrogens"), "is for files"),
+    ],
+)
+def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, text):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    assert text in capsys.readouterr().err

@@ -1,0 +1,239 @@
+"""The packed sigma, A and b of many objects: consistency, order of rows, cells, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
+
+from kcons.constraints import Angle, Distance, FixedAtoms, LinearCombination, Plane, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import ConstraintError, InputError
+
+TRICLINIC = np.array([[10.0, 0.0, 0.0], [3.0, 9.0, 0.0], [-2.0, 1.0, 8.0]])
+
+
+def everything(x):
+    return ConstraintSet([make() for make in CASES.values()], x, MASSES, time=TIME)
+
+
+def test_acceleration_target_is_the_second_derivative_along_any_curve():
+    """d2 sigma/dt2 = A a - b and d sigma/dt = A v - c; for velocity rows d(A v - c)/dt = A a - b."""
+    x0 = scattered(0)
+    rng = np.random.default_rng(1)
+    v, a = rng.normal(size=(2, N_ATOMS, 3))
+    held = everything(x0)
+
+    def position(s):
+        return x0 + s * v + s**2 / 2 * a
+
+    def residual(s):
+        x, t = position(s), TIME + s
+        speed = held.jacobian(x, t) @ (v + s * a).ravel() - held.velocity_target(x, t)
+        return held.value(x, t), speed
+
+    h = 0.01
+    weights = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+    value_rate, speed_rate = (
+        sum(c * (residual(k * h)[i] - residual(-k * h)[i]) for k, c in weights) / h for i in (0, 1)
+    )
+    speed = residual(0.0)[1]
+    beyond = held.jacobian(x0, TIME) @ a.ravel() - held.acceleration_target(x0, v, TIME)
+    rows = held.holonomic
+    assert 0 < rows.sum() < len(rows)
+    assert np.abs(value_rate - speed)[rows].max() < 1e-9
+    assert np.abs(speed_rate - beyond).max() < 1e-8
+
+
+def test_rows_come_in_the_order_given():
+    x = scattered(0)
+    held = ConstraintSet([Distance([[0, 1], [2, 3]]), FixedAtoms([5]), Angle([[0, 1, 2]])], x, MASSES)
+    assert held.starts.tolist() == [0, 2, 5, 6]
+    names = ["#0 Distance(0, 1)", "#1 Distance(2, 3)", *(f"#{k} FixedAtoms(5)" for k in (2, 3, 4)), "#5 Angle(0, 1, 2)"]
+    assert [held.row_name(k) for k in range(held.n_rows)] == names
+    assert held.row_atoms(1).tolist() == [2, 3]
+    assert held.locate(4)[1] == 2
+    assert len(held) == 6
+    assert held.incidence.toarray().sum(axis=1).tolist() == [2, 2, 1, 1, 1, 3]
+
+
+def test_sets_start_fulfilled_when_targets_are_taken_from_the_positions():
+    x = scattered(0)
+    held = everything(x)
+    implicit = np.concatenate(
+        [np.full(c.n_rows, make().target is None) for c, make in zip(held.constraints, CASES.values(), strict=True)]
+    )
+    assert implicit.sum() > 30
+    assert np.all(np.abs(held.value(x, TIME))[implicit] <= held.tolerance(x, TIME)[implicit])
+
+
+def test_subset_is_the_rows_of_the_whole():
+    x, v = scattered(0), scattered(1)
+    held = everything(x)
+    rows = np.arange(1, held.n_rows, 3)
+    part, atoms = held.subset(rows)
+    assert np.array_equal(part.value(x[atoms], TIME), held.value(x, TIME)[rows])
+    assert np.array_equal(part.scale, held.scale[rows])
+    full = held.jacobian(x, TIME).toarray().reshape(held.n_rows, N_ATOMS, 3)[rows][:, atoms]
+    assert np.allclose(part.jacobian(x[atoms], TIME).toarray(), full.reshape(len(rows), -1), rtol=1e-14, atol=1e-15)
+    assert np.allclose(
+        part.acceleration_target(x[atoms], v[atoms], TIME), held.acceleration_target(x, v, TIME)[rows], rtol=1e-9
+    )
+
+
+def test_scale_is_the_length_held_or_one_radian_or_the_size_of_the_positions():
+    x = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
+    items = [
+        Distance([[0, 1]], 5.0),
+        Angle([[1, 0, 2]]),
+        Sphere(1, [0.0, 0.0, 1.0], lambda t: 2.0 + t),
+        Plane(1, [0.0, 0.0, 1.0], 0.0),
+        Plane(0, [0.0, 0.0, 1.0], 0.0),
+    ]
+    held = ConstraintSet(items, x, np.ones(3))
+    assert held.scale.tolist() == [5.0, 1.0, 2.0, 5.0, 4.0]
+    assert ConstraintSet([Plane(0, [0.0, 0.0, 1.0], 0.0)], x[:1], np.ones(1)).scale.tolist() == [1.0]
+
+
+def test_tolerance_knows_what_double_precision_can_reach():
+    x = scattered(0)
+    near = ConstraintSet([Distance([[0, 1]], 1.0)], x, MASSES)
+    assert near.tolerance(x)[0] == 1e-14
+    far = x + np.array([1e6, 0.0, 0.0])
+    reach = 2 * np.finfo(float).eps * np.linalg.norm(far[:2], axis=1).sum()
+    assert near.tolerance(far)[0] == pytest.approx(reach, rel=1e-12)
+
+
+# -- cells ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", [np.diag([9.0, 8.0, 10.0]), TRICLINIC], ids=["orthorhombic", "triclinic"])
+def test_wrapped_atoms_give_the_rows_of_whole_molecules(cell):
+    rng = np.random.default_rng(0)
+    whole = 0.3 * scattered(0) + [4.0, 4.0, 4.0]
+    wrapped = whole + rng.integers(-2, 3, size=(N_ATOMS, 3)) @ cell
+    v = rng.normal(size=(N_ATOMS, 3))
+    names = [name for name, make in CASES.items() if make().translation_invariant]
+    assert {"Distance", "Angle", "Dihedral", "LinearRelation", "RadiusOfGyration", "Custom", "KnifeEdge"} <= set(names)
+    for name in names:
+        free = ConstraintSet([CASES[name]()], whole, MASSES, time=TIME)
+        periodic = ConstraintSet([CASES[name]()], wrapped, MASSES, cell=cell, time=TIME)
+        assert np.allclose(periodic.target(TIME), free.target(TIME), rtol=1e-12, atol=1e-12), name
+        assert np.allclose(periodic.value(wrapped, TIME), free.value(whole, TIME), atol=1e-12), name
+        assert np.allclose(periodic.jacobian(wrapped, TIME).toarray(), free.jacobian(whole, TIME).toarray(), atol=1e-12)
+        assert np.allclose(
+            periodic.acceleration_target(wrapped, v, TIME),
+            free.acceleration_target(whole, v, TIME),
+            rtol=1e-8,
+            atol=1e-9,
+        ), name
+
+
+def test_only_periodic_directions_are_wrapped():
+    x = np.array([[0.2, 0.2, 0.2], [0.2, 0.2, 9.8]])
+    assert ConstraintSet([Distance([[0, 1]])], x, np.ones(2), cell=[10.0] * 3).target() == pytest.approx([0.4])
+    slab = ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=[10.0] * 3, pbc=[True, True, False])
+    assert slab.measure(x) == pytest.approx([9.6])
+    flat = np.diag([10.0, 10.0, 0.0])
+    assert ConstraintSet([Distance([[0, 1]], 3.0)], x, np.ones(2), cell=flat, pbc=[1, 1, 0]).half_width == 5.0
+
+
+def test_half_width_of_a_triclinic_cell_is_perpendicular():
+    held = ConstraintSet([], np.zeros((1, 3)), np.ones(1), cell=TRICLINIC)
+    volume = abs(np.linalg.det(TRICLINIC))
+    widths = [volume / np.linalg.norm(np.cross(TRICLINIC[i - 2], TRICLINIC[i - 1])) for i in range(3)]
+    assert held.half_width == pytest.approx(min(widths) / 2, rel=1e-14)
+
+
+def test_lengths_of_half_the_box_are_refused():
+    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0], [4.6, 3.0, 3.6]])
+    with pytest.raises(InputError, match=r"row 1, Distance\(1, 2\): target 4 is not shorter than half the box \(4\)"):
+        ConstraintSet([Distance([[0, 1], [1, 2]], [1.0, 4.0])], x, np.ones(4), cell=[8.0] * 3)
+    with pytest.raises(
+        InputError, match=r"row 0, Angle\(1, 2, 3\): distance .* of atoms 2 and 3 is not shorter than half the box"
+    ) as e:
+        ConstraintSet([Angle([[1, 2, 3]])], x, np.ones(4), cell=[8.0] * 3)
+    assert e.value.atoms == (2, 3)
+
+
+# -- bad input --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": np.zeros((8, 2))}, r"positions must have shape \(n_atoms, 3\), not \(8, 2\)"),
+        ({"positions": "here"}, "positions is no array of numbers"),
+        ({"masses": np.ones(7)}, r"masses must have shape \(8,\), not \(7,\)"),
+        ({"cell": np.ones(4)}, r"cell must have shape \(3, 3\) or \(3,\)"),
+        ({"cell": np.ones((3, 3))}, "cell vectors are zero or not independent"),
+        ({"cell": [1.0, np.nan, 1.0]}, "cell has a NaN or infinity"),
+        ({"constraints": ["bond"]}, "'bond' is no kcons constraint"),
+        ({"constraints": [Distance([[2, 3], [0, 8]])]}, r"row 1, Distance\(0, 8\): there is no atom 8"),
+    ],
+)
+def test_bad_arguments_are_named(change, message):
+    arguments = {"constraints": [Distance([[0, 1]])], "positions": scattered(0), "masses": MASSES} | change
+    cell = arguments.pop("cell", None)
+    with pytest.raises(InputError, match=message):
+        ConstraintSet(*arguments.values(), cell=cell)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_positions_of_constrained_atoms_must_be_finite(number):
+    x = scattered(0)
+    x[3, 1] = number
+    with pytest.raises(InputError, match="position of atom 3 is not finite") as caught:
+        ConstraintSet([Distance([[0, 1], [2, 3]])], x, MASSES)
+    assert caught.value.atoms == (3,)
+    ConstraintSet([Distance([[0, 1]])], x, MASSES)  # other atoms are not looked at
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, np.nan, np.inf])
+def test_masses_of_constrained_atoms_must_be_positive(mass):
+    m = MASSES.copy()
+    m[3] = mass
+    with pytest.raises(InputError, match=f"atom 3 has mass {mass:g}; constrained atoms need positive mass") as caught:
+        ConstraintSet([Distance([[0, 1], [2, 3]])], scattered(0), m)
+    assert caught.value.atoms == (3,)
+
+
+def test_arrays_of_the_wrong_shape_are_named_later_too():
+    held = ConstraintSet([Distance([[0, 1]])], scattered(0), MASSES)
+    with pytest.raises(InputError, match=r"positions must have shape \(8, 3\)"):
+        held.value(np.zeros((7, 3)))
+    with pytest.raises(InputError, match=r"velocities must have shape \(8, 3\)"):
+        held.acceleration_target(scattered(0), np.zeros((7, 3)))
+
+
+def test_rows_without_a_target_say_where_they_get_one():
+    with pytest.raises(ConstraintError, match="has no target; put it in a ConstraintSet first"):
+        Distance([[0, 1]]).target_at(0.0)
+
+
+def test_inputs_are_left_alone_and_single_precision_is_cast():
+    x = scattered(0).astype(np.float32)
+    before = x.copy()
+    item = Distance([[0, 1]])
+    held = ConstraintSet(item, x, MASSES.astype(np.float32))
+    assert np.array_equal(x, before)
+    assert item.target is None
+    assert held.target().dtype == np.float64
+    assert held.target()[0] == pytest.approx(np.linalg.norm(x[0].astype(float) - x[1].astype(float)), rel=1e-15)
+
+
+def test_nothing_held():
+    held = ConstraintSet([], scattered(0), MASSES)
+    x = scattered(0)
+    assert held.n_rows == 0
+    assert held.value(x).shape == held.target().shape == held.acceleration_target(x, x).shape == (0,)
+    assert held.jacobian(x).shape == (0, 24)
+    assert not held.moving
+
+
+def test_moving_is_known():
+    x = scattered(0)
+    assert not ConstraintSet([Distance([[0, 1]])], x, MASSES).moving
+    assert ConstraintSet([Distance([[0, 1]], lambda t: 1 + t)], x, MASSES).moving
+    assert ConstraintSet([CASES["ImplicitSurface moving"]()], x, MASSES).moving
+    assert not ConstraintSet([LinearCombination([0], [[1, 0, 0]])], x, MASSES).moving

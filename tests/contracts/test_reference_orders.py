@@ -1,0 +1,327 @@
+"""Every stepper on every reference case: its order by slope, and the round-off floor at every stored time.
+
+The slope is fitted where the error is 30 times above the floor max(1e-11, 100 cond eps) or more, cond being the
+sensitivity of the solution to its start. Isokinetic cases are run with the thermostat as a force that depends on
+the velocities, (f.v / v.m v) m v.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from reference import cases
+from reference.cases import Case, Snapshot
+from stepper_systems import EVERY
+
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import ConvergenceError, NonFiniteError, UnsupportedError
+from kcons.motion import Motion
+from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, State, Stepper, System, run
+
+EPS = float(np.finfo(float).eps)
+STEPPERS: list[Stepper] = EVERY
+#: Run on all cases by every test run; all steppers by the long one.
+USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesMoan4()", "BlanesMoan6()"}
+#: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.
+START = {2: 3e-4, 4: 4e-9, 6: 0.0}
+#: From there on, these many times more steps each.
+FINER = (1.0, 1.12, 1.25, 1.4)
+#: So accurate that the leading term shows only below 30 times the floor of all others: for these the floor is what
+#: rounding really leaves, which is measured as well.
+FINEST = {
+    ("A02_spherical_pendulum_near_planar", "BlanesMoan6a()"): 3e-13,
+    ("A03_planar_pendulum_150deg", "BlanesMoan6a()"): 3e-13,
+    ("A03_planar_pendulum_179deg", "BlanesMoan6a()"): 1e-13,
+    ("A03_planar_pendulum_90deg", "BlanesMoan6a()"): 3e-13,
+    ("A05_two_dumbbells_lj", "BlanesMoan6()"): 2e-13,
+    ("A05_two_dumbbells_lj", "BlanesMoan6a()"): 2e-13,
+    ("A08_bead_vertical_ellipse", "BlanesMoan6()"): 3e-13,
+}
+#: The stored times where the leading term shows best: those that are later have higher floors.
+ORDER_TIMES = {
+    ("A03_planar_pendulum_179deg", "BlanesMoan6()"): 2,
+    ("A03_planar_pendulum_179deg", "BlanesMoan6a()"): 2,
+    ("A05_two_dumbbells_lj", "KahanLi6()"): 1,
+    ("A05_two_dumbbells_lj", "BlanesMoan6()"): 1,
+    ("A05_two_dumbbells_lj", "BlanesMoan6a()"): 1,
+}
+#: The leading term along great circles is below 30 times what rounding leaves here, and what is above it falls with
+#: dt^8 or faster: the order is that of the same scheme with flights by composition, and the great circles are to be
+#: better and fall no slower.
+BELOW_THE_FLOOR = {
+    ("A02_spherical_pendulum_near_top", "BlanesMoan6a()"),
+    ("A02_spherical_pendulum_near_top_Lz", "BlanesMoan6a()"),
+    ("A03_planar_pendulum_rotating", "BlanesMoan6a()"),
+}
+#: Surfaces without compiled solvers: a projection takes a millisecond.
+SLOW = frozenset(name for name in cases.NAMES if name.startswith("A08"))
+#: Nothing is left of the error where atoms fly along great circles and no forces act.
+EXACT = {("A01_sphere_free", s) for s in ("Geodesic(substeps=4)", "BlanesMoan4()", "BlanesMoan6()", "BlanesMoan6a()")}
+
+#: Take two seconds and more. In the usual run another stepper of that order is on the same case, or, for four surfaces
+#: and three isokinetic cases, on others of their kind.
+LONG = {
+    ("A02_spherical_pendulum_near_top", "BlanesMoan4()"),
+    ("A02_spherical_pendulum_near_top_Lz", "BlanesMoan4()"),
+    ("A04_double_pendulum", "BlanesMoan4()"),
+    ("A04_double_pendulum", "BlanesMoan6()"),
+    ("A04_double_spherical_pendulum", "BlanesMoan4()"),
+    ("A04_triple_pendulum", "BlanesMoan4()"),
+    ("A04_triple_pendulum", "BlanesMoan6()"),
+    ("A05_dipole_field", "BlanesMoan6()"),
+    ("A05_two_dumbbells_lj", "BlanesMoan4()"),
+    ("A05_two_dumbbells_lj", "BlanesMoan6()"),
+    ("A06_water_free3", "BlanesMoan4()"),
+    ("A06_water_free3", "BlanesMoan6()"),
+    ("A07_angle_only_flexible_bonds", "BlanesMoan4()"),
+    ("A07_angle_only_flexible_bonds", "BlanesMoan6()"),
+    ("A07_butane_bonds_angles_fixed", "BlanesMoan4()"),
+    ("A07_butane_bonds_angles_fixed", "KahanLi6()"),
+    ("A08_bead_rotating_ellipse", "Suzuki4()"),
+    ("A08_bead_rotating_hoop", "Suzuki4()"),
+    ("A08_torus_geodesic", "Suzuki4()"),
+    ("A08_torus_inner_equator", "Suzuki4()"),
+    ("A09_hanging_chain5_3d", "BlanesMoan4()"),
+    ("A09_ring6_planar", "KahanLi6()"),
+    ("A10_isokinetic_dumbbell_quartic", "KahanLi6()"),
+    ("A10_isokinetic_harmonic2d", "KahanLi6()"),
+    ("A10_isokinetic_lj4", "Suzuki4()"),
+    ("A10_isokinetic_lj4", "KahanLi6()"),
+}
+#: Later times are left to the long run.
+SLOW_FLOORS = SLOW | {"A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"}
+#: Steps with which the floor is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
+FLOOR_STEPS = {
+    "A02_spherical_pendulum_near_top": 0.025,
+    "A02_spherical_pendulum_near_top_Lz": 0.025,
+    "A03_planar_pendulum_179deg": 0.03,
+    "A03_planar_pendulum_179p9deg": 0.03,
+    "A04_double_pendulum": 0.012,
+    "A04_double_spherical_pendulum": 0.03,
+    "A04_triple_pendulum": 0.008,
+    "A05_rotor_free": 0.03,
+    "A05_rotor_gravity": 0.03,
+    "A05_two_dumbbells_lj": 0.0045,
+    "A06_water_free3": 0.0025,
+    "A07_angle_only_flexible_bonds": 0.02,
+    "A07_butane_bonds_angles_fixed": 0.025,
+    "A08_bead_rotating_ellipse": 0.008,
+    "A08_bead_rotating_hoop": 0.015,
+    "A08_bead_vertical_ellipse": 0.02,
+    "A08_torus_geodesic": 0.015,
+    "A08_torus_inner_equator": 0.02,
+    "A09_catenary_relax": 0.012,
+    "A09_hanging_chain5_3d": 0.012,
+    "A09_ring6_planar": 0.02,
+    "A10_isokinetic_constant_force": 0.025,
+    "A10_isokinetic_dumbbell_quartic": 0.015,
+    "A10_isokinetic_harmonic2d": 0.01,
+    "A10_isokinetic_lj4": 0.0015,
+}
+
+
+def depends_on_velocities(case: Case) -> bool:
+    return case.isokinetic or case.velocity_dependent
+
+
+@functools.cache
+def system(name: str) -> System:
+    case = cases.load(name)
+    held = ConstraintSet(case.constraints, case.initial.positions, case.masses, time=case.initial.time)
+    motion = Motion(held, case.initial.positions, time=case.initial.time)
+    if case.isokinetic:
+
+        def thermostatted(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+            f, p = case.force(x, v), case.masses[:, None] * v
+            return f - np.sum(f * v) / np.sum(p * v) * p
+
+        return System(motion, thermostatted, velocity_dependent=True)
+    if case.velocity_dependent:
+        return System(motion, lambda x, v, t: case.force(x, v), velocity_dependent=True)
+    nothing = np.zeros((len(case.masses), 3))
+    return System(motion, lambda x, t: case.force(x, nothing))
+
+
+def start(name: str) -> State:
+    first = cases.load(name).initial
+    return system(name).initial_state(first.positions, first.velocities, time=first.time)
+
+
+@functools.cache
+def sensitivities(name: str) -> tuple[float, ...]:
+    """Of the solution at each stored time to its start.
+
+    By differences where the file has none, to the state at earlier stored times as well, since rounding on the way
+    counts as that at the start does, and may count more: a pendulum near the top, a body about its middle axis.
+    """
+    case = cases.load(name)
+    known = [s.condition for s in case.solution]
+    if np.isfinite(known).all():
+        return tuple(float(c) for c in known)
+    setting, size, dt = system(name), 1e-6, min(0.1, 4 * FLOOR_STEPS.get(name, 0.05))
+    largest = np.nan_to_num(known, nan=1.0)
+    snapshots = [case.initial, *case.solution]
+    for j, s in enumerate(snapshots[:-1]):
+        starts = [(s.positions, s.velocities), *disturbed(s, size)]
+        states = [setting.initial_state(y, u, time=s.time, project=True) for y, u in starts]
+        for k in range(j, len(known)):
+            length = snapshots[k + 1].time - states[0].time
+            n = int(np.ceil(length / dt))
+            states = [run(setting, state, length / n, n, stepper=KahanLi6()) for state in states]
+            flat = np.array([np.concatenate([e.positions.ravel(), e.velocities.ravel()]) for e in states])
+            largest[k] = max(largest[k], np.linalg.norm(flat[1:] - flat[0]) / size)
+    return tuple(largest.tolist())
+
+
+def disturbed(snapshot: Snapshot, size: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Positions and velocities that differ from these by `size` along each axis of the tangent space, or at random."""
+    x, v = snapshot.positions, snapshot.velocities
+    if len(x) == 1:
+        along = np.cross([0.0, 1.0, 0.0], x)  # in the plane of the pendulum
+        return [(x * np.cos(size) + along * np.sin(size), v), (x, v + size * along)]
+    # Of a matrix J, the mean of |J g|^2 over normal deviates g is |J|^2.
+    some = np.random.default_rng(0).standard_normal((6, 2, *x.shape)) * size / np.sqrt(6)
+    return [(x + a, v + b) for a, b in some]
+
+
+def floor(name: str, index: int) -> float:
+    return max(1e-11, 100 * sensitivities(name)[index] * EPS)
+
+
+def telling_time(name: str, latest: float = 20.0) -> int:
+    """Where errors stand highest above the floor: once the sensitivity sets it, or as late as can be."""
+    times = [s.time for s in cases.load(name).solution]
+    for k, sensitivity in enumerate(sensitivities(name)):
+        if 100 * sensitivity * EPS >= 1e-11:
+            return k
+    return max(k for k, t in enumerate(times) if t <= latest)
+
+
+def error(name: str, stepper: Stepper, reference: Snapshot, n: int) -> float:
+    first = start(name)
+    end = run(system(name), first, (reference.time - first.time) / n, n, stepper=stepper)
+    return float(np.hypot(*deviations(end, reference)))
+
+
+def deviations(end: State, reference: Snapshot) -> tuple[float, float]:
+    """Of positions and velocities: norms, relative to the largest component where that is more than 1."""
+    return tuple(
+        float(np.linalg.norm(a - b)) / max(1.0, float(np.abs(b).max()))
+        for a, b in ((end.positions, reference.positions), (end.velocities, reference.velocities))
+    )
+
+
+def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tuple[int, float]]]:
+    """Observed order at one stored time, and the numbers of steps and errors it was fitted to."""
+    reference, rounding = cases.load(name).solution[index], FINEST.get((name, repr(stepper)))
+    lowest = 30 * (rounding or floor(name, index))
+    first = max(START[stepper.order], 8 * lowest)
+    n = 1
+    while True:
+        assert n < 1e6, "the error does not go down"
+        try:
+            e = error(name, stepper, reference, n)
+            if e <= first:
+                break
+        except (ConvergenceError, NonFiniteError):
+            pass  # the step is too large
+        n *= 2
+    base = n * (e / first) ** (1 / stepper.order)
+    points = []
+    for factor in FINER:
+        try:
+            points.append((round(base * factor), error(name, stepper, reference, round(base * factor))))
+        except ConvergenceError:
+            continue
+    points = [(n, e) for n, e in dict(points).items() if e >= lowest]
+    assert len(points) >= 3, f"too few points above {lowest:.1e}: {points}"
+    if rounding:
+        assert rounding < floor(name, index)
+        assert error(name, stepper, reference, 4 * points[-1][0]) <= rounding
+    counts, errors = np.array(points).T
+    return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0]), points
+
+
+def check_order(name: str, stepper: Stepper, index: int) -> None:
+    if (name, repr(stepper)) in EXACT:
+        reference = cases.load(name).solution[index]
+        assert error(name, stepper, reference, 3) <= floor(name, index)
+        return
+    if isinstance(stepper, BlanesMoan4 | BlanesMoan6 | BlanesMoan6a) and depends_on_velocities(cases.load(name)):
+        before = start(name)
+        with pytest.raises(UnsupportedError, match="use Suzuki4 or KahanLi6"):
+            stepper.step(system(name), before, 0.01)
+        return
+    if (name, repr(stepper)) in BELOW_THE_FLOOR:
+        exact, stepper = stepper, BlanesMoan6a()
+        stepper.exact_flight = False
+        faster, exact_points = slope(name, exact, index)
+        assert faster >= stepper.order - 0.15, exact_points
+        n, best = exact_points[-1]
+        assert best < error(name, stepper, cases.load(name).solution[index], n)
+    measured, points = slope(name, stepper, index)
+    assert measured == pytest.approx(stepper.order, abs=0.15), points
+
+
+PAIRS = [(name, stepper) for name in cases.NAMES for stepper in STEPPERS]
+
+
+def order_time(name: str, stepper: Stepper) -> int:
+    """The first stored time where that will do."""
+    if (name, repr(stepper)) in ORDER_TIMES:
+        return ORDER_TIMES[name, repr(stepper)]
+    if name in SLOW:
+        return 1 if isinstance(stepper, BlanesMoan6 | BlanesMoan6a) else 0
+    if not isinstance(stepper, KahanLi6 | BlanesMoan4 | BlanesMoan6 | BlanesMoan6a):
+        return 0
+    return telling_time(name, 20.0 if stepper.order == 6 else 5.0)
+
+
+def is_quick(name: str, stepper: Stepper) -> bool:
+    """Whether the usual run takes it; everything else waits for the long run."""
+    if name in SLOW and isinstance(stepper, BlanesMoan4 | BlanesMoan6):
+        return False
+    return (name, repr(stepper)) not in LONG
+
+
+QUICK = [p for p in PAIRS if repr(p[1]) in USUAL and is_quick(*p)]
+
+
+@pytest.mark.parametrize(("name", "stepper"), QUICK, ids=lambda p: p if isinstance(p, str) else repr(p))
+def test_order(name: str, stepper: Stepper) -> None:
+    check_order(name, stepper, order_time(name, stepper))
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize(
+    ("name", "stepper"), [p for p in PAIRS if p not in QUICK], ids=lambda p: p if isinstance(p, str) else repr(p)
+)
+def test_order_of_the_others(name: str, stepper: Stepper) -> None:
+    check_order(name, stepper, order_time(name, stepper))
+
+
+def check_floor(name: str, latest: float) -> None:
+    case, setting, state = cases.load(name), system(name), start(name)
+    stepper: Stepper = KahanLi6() if name in SLOW or depends_on_velocities(case) else BlanesMoan6()
+    for k, reference in enumerate(case.solution):
+        if k and reference.time > latest:
+            return
+        n = int(np.ceil((reference.time - state.time) / FLOOR_STEPS.get(name, 0.05)))
+        state = run(setting, state, (reference.time - state.time) / n, n, stepper=stepper)
+        allowed = floor(name, k)
+        for item, off in zip(("positions", "velocities"), deviations(state, reference), strict=True):
+            assert off <= allowed, f"{item} at t = {reference.time}: {off:.1e}, allowed {allowed:.1e}"
+
+
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_round_off_floor(name: str) -> None:
+    check_floor(name, 1.0 if name in SLOW_FLOORS or depends_on_velocities(cases.load(name)) else 5.0)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_round_off_floor_at_every_stored_time(name: str) -> None:
+    check_floor(name, np.inf)

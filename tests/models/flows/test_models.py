@@ -1,0 +1,199 @@
+"""Oscillators, pendulum and the particle on a sphere against closed forms and reference cases."""
+
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+from flow_reference import case
+
+from kcons import projection
+from kcons.errors import InputError
+from kcons.models.flows import (
+    DampedOscillator,
+    HarmonicOscillator,
+    Kind,
+    ParticleOnSphere,
+    Pendulum,
+    Stability,
+    jordan_form,
+)
+
+REGIMES = case("A12_damped_oscillator")["regimes"]
+
+
+@pytest.mark.parametrize("number", range(len(REGIMES)))
+def test_damped_oscillator_reference(number):
+    given, regime = case("A12_damped_oscillator"), REGIMES[number]
+    w = given["parameters"]["w"]
+    flow = DampedOscillator(w, 2 * regime["zeta"] * w)
+    # x_1 = Omega x, x_2 = dx/dt
+    X0 = np.array([w * given["parameters"]["x0"], given["parameters"]["v0"]])
+    for k, t in enumerate(given["times"]):
+        wanted = np.array([w * regime["x"][k], regime["v"][k]])
+        for found in (flow.closed_form(t) @ X0, flow.exact(t, X0)):
+            assert abs(found - wanted).max() < 1e-12 * max(abs(wanted).max(), 1e-3)
+    eigenvalues = sorted((complex(*pair) for pair in regime["eigenvalues"]), key=lambda z: (z.real, z.imag))
+    # The first of (23) is the faster one, or the one below the real axis. Near critical damping a rounding of eta, by
+    # eps, moves them by eps/a.
+    a = np.sqrt(abs(regime["zeta"] ** 2 - 1))
+    rounding = 4 * np.finfo(float).eps * w * max(1.0, regime["zeta"]) * (1 + (1 / a if a else 0.0))
+    assert flow.eigenvalues() == pytest.approx(eigenvalues, abs=rounding)
+
+
+def test_three_regimes():
+    kinds = {
+        "undamped": (0.0, Kind.CENTRE, Stability.STABLE),
+        "oscillating": (0.2, Kind.FOCUS, Stability.ASYMPTOTIC),
+        "critical": (2.0, Kind.NODE, Stability.ASYMPTOTIC),
+        "overdamped": (5.0, Kind.NODE, Stability.ASYMPTOTIC),
+    }
+    for regime, (eta, kind, stability) in kinds.items():
+        flow = DampedOscillator(1.0, eta)
+        assert flow.regime == regime
+        assert flow.classification().kind is kind
+        assert flow.classification().stability is stability
+    assert DampedOscillator(1.0, 2.0).jordan_blocks()[0].sizes == (2,)
+
+
+@pytest.mark.parametrize(
+    ("omega", "eta"),
+    [(1.0, 0.2), (1.3, 0.0), (0.7, 1.4), (1.0, 2.0 + 1e-9), (1.0, 2.0 - 1e-9), (3.0, 7.0), (1.0, 1e9), (1e150, 1e170)],
+)
+def test_oscillator_eigenvalues_to_the_last_digits(omega, eta):
+    # (23) with 100 digits from the same two numbers.
+    with localcontext(prec=100):
+        W, E = Decimal(omega), Decimal(eta)
+        square = (E - 2 * W) * (E + 2 * W)
+        root = abs(square).sqrt()
+        wanted = [-(E + root) / 2, -(E - root) / 2] if square > 0 else [complex(-E / 2, s * root / 2) for s in (-1, 1)]
+    for own, true in zip(DampedOscillator(omega, eta).eigenvalues(), map(complex, wanted), strict=True):
+        assert own.real == pytest.approx(true.real, rel=1e-15, abs=0.0)
+        assert own.imag == pytest.approx(true.imag, rel=1e-15, abs=0.0)
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.2, 1.9, 2.0, 2.1, 5.0])
+def test_jordan_form_of_the_oscillator(eta):
+    omega, t = 1.7, 0.6
+    flow = DampedOscillator(omega, omega * eta)
+    form = flow.jordan_form()
+    assert form.T @ form.J @ np.linalg.inv(form.T) == pytest.approx(flow.matrix, abs=1e-13)
+    assert form.propagator(t) == pytest.approx(flow.closed_form(t), abs=1e-13)
+    if eta == 2.0:
+        assert form.J.tolist() == [[-omega, 1.0], [0.0, -omega]]
+        return
+    # As (24) is printed.
+    a = np.sqrt(complex(flow.eta**2 - 4 * omega**2))
+    printed = np.array([[(a - flow.eta) / (2 * omega), -(a + flow.eta) / (2 * omega)], [1.0, 1.0]])
+    assert pytest.approx(printed, abs=1e-14) == form.T
+    assert pytest.approx(np.diag([-(a + flow.eta) / 2, (a - flow.eta) / 2]), abs=1e-14) == form.J
+    # The general one finds the same eigenvalues.
+    own = sorted((b.eigenvalue for b in jordan_form(flow.matrix).blocks), key=lambda z: (z.real, z.imag))
+    assert own == pytest.approx(sorted(np.diag(form.J), key=lambda z: (z.real, z.imag)), abs=1e-14)
+
+
+def test_jordan_form_of_the_harmonic_oscillator():
+    # (16), (17) to the letter.
+    form = HarmonicOscillator(2.0).jordan_form()
+    assert form.J.tolist() == [[-2j, 0.0], [0.0, 2j]]
+    assert form.T.tolist() == [[1j, -1j], [1.0, 1.0]]
+    assert HarmonicOscillator(2.0).eigenvalues() == (-2j, 2j)
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.2, 1.999999, 2.0, 2.000001, 2.01, 3.0, 50.0])
+def test_closed_form_is_the_exponential(eta):
+    flow = DampedOscillator(1.3, 1.3 * eta)
+    for t in (0.0, 1e-3, 1.0, 20.0):
+        assert flow.closed_form(t) == pytest.approx(flow.propagator(t), rel=1e-10, abs=1e-14)
+    assert np.all(np.isfinite(flow.closed_form(1e5)))
+
+
+def test_harmonic_oscillator_runs_on_a_circle():
+    flow, X0 = HarmonicOscillator(1.7), np.array([0.6, -0.8])
+    t = np.linspace(0.0, 9.0, 7)
+    assert flow.circle(t, X0) == pytest.approx(flow.exact(t, X0), abs=1e-12)
+    assert np.linalg.norm(flow.circle(t, X0), axis=1) == pytest.approx(np.ones(7))
+    assert flow.velocity(0.0, X0) == pytest.approx([1.7 * -0.8, -1.7 * 0.6])
+    assert flow.divergence(0.0, X0) == 0.0
+
+
+PENDULUMS = ["10deg", "90deg", "150deg", "179deg", "179p9deg", "rotating"]
+
+
+@pytest.mark.parametrize("name", PENDULUMS)
+def test_pendulum_reference(name):
+    given = case(f"A03_planar_pendulum_{name}")
+    x, v = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
+    pivot = np.array(given["constraints"][0].get("point", [0.0, 0.0, 0.0]))
+    down = x - pivot
+    theta = np.arctan2(down[0], -down[2])
+    rate = v[0] * np.cos(theta) + v[2] * np.sin(theta)
+    times = np.array(given["times"])
+    found = Pendulum().exact(times, [theta, rate])
+    positions = np.stack([np.sin(found[:, 0]), 0 * times, -np.cos(found[:, 0])], axis=1) + pivot
+    wanted = np.array(given["reference"]["positions"])[:, 0]
+    assert abs(positions - wanted).max() < 1e-10
+    velocities = found[:, 1, None] * np.stack([np.cos(found[:, 0]), 0 * times, np.sin(found[:, 0])], axis=1)
+    assert abs(velocities - np.array(given["reference"]["velocities"])[:, 0]).max() < 1e-10
+
+
+@pytest.mark.parametrize("X0", [[0.3, 0.0], [2.0, -1.0], [-1.0, 2.5], [7.0, 0.4], [0.0, 2.0], [0.0, 0.0], [1.0, -2.6]])
+def test_pendulum_exact_from_any_start(X0):
+    flow = Pendulum(1.4)
+    found = flow.solve((0.0, 6.0), X0, t_eval=[0.0, 2.0, 6.0], rtol=1e-12, atol=1e-13)
+    assert flow.exact(found.t, X0) == pytest.approx(found.y.T, abs=1e-9)
+    assert flow.exact(0.0, X0) == pytest.approx(X0, abs=1e-14)
+
+
+def test_small_swings_are_harmonic():
+    t = np.linspace(0.0, 10.0, 5)
+    assert Pendulum(2.0).exact(t, [1e-4, 0.0])[:, 0] == pytest.approx(1e-4 * np.cos(2.0 * t), abs=1e-11)
+
+
+def test_free_particle_on_a_sphere():
+    given = case("A01_sphere_free")
+    x0, v0 = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
+    spec = given["constraints"][0]
+    centre = np.array(spec.get("point", [0.0, 0.0, 0.0]))
+    flow = ParticleOnSphere(spec["target"])
+    found = flow.great_circle(given["times"], x0 - centre, v0) + centre
+    assert abs(found - np.array(given["reference"]["positions"])[:, 0]).max() < 1e-10
+
+
+@pytest.mark.parametrize("name", ["generic", "near_conical"])
+def test_spherical_pendulum(name):
+    given = case(f"A02_spherical_pendulum_{name}")
+    x0, v0 = (np.array(given["initial"][key])[0] for key in ("positions", "velocities"))
+    m = given["masses"][0]
+    (force,) = given["forces"]
+    g = np.array(force["g"])
+    flow = ParticleOnSphere(given["constraints"][0]["target"], m, lambda x: m * g)
+    times = [t for t in given["times"] if t <= 10.0]
+    found = flow.solve((0.0, times[-1]), np.concatenate([x0, v0]), t_eval=times, rtol=1e-13, atol=1e-13)
+    assert abs(found.y[:3].T - np.array(given["reference"]["positions"])[: len(times), 0]).max() < 1e-10
+
+
+def test_acceleration_on_the_sphere_is_the_projected_one():
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=3)
+    x *= 1.5 / np.linalg.norm(x)
+    v = np.cross(x, rng.normal(size=3))
+    f = rng.normal(size=3)
+    flow = ParticleOnSphere(1.5, 2.0, lambda x: f)
+    wanted = projection.acceleration(2 * x[None, :], [2.0], f, [-2 * v @ v])
+    assert flow.acceleration(x, v) == pytest.approx(wanted, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: DampedOscillator(0.0),
+        lambda: DampedOscillator(1.0, -0.1),
+        lambda: HarmonicOscillator(np.nan),
+        lambda: Pendulum(-1.0),
+        lambda: ParticleOnSphere(0.0),
+        lambda: ParticleOnSphere(1.0, -1.0),
+    ],
+)
+def test_bad_parameters_are_refused(make):
+    with pytest.raises(InputError):
+        make()

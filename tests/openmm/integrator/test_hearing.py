@@ -1,0 +1,394 @@
+"""What is done to a Context behind its integrator's back."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import context_of, potential_energy, started, state_of, water_box
+
+from kcons.constraints import Distance, Sphere
+from kcons.errors import CertificateError, InputError, KconsError, UnsupportedError
+from kcons.openmm import (
+    CarriedConstraints,
+    CollectiveRows,
+    ExpressionSurface,
+    Langevin,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    hold,
+    surface_parts,
+)
+from tests.openmm.integrator.test_settings import (
+    CENTRE,
+    KINDS,
+    RADIUS,
+    X,
+    bond,
+    carried_at,
+    cluster,
+    on_a_sphere,
+    row_at,
+    thermostatted,
+)
+
+PARTS = {"collective": row_at, "carried": carried_at, "surface": on_a_sphere}
+parts = pytest.mark.parametrize("make", PARTS.values(), ids=PARTS)
+
+
+# -- the System is read again ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])
+@pytest.mark.parametrize("preserved", [True, False])
+def test_rows_after_reinitialize(kind, preserved):
+    system, integrator = cluster(), kind(0.002)
+    context = started(system, integrator, X, 0 * X)
+    integrator.step(3)
+    free = integrator.degrees_of_freedom()
+    x, v = state_of(context)
+    system.addConstraint(0, 1, 1.01 * float(np.linalg.norm(x[0] - x[1])))
+    integrator.step(3)
+    assert integrator.degrees_of_freedom() == free  # the Context does not know it yet
+    context.reinitialize(preserveState=preserved)
+    if not preserved:
+        context.setPositions(x)
+        context.setVelocities(v)
+    integrator.step(3)
+    assert integrator.degrees_of_freedom() == free - 1
+    x = state_of(context)[0]
+    assert np.linalg.norm(x[0] - x[1]) == pytest.approx(system.getConstraintParameters(0)[2]._value, rel=1e-9)
+    system.setConstraintParameters(0, 0, 1, 3.0)
+    context.reinitialize(preserveState=True)
+    with pytest.raises(InputError, match="constraint 0 of the System"):
+        integrator.step(1)
+
+
+def test_forces_and_parts_after_reinitialize():
+    made = row_at(0.3)
+    made.run(3)
+    force = made.context.getSystem().getForce(0)
+    force.setBondParameters(0, 1, 0, 0.3, 5000.0)
+    made.context.reinitialize(preserveState=True)
+    state = made.context.getState(positions=True, velocities=True)
+    made.run(1)
+    fresh = row_at(0.3)
+    fresh.context.getSystem().getForce(0).setBondParameters(0, 1, 0, 0.3, 5000.0)
+    fresh.context.reinitialize()
+    fresh.context.setState(state)
+    fresh.run(1)
+    np.testing.assert_allclose(state_of(made.context), state_of(fresh.context), rtol=0, atol=1e-12)
+
+
+# -- forces change --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parameters_of_forces_are_used_in_the_next_step(kind):
+    made, fresh = KINDS[kind](), KINDS[kind]()
+    quiet = [one.integrator for one in (made, fresh) if "Langevin" in kind]
+    for integrator in quiet:
+        integrator.setFriction(0)
+    made.run(5)
+    state = made.context.getState(positions=True, velocities=True)
+    for one in (made, fresh):
+        force = one.context.getSystem().getForce(0)
+        force.setBondParameters(0, 1, 0, 0.3, 5000.0)
+        force.updateParametersInContext(one.context)
+    fresh.context.setState(state)
+    made.run(1)
+    fresh.run(1)
+    within = 1e-4 if "leapfrog" in kind else 1e-10
+    np.testing.assert_allclose(state_of(made.context), state_of(fresh.context), rtol=0, atol=within)
+    old = KINDS[kind]()
+    for integrator in [old.integrator] if quiet else ():
+        integrator.setFriction(0)
+    old.context.setState(state)
+    old.run(1)
+    assert np.abs(state_of(old.context)[1] - state_of(made.context)[1]).max() > 1e-2
+
+
+@parts
+def test_a_state_of_other_forces_does_not_bring_them(make):
+    """The State of a run carries the forces that its program has kept."""
+    soft, stiff, plain = make(strength=200.0), make(strength=5000.0), make(strength=5000.0)
+    soft.run(5)
+    stiff.context.setState(soft.context.getState(positions=True, velocities=True, integratorParameters=True))
+    plain.context.setState(soft.context.getState(positions=True, velocities=True))
+    stiff.run(1)
+    plain.run(1)
+    np.testing.assert_allclose(state_of(stiff.context), state_of(plain.context), rtol=0, atol=1e-12)
+
+
+# -- positions and velocities change ----------------------------------------------------------------------
+
+
+def length_of(make, context):
+    x = state_of(context)[0]
+    return np.linalg.norm(x[0] - CENTRE) if make is on_a_sphere else np.linalg.norm(x[0] - x[7])
+
+
+@parts
+def test_positions_off_the_rows_are_not_pulled_back_in_silence(make):
+    made = make()
+    made.run(5)
+    wanted = length_of(make, made.context)
+    x, v = state_of(made.context)
+    moved = x.copy()
+    moved[0] += 0.5 * (x[7] - x[0]) + 0.05
+    made.context.setPositions(moved)
+    with pytest.raises(KconsError, match="apply"):
+        made.run(1)
+    np.testing.assert_array_equal(state_of(made.context), [moved, v])
+    made.integrator.applyConstraints(made.context)
+    made.run(3)
+    assert length_of(make, made.context) == pytest.approx(wanted, abs=1e-12)
+
+
+@parts
+def test_velocities_are_made_tangent_whenever_they_are_set(make):
+    made = make()
+    made.run(5)
+    rng = np.random.default_rng(0)
+    made.context.setVelocities(rng.normal(size=X.shape))
+    made.integrator.check_every = 0
+    made.run(1)
+    made.integrator.check(made.context)
+    made.context.setVelocitiesToTemperature(300, 3)
+    twin = make()
+    twin.context.setState(made.context.getState(positions=True, velocities=True))
+    twin.integrator.applyVelocityConstraints(twin.context)
+    made.run(1)
+    twin.run(1)
+    np.testing.assert_allclose(state_of(made.context), state_of(twin.context), rtol=0, atol=1e-12)
+
+
+def _chain():
+    """Ten beads, bonded and repelling; the ends are to be held."""
+    chain, bonds, pairs = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomNonbondedForce("0.1/r^2")
+    topology = app.Topology()
+    residue = topology.addResidue("CH", topology.addChain())
+    for i in range(10):
+        chain.addParticle(12.0)
+        topology.addAtom(f"C{i}", app.element.carbon, residue)
+        pairs.addParticle([])
+        if i:
+            bonds.addBond(i - 1, i, 0.15, 1e5)
+    chain.addForce(bonds)
+    chain.addForce(pairs)
+    return topology, chain, np.cumsum(np.random.default_rng(1).normal(size=(10, 3)) * 0.09, axis=0)
+
+
+@pytest.mark.parametrize("how", ["collective", "carried"])
+def test_the_minimiser_of_a_simulation_keeps_rows(how):
+    topology, chain, x = _chain()
+    part = CollectiveRows(chain, [bond(0, 9)], positions=x) if how == "collective" else None
+    part = part or hold(chain, [Distance([[0, 9]])], x)
+    integrator = ProjectedIntegrator(0.001, parts=[part])
+    made = app.Simulation(topology, chain, integrator, openmm.Platform.getPlatformByName("Reference"))
+    made.context.setPositions(x)
+    before = potential_energy(made.context)
+    made.minimizeEnergy(maxIterations=200)
+    assert potential_energy(made.context) < before - 100
+    y = state_of(made.context)[0]
+    assert np.linalg.norm(y[0] - y[9]) == pytest.approx(np.linalg.norm(x[0] - x[9]), abs=1e-12)
+    made.step(1)
+    assert np.abs(state_of(made.context)[0] - y).max() < 1e-3
+    with pytest.raises(UnsupportedError, match="without a reporter"):
+        made.minimizeEnergy(reporter=openmm.MinimizationReporter())
+    free = app.Simulation(topology, _chain()[1], openmm.VerletIntegrator(0.001), made.context.getPlatform())
+    free.context.setPositions(x)
+    free.minimizeEnergy(maxIterations=200)
+    assert np.abs(state_of(free.context)[0] - y).max() > 0.01
+
+
+# -- the start --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator, "Langevin", "hold"])
+def test_a_start_that_is_a_little_off_is_put_right(kind, caplog):
+    system, x = water_box(8, spacing=0.4)
+    parts = [hold(system, [], 1.02 * x, take="all", keep_water=False)] if kind == "hold" else []
+    if kind == "Langevin":
+        integrator = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1))
+    else:
+        integrator = ProjectedIntegrator(1e-3, parts=parts) if kind == "hold" else kind(1e-3)
+    context = started(system, integrator, 1.02 * x)
+    with caplog.at_level(logging.WARNING, "kcons"):
+        integrator.step(1)
+    (record,) = caplog.records
+    assert record.name == "kcons.openmm"
+    assert "put right" in record.getMessage()
+    y = state_of(context)[0].reshape(-1, 3, 3)
+    for a, b, d in ((0, 1, 0.09572), (0, 2, 0.09572), (1, 2, 0.15139)):
+        np.testing.assert_allclose(np.linalg.norm(y[:, a] - y[:, b], axis=1), d, rtol=1e-7)
+    caplog.clear()
+    integrator.step(3)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_a_start_that_is_far_off_is_refused(carried):
+    system, x = water_box(8, spacing=0.4)
+    parts = [hold(system, [], x, take="all", keep_water=False)] if carried else []
+    integrator = ProjectedIntegrator(1e-3, parts=parts)
+    context = started(system, integrator, 1.12 * x)
+    with pytest.raises(InputError, match=r"positions|at the start"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context)[0], 1.12 * x)
+
+
+# -- parts that were forgotten ------------------------------------------------------------------------------
+
+
+def _held(how):
+    system = cluster()
+    if how == "hold":
+        hold(system, [Distance([[0, 7]])], X)
+    elif how == "collective":
+        CollectiveRows(system, [bond()], positions=X)
+    elif how == "compiled surface":
+        surface_parts(Sphere([0], CENTRE, RADIUS), system=system, compiled=True)
+    else:
+        surface_parts(ExpressionSurface([0], f"x^2+y^2+z^2-{X[0] @ X[0]}"), system=system)
+    return system
+
+
+@pytest.mark.parametrize("kind", [ProjectedIntegrator, RattleIntegrator])
+@pytest.mark.parametrize("how", ["hold", "collective", "compiled surface", "formula"])
+@pytest.mark.parametrize("copied", [False, True])
+def test_forgotten_parts_are_refused(how, kind, copied):
+    system = _held(how)
+    if copied and how != "compiled surface":
+        system = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(system))
+    integrator = kind(1e-3)
+    context = started(system, integrator, X)
+    with pytest.raises(InputError, match=r"parts=\[rows\]"):
+        integrator.step(1)
+    if how == "hold":
+        again = ProjectedIntegrator(1e-3, parts=[CarriedConstraints.of(system)])
+        context = started(system, again, X)
+        again.step(1)
+    del context
+
+
+# -- energies -------------------------------------------------------------------------------------------------
+
+
+@parts
+def test_coordinates_are_no_energy(make):
+    made, free = make(), thermostatted(None)()
+    made.run(2)
+    free.context.getSystem()
+    x = state_of(made.context)[0]
+    bare = started(cluster(), openmm.VerletIntegrator(1e-3), x)
+    assert potential_energy(made.context) == pytest.approx(potential_energy(bare), rel=1e-12)
+    forces = [
+        np.asarray(context.getState(forces=True).getForces(asNumpy=True)._value) for context in (made.context, bare)
+    ]
+    np.testing.assert_allclose(*forces, rtol=0, atol=1e-9)
+    if make is row_at:
+        (group,) = made.part.groups
+        state = made.context.getState(energy=True, groups={group})
+        assert state.getPotentialEnergy() / unit.kilojoule_per_mole == pytest.approx(0.3, abs=1e-12)
+
+
+# -- the certificate --------------------------------------------------------------------------------------------
+
+
+@parts
+def test_solvers_that_lie_are_found(make):
+    """The program holds another target than the rows say: at the next check, back to the last that was right."""
+    made = make()
+    made.integrator.check_every = 10
+    made.run(20)
+    good = state_of(made.context)
+    _lie(make, made)
+    with pytest.raises(CertificateError, match=r"positions are off row .* back at step 20") as caught:
+        made.run(15)
+    assert caught.value.step == 30
+    assert caught.value.residual > 1e-6
+    assert caught.value.state.getStepCount() == 20
+    np.testing.assert_array_equal(state_of(made.context), good)
+    assert made.context.getStepCount() == 20
+
+
+def _lie(make, made):
+    """Let the solver believe in a target that is 1e-5 nm off."""
+    program = made.integrator.program
+    if make is row_at:
+        program.write("target1_0", made.part.targets(made.context)[0] + 1e-5)
+    elif make is on_a_sphere:
+        table = np.array(made.integrator.getPerDofVariableByName("s_k"))
+        made.integrator.setPerDofVariableByName("s_k", (table * (1 + 2e-4)).tolist())
+    else:
+        solve = made.part.motion.project_positions
+
+        def astray(*arguments, **options):
+            result = solve(*arguments, **options)
+            options["velocities"][0] += 1e-5
+            return result
+
+        made.part.motion.project_positions = astray
+
+
+@pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere])
+def test_velocities_are_certified(make):
+    made = make()
+    made.run(5)
+    v = state_of(made.context)[1].copy()
+    v[0] += 1e-4
+    openmm._openmm.Context_setVelocities(made.context, [openmm.Vec3(*row) for row in v])
+    with pytest.raises(KconsError, match=r"velocit"):
+        made.integrator.check(made.context)
+
+
+def test_velocities_along_constraints_of_the_system_are_certified():
+    made = thermostatted(None)()
+    made.run(5)
+    v = state_of(made.context)[1].copy()
+    v[6] += 1e-4
+    openmm._openmm.Context_setVelocities(made.context, [openmm.Vec3(*row) for row in v])
+    with pytest.raises(CertificateError, match=r"velocities are off row constraint 0 of the System"):
+        made.integrator.check(made.context)
+
+
+def test_contexts_of_others_are_left_alone():
+    context = context_of(cluster(), openmm.VerletIntegrator(1e-3))
+    context.setPositions(X)
+    state = context.getState(positions=True, energy=True)
+    context.setState(state)
+    checkpoint = context.createCheckpoint()
+    context.getIntegrator().step(2)
+    context.loadCheckpoint(checkpoint)
+    np.testing.assert_array_equal(state_of(context)[0], X)
+    with pytest.raises(openmm.OpenMMException):
+        context.loadCheckpoint(b"nothing")
+    context.reinitialize(True)
+    openmm.LocalEnergyMinimizer.minimize(context, maxIterations=5)
+    assert context.getState(energy=True).getPotentialEnergy() < state.getPotentialEnergy()
+    assert openmm.Context.setState.__doc__.startswith("\n        setState(self, state)")
+
+
+def test_moving_row_goes_on_through_a_state():
+    def make():
+        system = cluster()
+        rows = CollectiveRows(system, [Row(bond(), 0.30, rate=1.0)], positions=X)
+        integrator = ProjectedIntegrator(0.002, parts=[rows])
+        context = started(system, integrator, X, 0 * X)
+        rows.restore(context)
+        return rows, integrator, context
+
+    _, integrator, context = make()
+    integrator.step(5)
+    state = context.getState(positions=True, velocities=True, integratorParameters=True)
+    again, other, there = make()
+    there.setState(state)
+    other.step(5)
+    integrator.step(5)
+    assert again.values(there)[0] == pytest.approx(0.32, abs=1e-12)
+    np.testing.assert_array_equal(state_of(there), state_of(context))

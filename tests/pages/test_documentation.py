@@ -1,0 +1,112 @@
+"""Every snippet in README.md and docs/, and every example, runs as it stands."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kcons import projection
+from kcons.cli import main
+from kcons.constraints import Constraint
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.motion import Motion
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+#: Between the cells of a table.
+BAR = re.compile(r"(?<!\\)\|")
+
+
+def snippets(language):
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for match in FENCE.finditer(text):
+            if match.group(1) == language:
+                line = text.count("\n", 0, match.start()) + 1
+                found.append(pytest.param(page, match.group(2), id=f"{page.name}:{line}"))
+    return found
+
+
+def python_pages():
+    """The Python snippets of one page continue each other."""
+    pages = {}
+    for parameter in snippets("python"):
+        page, code = parameter.values
+        pages.setdefault(page, []).append(code)
+    return [pytest.param("\n".join(codes), id=page.name) for page, codes in pages.items()]
+
+
+@pytest.mark.parametrize("code", python_pages())
+def test_python_snippets_run(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "snippet", "exec"), {"__name__": "snippet"})
+
+
+@pytest.mark.parametrize(("page", "text"), snippets("console"))
+def test_console_snippets_run(page, text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    commands = [line[2:] for line in text.splitlines() if line.startswith("$ ")]
+    assert commands, f"a console block in {page.name} has no line that starts with '$ '"
+    for command in commands:
+        program, *arguments = shlex.split(command, comments=True)
+        assert program == "kcons", f"only kcons commands can be tested, not {command!r}"
+        assert main.main(arguments) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.name)
+def test_example_runs(script, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    result = subprocess.run(
+        [sys.executable, "-W", "error", str(script)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip()
+
+
+def test_pages_and_examples_were_found():
+    assert ROOT / "docs" / "compare.md" in PAGES
+    assert EXAMPLES
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+def test_links_within_the_project_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        head, *rows = table.splitlines()
+        cells = len(BAR.findall(head))
+        assert [row for row in rows if len(BAR.findall(row)) != cells] == []
+
+
+def test_readme_links_to_every_page():
+    linked = re.findall(r"\]\((docs/[\w-]+\.md)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {ROOT / page for page in linked} == set(PAGES) - {ROOT / "README.md"}
+
+
+def test_names_in_the_notation_exist():
+    owners = {"projection": projection, "Motion": Motion, "ConstraintSet": ConstraintSet, "Constraint": Constraint}
+    text = (ROOT / "docs/notation.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(projection|Motion|ConstraintSet|Constraint)\.(\w+)", text)
+    assert len(named) > 20
+    for owner, name in named:
+        assert hasattr(owners[owner], name), f"{owner}.{name}"

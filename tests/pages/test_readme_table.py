@@ -1,0 +1,35 @@
+"""README's table is that of the committed run of the command above it, without some of its methods."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from kcons.cli.terminal import rendered
+from kcons.comparison.work_precision import report
+from kcons.comparison.work_precision.measurement import Comparison
+
+ROOT = Path(__file__).parents[2]
+SHOWN = ("rattle", "suzuki4", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853")
+
+
+def committed():
+    data = json.loads((ROOT / "docs" / "results" / "compare_water.json").read_text(encoding="utf-8"))
+    return Comparison.from_dict(data)
+
+
+def test_readme_shows_the_committed_run():
+    found = committed()
+    found = replace(found, measurements=[m for m in found.measurements if m.method in SHOWN])
+    notes = [line for line in report.explanation(found).splitlines() if line.startswith("[")]
+    lines = [line.rstrip() for line in (*rendered(report.table(found)).splitlines(), *notes)]
+    wanted = "\n".join(line for line in lines if line)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert wanted in readme, f"README.md has another table than\n\n{wanted}"
+
+
+def test_what_readme_says_of_it():
+    found = committed()
+    best, finest = found.of("blanes-moan6")[0], found.of("rattle")[-1]
+    assert (best.setting, finest.setting) == (12.0, 0.5)
+    assert round(finest.error / best.error) == 36
+    assert 0.5 < best.seconds_per_time / finest.seconds_per_time < 0.6

@@ -1,0 +1,69 @@
+"""Systems with rows that are carried through OpenMM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import openmm
+from openmm import app, unit
+
+from kcons.constraints import Dihedral
+from kcons.openmm import ProjectedIntegrator
+from kcons.openmm.carried.hold import hold
+
+NM, PS = unit.nanometer, unit.picosecond
+
+
+PEPTIDE_FILE = Path(__file__).parents[1] / "data" / "alanine-dipeptide-implicit.pdb"
+PEPTIDE = app.PDBFile(str(PEPTIDE_FILE))
+PSI = [[6, 8, 14, 16]]
+
+
+def context_of(system, integrator, platform="Reference"):
+    properties = {"Threads": "1"} if platform == "CPU" else {}
+    return openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+
+
+def state_of(context):
+    state = context.getState(positions=True, velocities=True)
+    return (
+        state.getPositions(asNumpy=True).value_in_unit(NM).copy(),
+        state.getVelocities(asNumpy=True).value_in_unit(NM / PS).copy(),
+    )
+
+
+def start(context, part, x, temperature=300, seed=1):
+    context.setPositions(x)
+    part.apply_positions(context)
+    context.setVelocitiesToTemperature(temperature, seed)
+    part.apply_velocities(context)
+    part.check(context)
+
+
+def peptide(rows=True, scheme="rattle", dt=0.001, platform="Reference", constraints=app.AllBonds):
+    """Alanine dipeptide with all bonds, and a dihedral, carried."""
+    system = app.ForceField("amber14-all.xml").createSystem(
+        PEPTIDE.topology, constraints=constraints, rigidWater=False, removeCMMotion=False
+    )
+    part = hold(system, [Dihedral(PSI)] if rows else [], PEPTIDE.positions, take="all")
+    integrator = ProjectedIntegrator(dt, scheme, parts=[part])
+    context = context_of(system, integrator, platform)
+    start(context, part, PEPTIDE.positions)
+    return part, integrator, context
+
+
+def free(masses, force=None):
+    """Particles under a force on each, or none."""
+    system = openmm.System()
+    for m in masses:
+        system.addParticle(m)
+    if force is not None:
+        system.addForce(force)
+    return system
+
+
+def pull(strength, n):
+    force = openmm.CustomExternalForce(f"-{strength}*z")
+    for k in range(n):
+        force.addParticle(k, [])
+    return force

@@ -1,0 +1,182 @@
+"""Systems and platforms that the tests of the OpenMM side share."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import openmm
+from openmm import app, unit
+from openmm_parts import HeldCoordinates
+
+from kcons.openmm.integrator.guard import positions_of, velocities_of
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+#: What every test that is parametrised by platform runs on: they carry exact doubles and are on every machine.
+#: Platforms of a GPU, or OpenCL on the CPU, may be there as well; no test depends on whether they are.
+PLATFORMS = ("Reference", "CPU")
+#: With several threads, forces are summed in any order, and no run is like another.
+PROPERTIES = {"CPU": {"Threads": "1", "DeterministicForces": "true"}}
+
+
+def context_of(system, integrator, platform="Reference"):
+    place = openmm.Platform.getPlatformByName(platform)
+    return openmm.Context(system, integrator, place, PROPERTIES.get(platform, {}))
+
+
+def started(system, integrator, x, v=None, platform="Reference"):
+    """A Context at these positions and velocities."""
+    context = context_of(system, integrator, platform)
+    context.setPositions(x)
+    if v is not None:
+        context.setVelocities(v)
+    return context
+
+
+def state_of(context):
+    return positions_of(context), velocities_of(context)
+
+
+def total_energy(context):
+    state = context.getState(energy=True)
+    return (state.getKineticEnergy() + state.getPotentialEnergy()).value_in_unit(unit.kilojoule_per_mole)
+
+
+def potential_energy(context):
+    return context.getState(energy=True).getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)
+
+
+def forces_at(context):
+    state = context.getState(forces=True)
+    return np.asarray(state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer))
+
+
+def rows_of(system):
+    table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    pairs = np.array([(i, j) for i, j, _ in table])
+    return pairs, np.array([d.value_in_unit(unit.nanometer) for *_, d in table])
+
+
+def masses_of(system):
+    return np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(system.getNumParticles())])
+
+
+def residuals(system, context):
+    """Largest relative error of a distance, and of a velocity along it (per root mean square velocity)."""
+    pairs, lengths = rows_of(system)
+    x, v = state_of(context)
+    r, u = (a[pairs[:, 0]] - a[pairs[:, 1]] for a in (x, v))
+    d = np.linalg.norm(r, axis=1)
+    along = np.einsum("ij,ij->i", r, u) / d
+    return np.abs(d / lengths - 1).max(), np.abs(along).max() / np.sqrt(np.mean(v**2))
+
+
+def dumbbell(length=0.1, masses=(12.0, 1.0), stiffness=50.0):
+    """One bond in an anharmonic field that turns it."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("k*(x^2+1.3*y^2+0.7*z^2)+c*x*y^3")
+    field.addGlobalParameter("k", stiffness)
+    field.addGlobalParameter("c", 10 * stiffness)
+    for m in masses:
+        field.addParticle(system.addParticle(m), [])
+    system.addForce(field)
+    system.addConstraint(0, 1, length)
+    x = np.array([[0.3, 0.1, 0.2], [0.3 + length, 0.1, 0.2]])
+    v = np.array([[0.1, 0.4, -0.3], [0.1, -0.9, 0.8]])
+    return system, x, v
+
+
+def hexagon(rows):
+    """Planar six-ring held by some of its 15 distances."""
+    angles = np.arange(6) * np.pi / 3
+    x = 0.14 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    pairs = sorted(
+        ((i, j) for i in range(6) for j in range(i)), key=lambda ij: np.linalg.norm(x[ij[0]] - x[ij[1]]).round(6)
+    )
+    system = openmm.System()
+    for _ in x:
+        system.addParticle(12.0)
+    for i, j in pairs[:rows]:
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+    return system, x
+
+
+def water_box(n=27, spacing=0.31, exact=False):
+    """Flexible-free TIP3P on a lattice in a periodic box, with reaction field; exact: lengths that a float holds."""
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    edge = round(n ** (1 / 3))
+    side = edge * spacing
+    force.setCutoffDistance(0.45 * side)
+    oh, hh = 0.09572, 0.15139
+    if exact:
+        oh, hh = float(np.float32(oh)), float(np.float32(hh))
+    rng = np.random.default_rng(1)
+    x = []
+    for place in np.ndindex(edge, edge, edge):
+        first = system.getNumParticles()
+        for m, charge, sigma, epsilon in ((15.999, -0.834, 0.31507, 0.6359), *[(1.008, 0.417, 0.1, 0.0)] * 2):
+            system.addParticle(m)
+            force.addParticle(charge, sigma, epsilon)
+        for i, j, d in ((0, 1, oh), (0, 2, oh), (1, 2, hh)):
+            system.addConstraint(first + i, first + j, d)
+            force.addException(first + i, first + j, 0, 1, 0)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        height = np.sqrt(oh**2 - hh**2 / 4)
+        shape = np.array([[0, 0, 0], [height, hh / 2, 0], [height, -hh / 2, 0]])
+        x.extend(shape @ turn.T + spacing * np.array(place))
+    system.addForce(force)
+    system.setDefaultPeriodicBoxVectors(*(side * np.eye(3)))
+    return system, np.array(x)
+
+
+@cache
+def alanine(held="AllBonds"):
+    """Alanine dipeptide in vacuum, equilibrated at 300 K with all bonds held: system, x, v."""
+    from kcons.openmm import ProjectedIntegrator
+
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    constraints = None if held is None else getattr(app, held)
+    system = app.ForceField("amber14-all.xml").createSystem(pdb.topology, constraints=constraints)
+    integrator = ProjectedIntegrator(0.001, tolerance=1e-13)
+    context = started(system, integrator, pdb.positions)
+    integrator.minimizeEnergy(context, maxIterations=50)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(200)
+    return system, *state_of(context)
+
+
+def loose_alanine():
+    """The same with a flexible bond to its first atom, a hydrogen, and nothing that removes momentum."""
+    system = copy.deepcopy(alanine()[0])
+    # What is held in space does not go together with a CMMotionRemover.
+    kinds = [type(force) for force in system.getForces()]
+    system.removeForce(kinds.index(openmm.CMMotionRemover))
+    for k in reversed(range(system.getNumConstraints())):
+        i, j, d = system.getConstraintParameters(k)
+        if 0 in (i, j):
+            system.removeConstraint(k)
+            bond = openmm.HarmonicBondForce()
+            bond.addBond(i, j, d, 2e5)
+            system.addForce(bond)
+    return system, *alanine()[1:]
+
+
+def holding(**arguments):
+    """A part that holds z of the atom that no constraint of `loose_alanine` touches."""
+    return HeldCoordinates([0], 2, float(alanine()[1][0, 2]), 22, **arguments)
+
+
+def volumes_under_pressure(system, integrator, context):
+    """Volumes (nm^3) met in 80 steps under the barostat of the System, always on its constraints."""
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    volumes = set()
+    for _ in range(20):
+        integrator.step(4)
+        volumes.add(context.getState().getPeriodicBoxVolume() / unit.nanometer**3)
+        assert residuals(system, context)[0] < 1e-7
+    return volumes

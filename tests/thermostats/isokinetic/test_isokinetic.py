@@ -1,0 +1,297 @@
+"""The isokinetic thermostat: the right motion, its order, and its constants."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+from isokinetic_systems import ORDERS, water_and_more
+from reference import cases
+from thermostat_systems import dumbbells, integrated, quartic, quartic_potential, system, waves
+
+from kcons.constraints import Distance, Ellipsoid, KnifeEdge, Plane, Sphere, Torus
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.motion import Motion
+from kcons.steppers import State, System, run
+from kcons.thermostats import Isokinetic, thermal_velocities
+
+NAMES = [name for name in cases.NAMES if "isokinetic" in name]
+#: Single atoms and free clusters: there is no temperature, and it is said.
+HAS_NO_TEMPERATURE = "ignore:(total momentum|the forces exert):UserWarning"
+
+
+@functools.cache
+def referenced(name: str) -> System:
+    case = cases.load(name)
+    start = case.initial.positions
+    motion = Motion(ConstraintSet(case.constraints, start, case.masses), start)
+    return System(motion, lambda x, t: case.force(x, np.zeros_like(x)), potential=lambda x, t: case.potential(x))
+
+
+def begin(name: str) -> State:
+    return State(cases.load(name).initial.positions, cases.load(name).initial.velocities)
+
+
+def error(a: State, b: cases.Snapshot) -> float:
+    return max(np.abs(a.positions - b.positions).max(), np.abs(a.velocities - b.velocities).max())
+
+
+#: Steps a unit of time for each order, few enough for errors to be above rounding.
+STEPS = {2: (40, 80, 160), 4: (8, 16, 32), 6: (4, 6, 8)}
+
+
+def slope(counts, errors) -> float:
+    return float(-np.polyfit(np.log(counts), np.log(errors), 1)[0])
+
+
+# -- against independent solutions ------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings(HAS_NO_TEMPERATURE)
+@pytest.mark.parametrize("name", NAMES)
+def test_reference_trajectories_to_their_tolerance(name):
+    held, case, state = referenced(name), cases.load(name), begin(name)
+    thermostat = Isokinetic(order=6)
+    kinetic = held.kinetic_energy(state.velocities)
+    steps = {"A10_isokinetic_lj4": 1000, "A10_isokinetic_dumbbell_quartic": 200}.get(name, 100)
+    for target in case.solution:
+        span = target.time - state.time
+        if target.time > 10:  # lj4 is chaotic
+            break
+        state = run(held, state, span / round(steps * span), round(steps * span), stepper=thermostat)
+        assert error(state, target) <= target.tolerance, target.time
+        assert thermostat.friction(held, state) == pytest.approx(target.alpha, abs=1e-10)
+        assert held.kinetic_energy(state.velocities) == pytest.approx(kinetic, rel=3e-15)
+
+
+@pytest.mark.filterwarnings(HAS_NO_TEMPERATURE)
+@ORDERS
+@pytest.mark.parametrize("name", NAMES)
+def test_order_on_the_reference_trajectories(name, order):
+    held, target = referenced(name), cases.load(name).solution[0]
+    counts = np.array(STEPS[order]) * (2 if "constant" not in name else 1)
+    if "lj4" in name:
+        counts = 12 * counts
+    errors = [
+        error(run(held, begin(name), target.time / n, n, stepper=Isokinetic(order=order)), target) for n in counts
+    ]
+    assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
+
+
+def test_constant_force_in_closed_form():
+    """u_par = U tanh(ct + b), u_perp ~ 1/cosh(ct + b); the kick is exact, so that only positions have an error."""
+    f, m = np.array([[0.4, -1.0, 0.7]]), 1.7
+    held = system([], np.zeros((1, 3)), [m], lambda x, t: f)
+    v = np.array([[-0.8, 0.3, 0.1]])
+    after = run(held, State(np.zeros((1, 3)), v), 0.25, 40, stepper=Isokinetic(momentum="free"))
+    e = f[0] / np.linalg.norm(f)
+    size = np.linalg.norm(v)
+    along = v[0] @ e
+    c = np.linalg.norm(f) / (m * size)
+    end = c * 10 + math.atanh(along / size)
+    expected = size * math.tanh(end) * e + (v[0] - along * e) * math.cosh(math.atanh(along / size)) / math.cosh(end)
+    np.testing.assert_allclose(after.velocities[0], expected, rtol=0, atol=2e-14)
+    # int(alpha) = ln(cosh(end)/cosh(begin))
+    assert after.thermostat[1] == pytest.approx(
+        math.log(math.cosh(end) / math.cosh(math.atanh(along / size))), rel=1e-13
+    )
+
+
+def on_ellipsoid():
+    a, s = np.array([1.2, 0.9, 0.7]), np.array([0.5, 0.6, math.sqrt(0.39)])
+    return [Ellipsoid([0], [0, 0, 0], a)], [a * s, [2.0, 1.0, 0.0]], [1.5, 1.0]
+
+
+def on_torus():
+    return [Torus([0], [0, 0, 0], [0, 0, 1.0], 1.5, 0.5)], [[2.0, 0.0, 0.0]], [1.3]
+
+
+def pulled():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.8, 0.1], [0.2, 1.5, 0.3]])
+    return [Distance([[0, 1]], lambda t: 1 + 0.2 * np.sin(2 * t)), Distance([[1, 2]])], x, [1.0, 2.0, 1.5, 1.0]
+
+
+def shaken():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [1.5, 0.8, 0.1], [0.2, 1.5, 0.3]])
+    rows = [
+        Sphere([0], [0, 0, -1.0], lambda t: 1 + 0.2 * np.sin(2 * t)),
+        Distance([[0, 1]]),
+        Plane([3], [0, 0, 1.0], lambda t: 0.3 + 0.3 * t),
+    ]
+    return rows, x, [1.0, 2.0, 1.5, 1.0]
+
+
+def skate():
+    x = np.array([[0.0, 0, 0], [1.0, 0.2, 0.0], [0.3, 2.0, 0.4]])
+    return [Distance([[0, 1]]), KnifeEdge(0, 1, [0, 0, 1.0])], x, [1.0, 2.0, 1.0]
+
+
+@functools.cache
+def solved(made):
+    held = system(*made(), waves)
+    x = np.array(made()[1])
+    start = held.initial_state(x, thermal_velocities(held, x, 0.8, 3))
+    return held, start, integrated(held, start, 1.0)
+
+
+#: Many projections on curved surfaces, which the others have too.
+COSTLY = {(on_ellipsoid, 4), (on_torus, 4), (on_torus, 6), (shaken, 4), (shaken, 6)}
+
+
+@pytest.mark.parametrize(
+    ("made", "order"),
+    [
+        pytest.param(
+            made, order, id=f"{made.__name__}-{order}", marks=[pytest.mark.validation] * ((made, order) in COSTLY)
+        )
+        for made in (water_and_more, on_ellipsoid, on_torus, pulled, shaken)
+        for order in (2, 4, 6)
+    ],
+)
+def test_order_with_constraints_and_moving_targets(made, order):
+    """Against Gauss's principle with v^T M as one more row, solved densely as an ordinary differential equation."""
+    check_order(made, order, 2 * np.array(STEPS[order]))
+
+
+def test_order_with_a_velocity_row():
+    """Such rows are flown by the midpoint rule, whose compositions are tested with the steppers."""
+    check_order(skate, 2, np.array(STEPS[2]) // 2)
+
+
+def check_order(made, order, counts):
+    held, start, exact = solved(made)
+    kinetic = held.kinetic_energy(start.velocities)
+    errors = []
+    for n in counts:
+        after = run(held, start, 1.0 / n, n, stepper=Isokinetic(order=order))
+        errors.append(max(np.abs(after.positions - exact[0]).max(), np.abs(after.velocities - exact[1]).max()))
+        assert held.kinetic_energy(after.velocities) == pytest.approx(kinetic, rel=1e-14)
+    assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
+
+
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.validation), 6])
+def test_going_back_undoes_a_run_to_the_order(order):
+    """Where a drift by itself changes K a little, scaling it back is no symmetric step; dumbbells turn exactly."""
+    held, start, _ = solved(on_ellipsoid)
+    dumbbell, x = dumbbells(2)
+    begun = dumbbell.initial_state(x, thermal_velocities(dumbbell, x, 0.8, 3))
+    exact = run(
+        dumbbell,
+        run(dumbbell, begun, 0.02, 50, stepper=Isokinetic(order=order)),
+        -0.02,
+        50,
+        stepper=Isokinetic(order=order),
+    )
+    assert np.abs(exact.positions - x).max() <= 1e-12
+    errors, counts = [], 2 * np.array(STEPS[order])
+    for n in counts:
+        there = run(held, start, 1.0 / n, n, stepper=Isokinetic(order=order))
+        back = run(held, there, -1.0 / n, n, stepper=Isokinetic(order=order))
+        assert back.time == pytest.approx(0, abs=1e-15)
+        errors.append(float(np.abs(back.positions - start.positions).max()))
+    assert slope(counts, errors) >= order - 0.15, errors
+
+
+# -- constants --------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings(HAS_NO_TEMPERATURE)
+@ORDERS
+def test_momenta_grow_with_the_potential(order):
+    """P exp(-U/2K) and L exp(-U/2K) are constants of the motion, P even of kicks and drifts, for orders 2, 4, 6."""
+    name = "A10_isokinetic_lj4"
+    held, case = referenced(name), cases.load(name)
+    start = begin(name)
+    twice = 2 * held.kinetic_energy(start.velocities)
+    m = case.masses[:, None]
+
+    def momenta(state):
+        boost = math.exp(-case.potential(state.positions) / twice)
+        centre = (m * state.positions).sum(axis=0) / m.sum()
+        total = (m * state.velocities).sum(axis=0)
+        turning = np.cross(state.positions - centre, m * state.velocities).sum(axis=0)
+        return np.concatenate([total, turning]) * boost
+
+    expected = momenta(start)
+    assert np.abs(expected).max() > 0.01
+    n = {2: 40000, 4: 8000, 6: 2000}[order]
+    off = np.abs(momenta(run(held, start, 1.0 / n, n, stepper=Isokinetic(order=order))) - expected).max()
+    assert off <= {2: 1e-5, 4: 1e-10, 6: 1e-10}[order] * np.abs(expected).max()
+
+
+def test_conserved_energy_has_no_slope():
+    held, x = dumbbells(2, force=quartic, potential=quartic_potential)
+    thermostat = Isokinetic(0.5)
+    state = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
+    first = thermostat.conserved_energy(held, state)
+    values = []
+    run(
+        held,
+        state,
+        0.01,
+        20_000,
+        stepper=thermostat,
+        observers=[lambda s: values.append(thermostat.conserved_energy(held, s))],
+        every=20,
+    )
+    assert first == values[0] == pytest.approx(quartic_potential(x), rel=1e-14)
+    trend = np.polyfit(np.linspace(0, 200, len(values)), values, 1)[0]
+    assert np.std(values) <= 2e-3
+    # What a random walk leaves; a thermostat that leaks energy shows 1e-3 and more.
+    assert abs(trend) <= 3e-5
+
+
+def test_conserved_energy_converges_with_the_order():
+    held, x = dumbbells(2, force=quartic, potential=quartic_potential)
+    for order in (2, 4, 6):
+        thermostat = Isokinetic(0.5, order=order)
+        start = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
+        errors, counts = [], {2: 4, 4: 4, 6: 12}[order] * np.array(STEPS[order])
+        for n in counts:
+            after = run(held, start, 1.0 / n, n, stepper=thermostat)
+            errors.append(abs(thermostat.conserved_energy(held, after) - thermostat.conserved_energy(held, start)))
+        assert slope(counts, errors) == pytest.approx(order, abs=0.15), errors
+
+
+def test_compression_rate_is_the_divergence_of_the_flow():
+    """Of two free atoms in a trap: div of (v, f/m - alpha v) over all coordinates is -(g - 1) alpha."""
+    x = np.array([[0.4, 0.2, -0.4], [-0.7, 0.3, 0.4]])
+    m = np.array([1.0, 2.0])[:, None]
+    held = system([], x, m[:, 0], quartic)
+    v = np.array([[0.3, -0.5, 0.2], [0.1, 0.2, -0.7]])
+    f = quartic(x)
+
+    def acceleration(v):
+        return f / m - (v * f).sum() / (m * v * v).sum() * v
+
+    h, trace = 1e-6, 0.0
+    for k in range(6):
+        e = h * np.eye(6)[k].reshape(2, 3)
+        trace += (acceleration(v + e) - acceleration(v - e)).ravel()[k] / (2 * h)
+    thermostat = Isokinetic()
+    assert thermostat.compression_rate(held, State(x, v)) == pytest.approx(trace, rel=1e-7)
+    assert thermostat.friction(held, State(x, v)) == pytest.approx((v * f).sum() / (m * v * v).sum(), rel=1e-14)
+
+
+def constancy(steps: int, every: int) -> float:
+    rows, x, masses = water_and_more()
+    held = system(rows, x, masses, lambda x, t: 3 * waves(x) - quartic(0.1 * x))
+    thermostat = Isokinetic(0.5)
+    state = thermostat.start(held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4)))
+    twice = (15 - 4 - 1) * 0.5
+    worst = 0.0
+    for _ in range(steps // every):
+        state = run(held, state, 0.01, every, stepper=thermostat)
+        worst = max(worst, abs(2 * held.kinetic_energy(state.velocities) / twice - 1))
+    return worst
+
+
+def test_kinetic_energy_is_constant():
+    assert constancy(20_000, 100) <= 1e-14
+
+
+@pytest.mark.validation
+def test_kinetic_energy_is_constant_over_a_million_steps():
+    assert constancy(1_000_000, 1000) <= 1e-13
