@@ -17,7 +17,6 @@ from kcons.errors import ConvergenceError
 FAST = 120
 
 
-@pytest.mark.validation
 def test_a_share_of_the_cases():
     found = random_cells.summary([judge(seed) for seed in range(FAST)])
     assert found["faults"] == {}
