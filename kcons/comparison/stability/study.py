@@ -135,10 +135,12 @@ def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[s
         raise InputError(f"{path} has no results of the stability study", item="into")
     made = {"made_by": result["made_by"], "environment": result["environment"]}
     names = [name for name in result["pieces"] if not name.startswith("fuzz/")]
+    summed = {"fuzz": result["fuzz"]} if "fuzz" in result else {}
     after = {
         **before,
+        **summed,
         "pieces": {**before["pieces"], **{name: result["pieces"][name] for name in names}},
-        "added": {**before.get("added", {}), **dict.fromkeys(names, made)},
+        "added": {**before.get("added", {}), **dict.fromkeys([*names, *summed], made)},
     }
     save(after, path)
     return before, after

@@ -139,6 +139,10 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
     assert json.loads(numbers.read_text(encoding="utf-8")) == after
     assert {k: v for k, v in after["pieces"].items() if k != "drift/butane"} == stored["pieces"]
     assert after["fuzz"] == stored["fuzz"] and list(after["added"]) == ["drift/butane"]
+    # The sum of the fuzz run goes along, where there was one.
+    summed = {**after["fuzz"], "trials": 7}
+    assert put_into({**found, "pieces": {}, "fuzz": summed}, numbers)[1]["fuzz"] == summed
+    numbers.write_text(json.dumps(after), encoding="utf-8")
     pages.renew(page, before, after)
     assert "| butane | 0.02 | 10,000 | 8 |" in page.read_text(encoding="utf-8")
     once = page.read_text(encoding="utf-8")
