@@ -97,7 +97,7 @@ def checking(path: str, molecules: int, workers: int, cache: str | None = None) 
 def commanding(path: str, topology: str, workers: int, cache: str, folder: str) -> float:
     """Memory of `kcons check` in MB: of the largest of its processes."""
     words = ["check", path, "--topology", topology, "--workers", str(workers), "--out", folder]
-    command = [sys.executable, "-c", "import sys; from kcons.cli import main; sys.exit(main())", *words]
+    command = [sys.executable, "-c", "import sys; from kcons.cli.main import main; sys.exit(main())", *words]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"NUMBA_CACHE_DIR": cache})
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)

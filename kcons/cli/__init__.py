@@ -4,7 +4,3 @@
 - `check`, `studies`: `kcons check`, `kcons hardcases`, `kcons stability`
 - `main`: all others
 """
-
-from kcons.cli.main import main
-
-__all__ = ["main"]

@@ -404,7 +404,3 @@ def _when(method: Method) -> str:
     if not method.usual:
         return " (only when named)"
     return "" if method.host != "openmm" or method.guest else " (in OpenMM's scenes, or when named)"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

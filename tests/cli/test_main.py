@@ -170,7 +170,7 @@ def test_interrupt(monkeypatch, capsys):
 
 def test_importing_the_command_imports_no_host():
     code = (
-        "import sys, kcons.cli; "
+        "import sys, kcons.cli.main; "
         "print([m for m in ('ase', 'openmm', 'matplotlib', 'rich', 'tblite') if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -15,7 +15,7 @@ C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
 def shell(line, **variables):
     """Status of `kcons ...` in a shell, and what came out."""
     done = subprocess.run(
-        ["bash", "-c", f"{sys.executable} -m kcons.cli {line}; exit ${{PIPESTATUS[0]}}"],
+        ["bash", "-c", f"{sys.executable} -m kcons {line}; exit ${{PIPESTATUS[0]}}"],
         capture_output=True,
         env=os.environ | variables,
     )

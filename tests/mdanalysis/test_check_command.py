@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import water_files as files
 
-from kcons.cli import main
+from kcons.cli.main import main
 from kcons.errors import OccupiedError
 from kcons.mdanalysis import check_trajectory
 from kcons.mdanalysis.check import report
@@ -193,7 +193,7 @@ def test_writing_refuses_others_and_leaves_nothing_unfinished(folder, tmp_path, 
 
 def process(folder, name, tail="", **variables):
     """`kcons check` in a shell: status of the check, what came out at the end of the pipe, and of errors."""
-    words = [sys.executable, "-m", "kcons.cli", "check", folder / name, "--topology", folder / "t.gro"]
+    words = [sys.executable, "-m", "kcons", "check", folder / name, "--topology", folder / "t.gro"]
     line = " ".join(map(str, [*words, "--constrain none --no-rank --out", folder / f"out-{name}"]))
     done = subprocess.run(
         ["bash", "-c", f"{line} {tail}; exit ${{PIPESTATUS[0]}}"],

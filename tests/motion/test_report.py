@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons.cli import main
+from kcons.cli.main import main
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion

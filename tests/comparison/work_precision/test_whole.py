@@ -84,7 +84,7 @@ def test_a_part_of_a_module_goes_on_where_it_was_interrupted(tmp_path, monkeypat
 
     monkeypatch.setattr(whole, "import_module", lambda name: SimpleNamespace(measure=measure))
     monkeypatch.setattr(whole, "find_spec", lambda name: True)
-    monkeypatch.setattr(whole, "comparison_page", Mock())
+    monkeypatch.setattr(whole, "whole_page", Mock())
     items = [Item("alone", "A module", module="kcons.some_module", seconds=1)]
     with pytest.raises(KeyboardInterrupt):
         whole.run(items, tmp_path)
