@@ -1,6 +1,14 @@
 """kcons holds things fixed in molecular dynamics, exactly and cheaply.
 
-The names here are those of the core; the hosts are imported by name: ``from kcons.ase import constrain``.
+- `errors`: what is raised
+- `constraints`, `projection`: what can be held; the theory, dense and literal
+- `topology`: what files say of a system
+- `solvers`, `plan`: constraint solvers, and which one holds what
+- `motion`: the engine
+- `steppers`, `thermostats`: dynamics on constraints
+- `models`: flows and growth under constraints
+- `ase`, `openmm`, `mdanalysis`: MD engines and files, imported by name: ``from kcons.ase import constrain``
+- `comparison`, `cli`: which method and which step; the command
 """
 
 from kcons import constraints, errors

@@ -1,10 +1,14 @@
 """Constraints on ASE `Atoms`: one object that owns everything that is held.
 
-ASE applies constraint objects one after another, so that two objects on the same atoms undo each other's
-work. `Constraints` therefore holds the whole set and solves it as one. Units are ASE's (Angstrom, eV,
-amu); targets are in Angstrom and radian.
+ASE applies constraint objects one after another, and each undoes the work of the one before. `Constraints` holds the
+whole set and solves it as one. Units are ASE's; targets are in angstrom and radian. Importing this package registers
+the object with ASE, which makes files that contain it readable.
 
-Importing this package registers the object with ASE, which makes files that contain it readable.
+- `topology`, `water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
+- `binding`, `respect`, `constraint`: the object, and whether the caller respects it
+- `virial`: the stress of the constraint forces
+- `calculator`: forces along the constraints, for optimisers
+- `dynamics`, `thermostats`: dynamics with any stepper
 """
 
 from kcons.ase.calculator import ConstrainedCalculator

@@ -1,4 +1,15 @@
-"""What can be held: one kind of constraints a module."""
+"""What can be held: one kind of constraint a module.
+
+- `arguments`, `target`, `vectors`, `differences`: arrays from outside, targets, arithmetic
+- `constraint`: the contract of a family
+- `internal`: distances, angles, dihedrals
+- `linear`: fixed atoms, linear relations
+- `surface`, `collective`, `custom`: surfaces, groups, functions of one's own
+- `velocity`: rows linear in the velocities
+- `contradictions`: targets that exclude each other
+- `images`: which periodic images rows mean
+- `constraint_set`: many constraints as one sigma, A and b
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,12 @@
 """MDAnalysis: constraints from any topology it reads, conversions, checks of trajectories, and writing them.
 
 Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnalysis.
+
+- `loading`: files opened, with errors that name the remedy
+- `topology`: constraints by its selection language
+- `conversions`: Universe, `Atoms` and System, one into the other
+- `writing`: runs written to files
+- `check`: how well a trajectory kept its constraints
 """
 
 from kcons.mdanalysis.check.check_files import check_trajectory

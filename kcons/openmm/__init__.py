@@ -2,6 +2,13 @@
 
 Swap the integrator of a Simulation, and what the System constrains is held to order 2, 4 or 6, together with
 collective variables, surfaces and the constraint objects of kcons.
+
+- `topology`: constraints by name
+- `integrator`: the integrators and the programs they run
+- `ensembles`: Langevin and isokinetic
+- `carried`: constraint objects of kcons
+- `collective`: collective variables
+- `surfaces`: particles on surfaces
 """
 
 from kcons.openmm.carried.carried_constraints import CarriedConstraints

@@ -1,1 +1,8 @@
-"""Per-cluster solvers: one shape a file; all Numba kernels live here."""
+"""Constraint solvers, one shape of cluster each; the Numba kernels live here.
+
+- `kernels`: what compiled kernels are made of
+- `cluster_solver`: what a solver reports
+- `rigid_triangles`, `small_clusters`, `chains`, `sparse`: held distances by shape, and rows of mixed kinds
+- `general_clusters`: any rows whatever
+- `fused_distances`: distances of every shape in one call
+"""

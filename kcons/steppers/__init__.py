@@ -1,7 +1,14 @@
 """Steppers: maps from one state on the constraints to the next.
 
-A stepper is a pure function of the state. It never changes its input, and where it raises, nothing
-has happened: the state that was passed in is still the last good one.
+A stepper never changes its input. Where it raises, nothing has happened.
+
+- `state`, `files`, `friction`: where a system is, and what acts on it
+- `stepper`: what a stepper is, and how to run one
+- `drifts`, `compensated_steps`, `fused_stages`: what steps are made of
+- `splitting`: kicks and drifts in turn
+- `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
+- `extrapolation`: steps that choose their own size
+- `projected_ode`: the projected equation of motion, for comparison
 """
 
 from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4

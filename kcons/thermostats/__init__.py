@@ -1,4 +1,10 @@
-"""Thermostats on constraints. Each is a stepper: a pure function from one state to the next."""
+"""Thermostats on constraints. Each is a stepper.
+
+- `freedom`: which degrees of freedom a thermostat acts on
+- `thermal_velocities`: velocities drawn on the constraints
+- `langevin`, `nose_hoover`, `isokinetic`: the thermostats
+- `configurational_temperature`: the temperature of configurations
+"""
 
 from kcons.thermostats.configurational_temperature import (
     Estimate,

@@ -1,15 +1,13 @@
 """Hard cases: what kcons, ASE and OpenMM do where constraints are difficult.
 
-Cases are functions in the modules named in `case.THEMES`; `run` takes them through all programs, `pages` shows what
-came of it. A person's own case is one more function::
+A case is a function with `case` as its decorator, as in `examples/13_hard_cases.py`.
 
-    from kcons.comparison.hard_cases import Problem, case, outcome
-
-    @case("Y01", "Two dumbbells", "residual 1e-10")
-    def dumbbells(program, quick):
-        problem = Problem(positions, masses, pairs=[(0, 1), (2, 3)], velocities=velocities)
-        end = program.run(problem, dt=0.01, steps=100)
-        return outcome(("residual", problem.residual(end.x), 1e-10))
+- `case`, `problem`, `truths`: a case, its problem, and what is right
+- `programs`, `worker`: the programs side by side
+- `bodies`, `rings`, `chains`: difficult molecules
+- `starts`, `steps`, `inputs`: difficult starts, steps and input
+- `invariance`, `long_runs`, `thermostats`, `growth_models`: what must not matter; long runs; other models
+- `study`, `pages`: all cases, and their table
 """
 
 from kcons.comparison.hard_cases.case import (

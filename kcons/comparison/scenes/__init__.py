@@ -1,4 +1,11 @@
-"""Built-in scenes: systems with known solutions, small or at size N."""
+"""Built-in test systems with known solutions, small or at size N.
+
+- `scene`, `potential`, `minimal`: the contract, forces, solutions in minimal coordinates
+- `sphere`, `fekete`, `bead`, `pendulums`, `rotor`: particles, beads, pendulums and tops
+- `chain`, `butane`, `molecule`, `slab`: chains and molecules
+- `lennard_jones`, `dumbbells`, `water`, `fluid`: fluids
+- `openmm_host`, `openmm_potential`, `structure`, `any_file`: OpenMM's forces, PDB files, any file
+"""
 
 from __future__ import annotations
 

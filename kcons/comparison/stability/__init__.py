@@ -1,4 +1,11 @@
-"""How far methods can be pushed: largest stable steps, drift of the energy, reversibility, random molecules."""
+"""How far methods can be pushed.
+
+- `scenes`: small test systems
+- `runs`: largest stable steps, drift of the energy, reversibility
+- `fuzz`: random molecules
+- `study`: all of it, kept as it comes in
+- `pages`: tables and a picture
+"""
 
 from kcons.comparison.stability.fuzz import Trial, trial
 from kcons.comparison.stability.runs import attempt, drift, largest_step, reversal

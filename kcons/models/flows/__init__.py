@@ -1,4 +1,13 @@
-"""Dynamical systems as flows (notes sections 1 to 3)."""
+"""Dynamical systems as flows (notes sections 1 to 3).
+
+- `flow`: a flow and its phase-space volume
+- `equilibria`: where it rests
+- `spectrum`, `imaginary_axis`, `jordan`: eigenvalues as far as they can be told
+- `stability`: the classification of equilibria
+- `linear`: linear flows
+- `hamiltonian`, `isokinetic`, `variation`: mechanics as flows
+- `models`: flows with known solutions
+"""
 
 from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
 from kcons.models.flows.flow import Flow, PhaseVolume, jacobian_by_differences, phase_volume

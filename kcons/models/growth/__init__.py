@@ -1,4 +1,10 @@
-"""Populations that grow under constraints (notes sections 3 and 4.3)."""
+"""Populations that grow under constraints (notes sections 3 and 4.3).
+
+- `model`, `models`, `hypercycle`, `mixture`: models of growth
+- `rows`, `orthogonal_rows`, `entropy`: what is held
+- `constrained`: a model with what is held
+- `compensated_sums`, `integration`, `ensemble`: one trajectory, and many
+"""
 
 from kcons.models.growth.constrained import ConstrainedGrowth
 from kcons.models.growth.ensemble import EnsembleSolution, solve_ensemble

@@ -1,6 +1,12 @@
-"""Peers that are no host: other people's solvers and integrators, each as a method of `kcons compare`.
+"""Solvers and integrators of others, each as a method of `kcons compare`.
 
-The packages are optional and imported when a run starts; what is not installed is refused with what to install.
+The packages are optional and imported when a run starts.
+
+- `smallness`: what solvers with dense matrices can run
+- `gauss_seidel`, `shake`: SHAKE and RATTLE as the literature has them
+- `lammps_shake`: LAMMPS' fix shake and fix rattle
+- `mici_leapfrog`: mici's constrained leapfrog
+- `dae`: solvers of differential-algebraic equations
 """
 
 from __future__ import annotations
