@@ -209,7 +209,7 @@ def _compare(chosen: argparse.Namespace) -> int:
 
 
 def _expression(chosen: argparse.Namespace) -> str:
-    """Python that makes the scene, after `from kcons import scenes`."""
+    """Python that makes the scene, after `from kcons.comparison import scenes`."""
     from kcons.comparison import scenes
 
     said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}

@@ -215,13 +215,23 @@ def in_one_piece(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     links = np.concatenate(pairs)
     if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
         return x
-    ends = np.concatenate([links, links[:, ::-1]])
-    start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=len(x)))])
-    neighbours = ends[np.argsort(ends[:, 0], kind="stable"), 1]
-    atoms, parents, _ = _breadth_first(np.arange(len(x)), start, neighbours, neighbours, len(x))
-    y = x.copy()
-    _make_whole(y, atoms, parents, lattice)
-    return y
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
+
+    n = len(x)
+    graph = sp.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
+    roots = np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
+    # One more node, from which all pieces hang.
+    ends = np.concatenate([links, np.stack([np.full(len(roots), n), roots], axis=1)])
+    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n + 1, n + 1))
+    parent = breadth_first_order(tree, n, directed=False)[1].astype(np.int64)
+    parent[n] = n
+    parent[roots] = roots
+    cells = np.zeros((n + 1, 3))
+    cells[:n] = -np.round((x - x[parent[:n]]) @ lattice[1])
+    while np.any(parent != parent[parent]):
+        cells += cells[parent]
+        parent = parent[parent]
+    return x + cells[:n] @ lattice[0]
 
 
 class _Links:

@@ -3,12 +3,13 @@
 A stepper never changes its input. Where it raises, nothing has happened.
 
 - `state`, `files`, `friction`: where a system is, and what acts on it
-- `stepper`: what a stepper is, and how to run one
+- `stepper`: what a stepper is
 - `drifts`, `compensated_steps`, `fused_stages`: what steps are made of
 - `splitting`: kicks and drifts in turn
 - `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
 - `extrapolation`: steps that choose their own size
 - `projected_ode`: the projected equation of motion, for comparison
+- `running`, `reversibility_check`: steps one after another, and taken back
 """
 
 from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
@@ -16,10 +17,12 @@ from kcons.steppers.extrapolation import Extrapolation
 from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
 from kcons.steppers.rattle import Rattle
+from kcons.steppers.reversibility_check import ReversibilityCheck
 from kcons.steppers.runge_kutta_nystrom import BlanesMoan4, BlanesMoan6, BlanesMoan6a, RungeKuttaNystrom
+from kcons.steppers.running import Observer, run
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.state import State, System
-from kcons.steppers.stepper import Observer, ReversibilityCheck, Stepper, run
+from kcons.steppers.stepper import Stepper
 
 __all__ = [
     "Baumgarte",

@@ -14,7 +14,7 @@ from cell_worlds import world
 from kcons import Motion
 from kcons.errors import ConvergenceError
 
-FAST = 120
+FAST = 150
 
 
 def test_a_share_of_the_cases():

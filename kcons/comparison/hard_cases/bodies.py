@@ -2,81 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
-from kcons.comparison.hard_cases.problem import Array, Pairs, Problem
-from kcons.comparison.hard_cases.programs import Frame, Program, together
+from kcons.comparison.hard_cases.motions import OMEGA, every, flat_body, move, tumble, worst_residual
+from kcons.comparison.hard_cases.problem import Array, Problem
+from kcons.comparison.hard_cases.program import Frame, Program, together
 
-OMEGA = np.array([0.9, -0.5, 0.7])
 TRIANGLE = [(0, 1), (0, 2), (1, 2)]
 WATER = np.array([[0.0, 0.0, 0.0], [0.9572, 0.0, 0.0], [-0.23999, 0.92663, 0.0]])
 WATER_MASSES = np.array([15.999, 1.008, 1.008])
-
-
-def every(n: int) -> list[tuple[int, int]]:
-    """All pairs of n atoms."""
-    return list(combinations(range(n), 2))
-
-
-def tumble(
-    program: Program, shape: Array, masses: Array, pairs: Pairs, freedom: int = 6, quick: bool = True
-) -> Outcome:
-    """Free flight of a rigid body against Euler's equations, its residual, and how many degrees of freedom are counted.
-
-    The error may be ten times that of RATTLE for a body held without surplus rows.
-    """
-    x = truths.rotated(shape)
-    dt, steps = 0.005, program.length(quick, 100, 1000)
-    problem = Problem(x, masses, pairs, velocities=truths.spinning(x, masses, OMEGA))
-    residual = _Worst(problem)
-    end = program.run(problem, dt, steps, residual)
-    expected = truths.rigid_flight(x, masses, OMEGA, dt * steps)
-    plain = float(np.abs(truths.rigid_rattle(x, masses, OMEGA, dt, steps) - expected).max())
-    return outcome(
-        ("residual", residual.value, 1e-10),
-        ("position error", np.abs(end.x - expected).max(), 10 * plain),
-        ("degrees of freedom, miscounted by", abs(program.degrees_of_freedom(problem) - freedom), 0),
-        remark=f"{steps} steps",
-    )
-
-
-class _Worst:
-    """Largest residual seen; NaN once anything is."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self.value = 0.0
-
-    def __call__(self, frame: Frame) -> None:
-        found = self.problem.residual(frame.x)
-        if not found <= self.value:
-            self.value = found if not np.isnan(self.value) else self.value
-
-
-def worst_residual(problem: Problem) -> _Worst:
-    """A watcher that keeps the largest residual."""
-    return _Worst(problem)
-
-
-def move(program: Program, problem: Problem, dt: float, steps: int, residual_limit: float = 1e-10) -> Outcome:
-    """A run of a body that can bend: against the dense theory, with ten times the error of RATTLE itself."""
-    problem = problem.but(velocities=problem.tangent(problem.v))
-    residual = _Worst(problem)
-    end = program.run(problem, dt, steps, residual)
-    expected = truths.true_motion(problem, dt * steps)
-    plain = float(np.abs(truths.dense_rattle(problem, dt, steps) - expected).max())
-    return outcome(
-        ("residual", residual.value, residual_limit),
-        ("position error", np.abs(end.x - expected).max(), 10 * plain),
-        remark=f"{steps} steps",
-    )
-
-
-# -- dependent rows -----------------------------------------------------------------------------------
 
 
 @case("H01", "One bond listed twice", "as the run with one bond to 1e-12 over 1e4 steps; 5 degrees of freedom")
@@ -144,8 +80,6 @@ _DIAMOND = np.array([[0, 0, 0], [2.7, 0, 0], [1.35, 2.338, 0], [1.35, -2.338, 0]
 
 @case("X04", "Martini diamond by all 6 distances", "right, or refused as singular", "warn-or-raise")
 def braced_diamond(program: Program, quick: bool) -> Outcome:
-    from kcons.comparison.hard_cases.rings import flat_body
-
     return flat_body(program, _DIAMOND, np.full(4, 45.0), every(4), quick)
 
 
@@ -165,7 +99,7 @@ def collinear(program: Program, quick: bool) -> Outcome:
     omega = np.cross(axis, OMEGA)
     dt, steps = 0.005, program.length(quick, 100, 2000)
     problem = Problem(x, masses, TRIANGLE, velocities=truths.spinning(x, masses, omega))
-    residual = _Worst(problem)
+    residual = worst_residual(problem)
     bent = _Bent()
     end = program.run(problem, dt, steps, together(residual, bent))
     true = truths.linear_flight(x, problem.v, masses, dt * steps)
@@ -212,7 +146,7 @@ def _bent_triatomic(degrees: float) -> Array:
 
 def _energy_run(program: Program, problem: Problem, dt: float, steps: int) -> tuple[float, float]:
     """Largest residual and relative deviation of the energy."""
-    residual = _Worst(problem)
+    residual = worst_residual(problem)
     energies: list[float] = []
     program.run(problem, dt, steps, together(residual, lambda frame: energies.append(frame.energy)))
     # The first energy of a leapfrog is that of velocities half a step earlier.

@@ -11,12 +11,10 @@ import importlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from kcons.comparison.hard_cases.program import CannotExpressError, Program
 from kcons.errors import KconsError
-
-if TYPE_CHECKING:
-    from kcons.comparison.hard_cases.programs import Program
 
 Kind = Literal["bound", "raise", "warn-or-raise"]
 Verdict = Literal["right", "refused", "silently wrong", "crash/NaN", "cannot express"]
@@ -37,10 +35,6 @@ THEMES = (
     "thermostats",
     "growth_models",
 )
-
-
-class CannotExpressError(Exception):
-    """The program has no means to state the problem; the message says which are missing."""
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ import tracemalloc
 import numpy as np
 
 from kcons.comparison.hard_cases import truths
-from kcons.comparison.hard_cases.bodies import move, worst_residual
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.motions import move, worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.programs import Core, Frame, Program
+from kcons.comparison.hard_cases.program import Frame, Program
+from kcons.comparison.hard_cases.programs import Core
 
 
 def zigzag(n: int, degrees: float = 110.0, length: float = 1.0) -> Array:

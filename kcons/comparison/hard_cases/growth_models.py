@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.problem import Array
-from kcons.comparison.hard_cases.programs import Program
+from kcons.comparison.hard_cases.program import Program
 from kcons.comparison.hard_cases.steps import each_refused
 
 NONE = "no growth models and no linear flows"

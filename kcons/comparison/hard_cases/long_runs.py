@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.hard_cases.bodies import worst_residual
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.motions import worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.programs import Core, Frame, Program
+from kcons.comparison.hard_cases.program import Frame, Program
+from kcons.comparison.hard_cases.programs import Core
 from kcons.errors import KconsError
 
 #: Steps of the pendulum for each program: quick and full.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.comparison.hard_cases import truths
-from kcons.comparison.hard_cases.bodies import OMEGA, every, move, tumble, worst_residual
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.motions import OMEGA, every, flat_body, move, worst_residual
 from kcons.comparison.hard_cases.problem import Array, Pairs, Problem
-from kcons.comparison.hard_cases.programs import Frame, Program
+from kcons.comparison.hard_cases.program import Frame, Program
 
 SINGULAR = "right to 10 x the error of RATTLE and flat to 1e-8, or refused with the count of degrees of freedom"
 
@@ -17,31 +17,6 @@ def ring(n: int, radius: float = 1.0) -> Array:
     """A regular polygon in the xy plane."""
     angle = 2 * np.pi * np.arange(n) / n
     return radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-
-
-def flat_body(program: Program, shape: Array, masses: Array, pairs: Pairs, quick: bool) -> Outcome:
-    """Tumbling against Euler's equations; then forces that would buckle it."""
-    tumbled = tumble(program, shape, masses, pairs, quick=quick)
-    x = truths.rotated(shape)
-    normal = np.linalg.svd(x - x.mean(axis=0))[2][2]
-    push = np.where(np.arange(len(x)) % 2 == 0, 1.0, -1.0)[:, None] * normal
-    push[0] += 0.3 * normal
-    problem = Problem(x, masses, pairs, push=push)
-    residual, buckled = worst_residual(problem), [0.0]
-
-    def watch(frame: Frame) -> None:
-        residual(frame)
-        finite = np.all(np.isfinite(frame.x))
-        buckled.append(np.linalg.svd(frame.x - frame.x.mean(axis=0))[1][2] if finite else np.nan)
-
-    steps = program.length(quick, 100, 2000)
-    program.run(problem, 0.01, steps, watch)
-    return outcome(
-        *[(check.name, check.value, check.limit) for check in tumbled.checks],
-        ("buckled by", np.max(buckled), 1e-8),
-        ("residual under a push", residual.value, 1e-10),
-        remark=f"{tumbled.remark}; {steps} steps under forces out of the plane",
-    )
 
 
 @case("H04", "Square by 6 and hexagon by 15 distances", SINGULAR, "warn-or-raise")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.comparison.hard_cases import truths
-from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES, worst_residual
+from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
+from kcons.comparison.hard_cases.motions import worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.programs import Core, Frame, KconsInAse, Program, together, wrapped
+from kcons.comparison.hard_cases.program import Frame, Program, together
+from kcons.comparison.hard_cases.programs import Core, KconsInAse, wrapped
 
 
 def _first(program: Program, problem: Problem, steps: int = 0, dt: float = 1e-3) -> tuple[Frame, Frame]:

@@ -50,7 +50,8 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
     setting : float
         Time step in the unit the scene shows, or tolerance.
     made_by : str
-        The expression that makes the scene after ``from kcons import scenes``, such as ``scenes.build("chain", 10)``.
+        The expression that makes the scene after ``from kcons.comparison import scenes``, as in
+        ``scenes.build("chain", 10)``.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def _ase_stepper(dt: str, steps: int, stepper: str) -> list[str]:
     return [
         "from ase import units",
         "",
-        "from kcons import scenes",
+        "from kcons.comparison import scenes",
         "from kcons.ase import ConstrainedDynamics",
         f"from kcons.steppers import {stepper}",
         "",
@@ -111,7 +112,8 @@ def _ase_stepper(dt: str, steps: int, stepper: str) -> list[str]:
 
 def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
     return [
-        "from kcons import Motion, State, System, run, scenes",
+        "from kcons import Motion, State, System, run",
+        "from kcons.comparison import scenes",
         f"from kcons.steppers import {stepper}",
         "",
         *_ON_ARRAYS,
@@ -121,7 +123,8 @@ def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
 
 def _extrapolated(tolerance: float) -> list[str]:
     return [
-        "from kcons import Motion, State, System, scenes",
+        "from kcons import Motion, State, System",
+        "from kcons.comparison import scenes",
         "from kcons.steppers import Extrapolation",
         "",
         *_ON_ARRAYS,
@@ -135,7 +138,7 @@ def _ase_kcons(dt: str, steps: int) -> list[str]:
         "from ase import units",
         "from ase.md.verlet import VelocityVerlet",
         "",
-        "from kcons import scenes",
+        "from kcons.comparison import scenes",
         "from kcons.ase import Constraints",
         "",
         "scene = SCENE",
@@ -150,7 +153,7 @@ def _ase_bonds(dt: str, steps: int) -> list[str]:
         "from ase.constraints import FixAtoms, FixBondLengths",
         "from ase.md.verlet import VelocityVerlet",
         "",
-        "from kcons import scenes",
+        "from kcons.comparison import scenes",
         "",
         "scene = SCENE",
         "atoms = scene.atoms()  # yours, with a calculator and velocities",
@@ -164,7 +167,8 @@ def _scipy(rtol: float) -> list[str]:
         "import numpy as np",
         "from scipy.integrate import solve_ivp",
         "",
-        "from kcons import Motion, scenes",
+        "from kcons import Motion",
+        "from kcons.comparison import scenes",
         "",
         "scene = SCENE",
         "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet, rows independent",
@@ -192,7 +196,7 @@ def _only_water(scene: Scene) -> bool:
 
 
 def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str]:
-    lines = ["from kcons import scenes"]
+    lines = ["from kcons.comparison import scenes"]
     made = ["scene = SCENE", "host = scene.openmm", "system = host.system  # yours, with its constraints"]
     if isinstance(found, BuiltIn):
         lines = ["import openmm", "", *lines]
@@ -224,7 +228,7 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
 
 def _any(method: str, setting: float) -> list[str]:
     return [
-        "from kcons import scenes",
+        "from kcons.comparison import scenes",
         "from kcons.comparison.methods.methods import METHODS",
         "",
         "scene = SCENE",

@@ -1,0 +1,106 @@
+"""Every step taken back again and compared: for finding solves that fail silently."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
+from kcons.steppers.state import KICK_ROUNDING, State, System
+from kcons.steppers.stepper import Stepper
+
+
+class ReversibilityCheck:
+    """A stepper that takes every step back again and compares; for finding solves that fail silently.
+
+    Projections have more than one solution when a step is large; a step that lands on another branch than the
+    one it came from is no longer reversible, and long runs with such steps are wrong without any other sign.
+
+    Parameters
+    ----------
+    stepper : Stepper
+        The scheme; must be reversible.
+    tolerance : float
+        Largest allowed difference after a step forward and back: of positions relative to the distance travelled
+        or the size of the system, whichever is larger, and of velocities relative to the fastest one. What rounding
+        leaves of positions, and of the kick of a step, is allowed besides: at rest there is nothing else.
+
+    Raises
+    ------
+    UnsupportedError
+        The scheme is not reversible at all.
+    """
+
+    def __init__(self, stepper: Stepper, tolerance: float = 1e-9) -> None:
+        if not stepper.reversible:
+            raise UnsupportedError(
+                f"{stepper!r} is not reversible, so there is nothing to check; use Rattle, Geodesic, a Composition "
+                "or a RungeKuttaNystrom stepper"
+            )
+        if not tolerance > 0:
+            raise InputError(f"tolerance is {tolerance}; give a positive number", item="tolerance")
+        self.stepper = stepper
+        self.tolerance = tolerance
+        self.order = stepper.order
+        self.reversible = True
+        self.symplectic = stepper.symplectic
+        self.force_evaluations = 2 * stepper.force_evaluations
+        self.holds = getattr(stepper, "holds", True)
+
+    def __repr__(self) -> str:
+        return f"ReversibilityCheck({self.stepper!r})"
+
+    def check(self, system: System) -> None:
+        self.stepper.check(system)
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        ReversibilityError
+            The step back does not end where the step began; carries `step` and `residual`.
+        KconsError
+            Whatever the stepper raises, forward or back.
+        """
+        after = self.stepper.step(system, state, dt)
+        if dt == 0:
+            return after
+        try:
+            back = self.stepper.step(system, after, -dt)
+        except ConvergenceError as error:
+            raise ReversibilityError(
+                f"step {after.step} cannot be taken back: {error}",
+                residual=error.residual,
+                tolerance=error.tolerance,
+                iterations=error.iterations,
+                row=error.row,
+                atoms=error.atoms,
+                cluster=error.cluster,
+                step=after.step,
+            ) from error
+        speed = max(_largest(state.velocities), _largest(after.velocities))
+        length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
+        rounding = 8 * float(np.spacing(_largest(state.positions)))
+        forces = system.with_forces(after).forces
+        assert forces is not None
+        kick = abs(dt) * _largest(forces * system.inverse_masses)
+        moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
+        turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
+        # A speed of zero both before and after leaves nothing to compare with.
+        off = np.maximum(moved / (length or 1.0), turned / (speed or 1.0))
+        residual = float(off.max(initial=0.0))
+        if not residual <= self.tolerance:
+            atom = int(np.argmax(off.max(axis=1)))
+            raise ReversibilityError(
+                f"step {after.step} is not reversible: taken back, atom {atom} misses its start by {residual:.3g} "
+                f"(relative; allowed {self.tolerance:.3g}); use a smaller time step than {dt:g}",
+                residual=residual,
+                tolerance=self.tolerance,
+                atoms=[atom],
+                step=after.step,
+            )
+        return after
+
+
+def _largest(values: np.ndarray) -> float:
+    return float(np.abs(values).max(initial=0.0))
