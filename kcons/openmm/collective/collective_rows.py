@@ -285,13 +285,6 @@ class CollectiveRows(GroupRows):
             value -= slope * self._clock(variables)
         integrator.program.set(self._of("target", row), value)
 
-    def _clock(self, variables: dict[str, float]) -> float:
-        if not self._drives:
-            return 0.0
-        c = self.code
-        kept = variables[f"pending{c}"] and variables[f"step_start{c}"] != variables["good_steps"]
-        return variables[f"clock_end{c}" if kept else f"clock_start{c}"]
-
     def _read(self, integrator: openmm.CustomIntegrator, name: str) -> FloatArray:
         return np.array([integrator.getGlobalVariableByName(self._of(name, k)) for k in range(self.n_rows)])
 

@@ -18,7 +18,7 @@ from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
 
 if TYPE_CHECKING:
-    from kcons.openmm.collective.collective_rows import CollectiveRows
+    from kcons.openmm.collective.row_program import GroupRows
 
 #: Rows whose part beside the others is smaller than this (of their own norm) are dependent.
 DEPENDENT = 1e-5
@@ -34,12 +34,12 @@ class ContextRows:
 
     Parameters
     ----------
-    rows : CollectiveRows
+    rows : GroupRows
     context : openmm.Context
         Its integrator need not be the one that holds the rows, but then targets are those the rows were made with.
     """
 
-    def __init__(self, rows: CollectiveRows, context: openmm.Context) -> None:
+    def __init__(self, rows: GroupRows, context: openmm.Context) -> None:
         self.rows = rows
         self.context = context
         self._numbers = range(rows.n_rows)
@@ -337,7 +337,7 @@ class ContextRows:
         return f"{row} ({self.rows.names[row]})"
 
 
-def owner(rows: CollectiveRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
+def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
     """The integrator of the context that holds the rows, None if it has none."""
     for ours in listeners(context):
         if rows._of("push", 0) in ours.program.numbers:
@@ -362,7 +362,7 @@ def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
     return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
 
 
-def applied_groups(rows: CollectiveRows, context: openmm.Context) -> set[int]:
+def applied_groups(rows: GroupRows, context: openmm.Context) -> set[int]:
     """The force groups that move the System."""
     groups = context.getIntegrator().getIntegrationForceGroups()
     chosen = groups if isinstance(groups, set | frozenset) else {g for g in range(32) if int(groups) >> g & 1}

@@ -29,6 +29,7 @@ class GroupRows:
     meets_system: bool
     groups: frozenset[int]
     names: tuple[str, ...]
+    atoms: tuple[tuple[int, ...], ...]
     scales: tuple[float, ...]
     periods: tuple[float, ...]
     tolerance: float
@@ -162,6 +163,13 @@ class GroupRows:
         self._gradients(p, sizes=sizes, slopes=False)
         singular = f"select(singular{self.code}, {self.code}, 0)"
         p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
+
+    def _clock(self, variables: dict[str, float]) -> float:
+        if not self._drives:
+            return 0.0
+        c = self.code
+        kept = variables[f"pending{c}"] and variables[f"step_start{c}"] != variables["good_steps"]
+        return variables[f"clock_end{c}" if kept else f"clock_start{c}"]
 
     def _set_clock(self, p: Program) -> None:
         """At the first drift of a step. A step that failed is not counted in good_steps, and its time is not kept."""

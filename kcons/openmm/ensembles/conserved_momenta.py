@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import openmm
@@ -13,11 +13,9 @@ from openmm import unit
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.system_checks import BAROSTATS, forces_of, removes_centre_of_mass_motion
 from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, open_directions
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -63,7 +61,7 @@ class Momenta:
 NONE = Momenta(np.zeros((0, 3)), False)
 
 
-def conserved_momenta(integrator: ProjectedIntegrator, context: openmm.Context, momentum: Momentum) -> Momenta:
+def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
     """Look at the forces and at what is held.
 
     Parameters

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import openmm
@@ -17,15 +17,13 @@ from kcons.errors import ConvergenceError, InputError, OverdeterminedError, Unsu
 from kcons.openmm.ensembles.conserved_momenta import NONE, Momenta, Momentum, conserved_momenta
 from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
 from kcons.steppers.compositions import Composition
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import AT_REST, atom_numbers, positive
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
 ROUNDING = 1e-12
@@ -196,7 +194,7 @@ class Isokinetic(Value):
 
     # -- a run ----------------------------------------------------------------------------------
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """Find g and K; scale the velocities, unless they are right to rounding.
 
         Raises
@@ -248,7 +246,7 @@ class Isokinetic(Value):
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
 
-    def verify(self, integrator: ProjectedIntegrator) -> None:
+    def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if kicks have lost digits."""
         if integrator.getGlobalVariableByName("lost"):
             integrator.program.write("lost", 0.0)
@@ -257,7 +255,7 @@ class Isokinetic(Value):
                 "step, and lost digits; take a smaller time step"
             )
 
-    def _masses(self, integrator: ProjectedIntegrator, context: openmm.Context) -> np.ndarray:
+    def _masses(self, integrator: Integrator, context: openmm.Context) -> np.ndarray:
         """Of thermostatted particles; 0 for others."""
         system = context.getSystem()
         n = system.getNumParticles()
@@ -280,12 +278,12 @@ class Isokinetic(Value):
                 )
         return np.where(inside, masses, 0.0)
 
-    def _momenta(self, integrator: ProjectedIntegrator, context: openmm.Context) -> Momenta:
+    def _momenta(self, integrator: Integrator, context: openmm.Context) -> Momenta:
         if self.atoms is not None:
             return NONE
         return conserved_momenta(integrator, context, self.momentum)
 
-    def _count(self, integrator: ProjectedIntegrator, context: openmm.Context, momenta: Momenta) -> int:
+    def _count(self, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:
         """g: momenta that are thermostatted and independent."""
         if self.atoms is None:
             count = integrator.independent_momenta(context)
@@ -318,14 +316,14 @@ class Isokinetic(Value):
 
     # -- what can be read -----------------------------------------------------------------------
 
-    def count(self, integrator: ProjectedIntegrator) -> int:
+    def count(self, integrator: Integrator) -> int:
         """g of an integrator: its momenta that are thermostatted and independent."""
         guard = integrator._watch()
         if guard.thermal is None:
             return self._count(integrator, guard.context, self._momenta(integrator, guard.context))
         return guard.thermal
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         """2 K/(g k) times this is the temperature of the configurations."""
         count = self.count(integrator)
         if self.atoms is not None or count < 2:
@@ -339,14 +337,14 @@ class Isokinetic(Value):
         atoms = None if self.atoms is None else np.asarray(self.atoms)
         return Isokinetic(temperature, convention=self.convention, atoms=atoms, momentum=self.momentum)
 
-    def follow(self, integrator: ProjectedIntegrator) -> None:
+    def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
         if integrator.getGlobalVariableByName("two_k"):
             masses = self._masses(integrator, integrator.context)
             twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
             integrator.program.write("two_k", twice)
 
-    def friction(self, integrator: ProjectedIntegrator) -> float:
+    def friction(self, integrator: Integrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
         context = integrator.context
         masses, v = self._masses(integrator, context), velocities_of(context)
@@ -355,11 +353,11 @@ class Isokinetic(Value):
         inside = masses > 0
         return float(np.sum(v[inside] * f[inside]) / (masses @ np.einsum("ij,ij->i", v, v)))
 
-    def compression_rate(self, integrator: ProjectedIntegrator) -> float:
+    def compression_rate(self, integrator: Integrator) -> float:
         """Divergence of the flow in phase space, -(g - 1) alpha, in 1/ps."""
         return -(self.count(integrator) - 1) * self.friction(integrator)
 
-    def conserved_energy(self, integrator: ProjectedIntegrator) -> float:
+    def conserved_energy(self, integrator: Integrator) -> float:
         """U + 2K int(alpha dt) in kJ/mol, conserved where all particles are thermostatted."""
         state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")

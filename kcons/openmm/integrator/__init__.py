@@ -1,7 +1,7 @@
 """The integrators for OpenMM, and the programs they run.
 
 - `program`, `schemes`: a program for CustomIntegrator, and the splittings
-- `part`, `ensemble`: what an integrator is put together from
+- `part`, `interface`, `ensemble`: what an integrator is put together from
 - `step_writer`, `lean_step_writer`, `step_counts`: the program of one step, and what it costs
 - `system_checks`, `guard`: what a System holds, and whether it was held
 - `settings`, `hearing`, `copies`, `states_on_constraints`, `minimization`: a Context and its states

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import openmm
 
 from kcons.errors import InputError
+from kcons.openmm.integrator.ensemble import Ensemble
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.schemes import LEAPFROG, SCHEMES
 from kcons.steppers.splitting import Splitting
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.ensemble import Ensemble
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
 RUN_STATE = frozenset(
@@ -49,7 +47,7 @@ def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:
     }
 
 
-def apply_settings(integrator: ProjectedIntegrator, settings: dict[str, Any]) -> None:
+def apply_settings(integrator: Integrator, settings: dict[str, Any]) -> None:
     """What was set, but no setting of the ensemble or of a part that the integrator itself has kept."""
     program = integrator.program
     integrator.setRandomNumberSeed(settings["seed"])
@@ -61,7 +59,7 @@ def apply_settings(integrator: ProjectedIntegrator, settings: dict[str, Any]) ->
         program.set(name, value)
 
 
-def remade(kind: type[ProjectedIntegrator], making: tuple[Any, ...], settings: dict[str, Any]) -> ProjectedIntegrator:
+def remade(kind: type[Integrator], making: tuple[Any, ...], settings: dict[str, Any]) -> Integrator:
     """The integrator of these arguments and settings; what pickles call."""
     dt, scheme, parts, tolerance, check_every, ensemble = making
     made = kind(dt, scheme, parts=parts, tolerance=tolerance, check_every=check_every, ensemble=ensemble)
@@ -70,12 +68,12 @@ def remade(kind: type[ProjectedIntegrator], making: tuple[Any, ...], settings: d
 
 
 def as_projected(
-    kind: type[ProjectedIntegrator],
+    kind: type[Integrator],
     integrator: openmm.CustomIntegrator,
     parts: Sequence[Part] = (),
     check_every: int | None = None,
     ensemble: Ensemble | None = None,
-) -> ProjectedIntegrator:
+) -> Integrator:
     """The integrator of this class that has the program of `integrator`.
 
     Raises

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import openmm
 
 from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.steppers.splitting import Splitting
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 
 class Ensemble(Protocol):
@@ -70,7 +68,7 @@ class Ensemble(Protocol):
         """Between two halves of the drift; adds the impulse of the first, and leaves v tangent."""
         ...
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         """At the first step of a run, x and v on the constraints.
 
         Raises
@@ -80,11 +78,11 @@ class Ensemble(Protocol):
         """
         ...
 
-    def verify(self, integrator: ProjectedIntegrator) -> None:
+    def verify(self, integrator: Integrator) -> None:
         """Raise `ConvergenceError` if something went wrong since the last check."""
         ...
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         """What 2 K/(g k) is to be multiplied with for the temperature, g being `degrees_of_freedom`."""
         ...
 
@@ -96,7 +94,7 @@ class Ensemble(Protocol):
         """The same at another temperature (K)."""
         ...
 
-    def follow(self, integrator: ProjectedIntegrator) -> None:
+    def follow(self, integrator: Integrator) -> None:
         """The integrator has taken this ensemble in the middle of a run."""
         ...
 
@@ -147,13 +145,13 @@ class ConstantEnergy(Value):
     def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
         raise NotImplementedError
 
-    def begin(self, integrator: ProjectedIntegrator, context: openmm.Context) -> None:
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
         pass
 
-    def verify(self, integrator: ProjectedIntegrator) -> None:
+    def verify(self, integrator: Integrator) -> None:
         pass
 
-    def warmth(self, integrator: ProjectedIntegrator) -> float:
+    def warmth(self, integrator: Integrator) -> float:
         return 1.0
 
     def settings(self) -> dict[str, float]:
@@ -162,5 +160,5 @@ class ConstantEnergy(Value):
     def at(self, temperature: float) -> Ensemble:
         raise UnsupportedError("at constant energy there is no temperature to set; give an ensemble")
 
-    def follow(self, integrator: ProjectedIntegrator) -> None:
+    def follow(self, integrator: Integrator) -> None:
         pass

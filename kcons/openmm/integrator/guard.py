@@ -6,7 +6,7 @@ import gc
 import logging
 import weakref
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import openmm
@@ -14,6 +14,7 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
@@ -22,9 +23,6 @@ from kcons.openmm.integrator.system_checks import (
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -81,7 +79,7 @@ class Guard:
         The System cannot be propagated, see `check_system`.
     """
 
-    def __init__(self, context: openmm.Context, integrator: ProjectedIntegrator) -> None:
+    def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
         self._context = weakref.ref(context)
         self._integrator = weakref.ref(integrator)
         self.system = context.getSystem()
@@ -118,7 +116,7 @@ class Guard:
         return context
 
     @property
-    def integrator(self) -> ProjectedIntegrator:
+    def integrator(self) -> Integrator:
         integrator = self._integrator()
         assert integrator is not None
         return integrator

@@ -21,30 +21,28 @@ import json
 import logging
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import openmm
 
 from kcons.errors import InputError, UnsupportedError
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.interface import Integrator
 
 logger = logging.getLogger("kcons.openmm")
 
-_LIVE: weakref.WeakValueDictionary[int, ProjectedIntegrator] = weakref.WeakValueDictionary()
+_LIVE: weakref.WeakValueDictionary[int, Integrator] = weakref.WeakValueDictionary()
 #: Ends a checkpoint, before the length of what was added.
 _MARK = b"kcons checkpoint"
 #: What OpenMM says where integrator parameters are those of another kind; by then it has read all the rest.
 _FOREIGN = ("IntegratorParameters", "global variable name", "per-DOF variable name", "CompoundIntegrator", "in node '")
 
 
-def listen(integrator: ProjectedIntegrator) -> None:
+def listen(integrator: Integrator) -> None:
     """Let this integrator hear what its Context is told."""
     _LIVE[int(integrator.this)] = integrator
 
 
-def listeners(context: openmm.Context) -> list[ProjectedIntegrator]:
+def listeners(context: openmm.Context) -> list[Integrator]:
     """The integrators of kcons that a Context has."""
     integrator = getattr(context, "_integrator", None)
     if integrator is None or not _LIVE:
@@ -82,12 +80,12 @@ def _set_state(original: Callable[..., None], context: openmm.Context, state: op
         _loaded(heard, context)
 
 
-def _forget(heard: list[ProjectedIntegrator]) -> None:
+def _forget(heard: list[Integrator]) -> None:
     for one in heard:
         one._hear_forget()
 
 
-def _loaded(heard: list[ProjectedIntegrator], context: openmm.Context) -> None:
+def _loaded(heard: list[Integrator], context: openmm.Context) -> None:
     _use_first(context)
     for one in heard:
         one._hear_loaded(context)
@@ -109,7 +107,7 @@ def _create_checkpoint(original: Callable[..., bytes], context: openmm.Context) 
     return bytes(made) + added + len(added).to_bytes(8, "big") + _MARK
 
 
-def _origin(heard: list[ProjectedIntegrator]) -> dict[str, Any]:
+def _origin(heard: list[Integrator]) -> dict[str, Any]:
     """Which programs a Context has, and their seeds."""
     programs = repr([one.program.operations for one in heard])
     return {

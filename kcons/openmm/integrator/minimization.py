@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import openmm
 from openmm import unit
@@ -12,14 +10,11 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.states_on_constraints import StatesOnConstraints
-
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01
 
 
-def descend(integrator: StatesOnConstraints, context: openmm.Context, tolerance: float, iterations: int) -> None:
+def descend(integrator: openmm.Integrator, context: openmm.Context, tolerance: float, iterations: int) -> None:
     """Fast inertial relaxation along the constraints of the System and of the parts.
 
     Velocities are the search direction in the mass metric: each step projects f/m, turns v towards it, goes, and
@@ -71,9 +66,7 @@ def descend(integrator: StatesOnConstraints, context: openmm.Context, tolerance:
         context.setVelocities(kept)
 
 
-def _move(
-    integrator: StatesOnConstraints, context: openmm.Context, v: FloatArray, dt: float
-) -> tuple[float, FloatArray]:
+def _move(integrator: openmm.Integrator, context: openmm.Context, v: FloatArray, dt: float) -> tuple[float, FloatArray]:
     x = positions_of(context)
     for _ in range(30):
         stride = dt * v
@@ -88,7 +81,7 @@ def _move(
     raise ConvergenceError("the constraints cannot be kept along the descent, however short the steps")
 
 
-def _tangent(integrator: StatesOnConstraints, context: openmm.Context, v: FloatArray) -> FloatArray:
+def _tangent(integrator: openmm.Integrator, context: openmm.Context, v: FloatArray) -> FloatArray:
     context.setVelocities(v)
     integrator.applyVelocityConstraints(context)
     return velocities_of(context)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import openmm
@@ -13,18 +13,16 @@ from kcons.openmm.ensembles.isokinetic import kelvins
 from kcons.openmm.ensembles.langevin import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard
+from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.states_on_constraints import value_in
 from kcons.steppers.splitting import Splitting
-
-if TYPE_CHECKING:
-    from kcons.openmm.integrator.projected import ProjectedIntegrator
 
 #: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
 _SAME = 1e-6
 
 
-class Settings(openmm.CustomIntegrator):
+class Settings(Integrator):
     """Settings belong to the integrator: they are kept here and in its program, and written into the Context.
 
     Attributes
@@ -112,7 +110,7 @@ class Settings(openmm.CustomIntegrator):
         self._ensemble = ensemble
         for name, value in ensemble.settings().items():
             self.program.set(name, value)
-        ensemble.follow(cast("ProjectedIntegrator", self))
+        ensemble.follow(self)
 
     # -- steps, tolerance, variables ------------------------------------------------------------
 

@@ -1,0 +1,34 @@
+"""What parts, ensembles, checks and copies may ask of an integrator; `ProjectedIntegrator` answers."""
+
+from __future__ import annotations
+
+import openmm
+
+from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.program import Program
+from kcons.steppers.splitting import Splitting
+
+
+class Integrator(openmm.CustomIntegrator):
+    """An integrator with a program of its own that holds constraints.
+
+    Besides what stands here it has `ensemble`, `check_every`, `degrees_of_freedom(context)`,
+    `applyConstraints(context)` and `applyVelocityConstraints(context)`.
+
+    Attributes
+    ----------
+    scheme : Splitting or None
+        None for the leapfrog.
+    parts : tuple of Part
+    program : Program
+    row_groups : frozenset of int
+        Force groups that carry rows, not forces.
+    spare : bool
+        Whether checks come later where they would take more than a hundredth of the time.
+    """
+
+    scheme: Splitting | None
+    parts: tuple[Part, ...]
+    program: Program
+    row_groups: frozenset[int]
+    spare: bool
