@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kcons.comparison.hard_cases import SYSTEMS, Case, Problem, all_cases, case, load, outcome, pages, run_cell
+from kcons.comparison.hard_cases import SYSTEMS, Case, Problem, all_cases, case, load, outcome, report, run_cell
 
 
 @case("Y01", "Cube by all 28 distances, tumbling", "residual 1e-10, kinetic energy 1e-3")
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", default=["X06", "H02", "Y01"], help="numbers of cases")
     chosen = parser.parse_args()
     if chosen.table:
-        print(pages.markdown(load(chosen.table)))
+        print(report.markdown(load(chosen.table)))
         return
     known = all_cases()
     for number in chosen.cases:

@@ -11,7 +11,7 @@ import argparse
 import json
 from pathlib import Path
 
-from kcons.comparison.stability import digest, drift, fuzz, largest_step, pages, trial
+from kcons.comparison.stability import digest, drift, fuzz, largest_step, report, trial
 
 
 def main() -> None:
@@ -22,7 +22,7 @@ def main() -> None:
     if chosen.table:
         result = json.loads(chosen.table.read_text(encoding="utf-8"))
         result = result if "fuzz" in result else digest(result)
-        print("\n\n".join(pages.markdown(result).values()))
+        print("\n\n".join(report.markdown(result).values()))
         return
 
     # A rotor turns by asin(omega dt) a step: beyond omega dt = 1 there is no step, and no method may pretend.

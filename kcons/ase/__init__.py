@@ -12,12 +12,17 @@ the object with ASE, which makes files that contain it readable.
 """
 
 from kcons.ase.calculator import ConstrainedCalculator
-from kcons.ase.constraint import Constraints, constrain
+from kcons.ase.constraints_object import Constraints, constrain
 from kcons.ase.dynamics import ConstrainedDynamics
-from kcons.ase.thermostats import ConstrainedLangevin, ConstrainedNoseHoover, IsokineticDynamics, draw_velocities
+from kcons.ase.rigid_water import rigid_water
+from kcons.ase.thermostat_dynamics import (
+    ConstrainedLangevin,
+    ConstrainedNoseHoover,
+    IsokineticDynamics,
+    draw_velocities,
+)
 from kcons.ase.topology import constraints_of, mend_elements
 from kcons.ase.translation import from_ase_constraints
-from kcons.ase.water import rigid_water
 
 __all__ = [
     "ConstrainedCalculator",

@@ -10,7 +10,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
 from numpy.typing import NDArray
 
-from kcons.ase.constraint import Constraints
+from kcons.ase.constraints_object import Constraints
 from kcons.ase.virial import VOIGT, constraint_virial
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers

@@ -16,7 +16,7 @@ from ase.md.md import MolecularDynamics
 from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
-from kcons.ase.constraint import Constraints
+from kcons.ase.constraints_object import Constraints
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint

@@ -9,7 +9,7 @@ import numpy as np
 from ase import Atoms
 from ase.geometry import find_mic
 
-from kcons.ase.constraint import Constraints
+from kcons.ase.constraints_object import Constraints
 from kcons.constraints import (
     Angle,
     CenterOfMass,

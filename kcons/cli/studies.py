@@ -40,7 +40,7 @@ def add(commands: Any) -> None:
 def _hard_cases(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison import hard_cases
-    from kcons.comparison.hard_cases import pages
+    from kcons.comparison.hard_cases import report
 
     cases = hard_cases.chosen(chosen.only)
     if chosen.list:
@@ -51,15 +51,15 @@ def _hard_cases(chosen: argparse.Namespace) -> int:
     kept = chosen.out / "hard_cases.json"
     with Bars() as watcher:
         result = hard_cases.run(only=chosen.only, quick=chosen.quick, kept=kept, watcher=watcher)
-    show(pages.table(result), pages.summary(result), console())
-    say_written([kept, *pages.write(result, chosen.out)])
+    show(report.table(result), report.summary(result), console())
+    say_written([kept, *report.write(result, chosen.out)])
     return 0
 
 
 def _stability(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison import stability
-    from kcons.comparison.stability import pages
+    from kcons.comparison.stability import report
 
     chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"
@@ -69,8 +69,8 @@ def _stability(chosen: argparse.Namespace) -> int:
     if chosen.into:
         before, result = stability.put_into(result, chosen.into[0])
         for page in chosen.into[1:]:
-            pages.renew(page, before, result)
+            report.renew(page, before, result)
         say_written(chosen.into)
-    print(pages.text(result))
-    say_written([kept, *pages.write(result, chosen.out)])
+    print(report.text(result))
+    say_written([kept, *report.write(result, chosen.out)])
     return 0

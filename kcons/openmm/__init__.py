@@ -15,10 +15,10 @@ from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold, take_constraints
 from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.collective.row_forces import Row, each_term
-from kcons.openmm.ensembles.isokinetic import Isokinetic
-from kcons.openmm.ensembles.langevin import Langevin
+from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
+from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.rattle import RattleIntegrator
+from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
 from kcons.openmm.surfaces.formulas import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 from kcons.openmm.topology import constraints_of

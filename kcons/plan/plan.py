@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import rank_of_small, ranked, small_enough
-from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import Outcome
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rigid_triangles import RigidTriangles

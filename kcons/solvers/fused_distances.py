@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.sweeps import project
 from kcons.solvers.kernels.aligned_memory import LINE, aligned
 from kcons.solvers.kernels.array_views import piece

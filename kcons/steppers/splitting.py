@@ -1,6 +1,6 @@
 """Kicks and drifts in turn: the loop that RATTLE, its compositions and the Runge-Kutta-Nystrom splittings share.
 
-A kick changes velocities by h M^-1 f(x, t), a drift flies h along the constraints (`kcons.steppers.drifts`).
+A kick changes velocities by h M^-1 f(x, t), a drift flies h along the constraints (`kcons.steppers.stages.drifts`).
 Time passes in the drifts, so that forces and constraints that depend on it are taken at the time of each stage,
 also where a stage goes back.
 """
@@ -18,10 +18,10 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.motion.certificate import checked_every
 from kcons.solvers.fused_distances import Packed
-from kcons.steppers.compensated_steps import NO_WORK, Point
-from kcons.steppers.drifts import Drift
-from kcons.steppers.friction import Friction
-from kcons.steppers.fused_stages import BOTH, FLY, UNENDED, Flights
+from kcons.steppers.stages.compensated_steps import NO_WORK, Point
+from kcons.steppers.stages.drifts import Drift
+from kcons.steppers.stages.friction import Friction
+from kcons.steppers.stages.fused_stages import BOTH, FLY, UNENDED, Flights
 from kcons.steppers.state import State, System, check_finite
 from kcons.steppers.stepper import explained, stays
 

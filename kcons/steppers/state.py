@@ -22,11 +22,11 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
-from kcons.steppers.compensated_steps import all_finite, beyond
-from kcons.steppers.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.files import in_one_piece
-from kcons.steppers.friction import Friction
-from kcons.steppers.fused_stages import Flights
+from kcons.steppers.stages.compensated_steps import all_finite, beyond
+from kcons.steppers.stages.drifts import Drift, GreatCircles, rattle_drift
+from kcons.steppers.stages.friction import Friction
+from kcons.steppers.stages.fused_stages import Flights
 
 #: Positions farther from the origin than this many times the size of what is held carry their remainder.
 FAR = 8.0
@@ -222,7 +222,7 @@ class System:
     friction : array_like, shape () or (n_atoms,)
         Rates at which velocities die away besides, m dv/dt = ... - gamma m v, in inverse units of time: for all atoms,
         or for each. Solved exactly, so that it takes no shorter step and no further evaluation of the force; see
-        `kcons.steppers.friction`. Relative to space at rest, also where targets move.
+        `kcons.steppers.stages.friction`. Relative to space at rest, also where targets move.
     far : float
         From this many times the size of what is held away from the origin, states carry the remainder of their
         positions. Infinite: never, so that positions and velocities alone are the whole state.

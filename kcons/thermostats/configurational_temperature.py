@@ -19,7 +19,7 @@ from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.compensated_steps import Point
+from kcons.steppers.stages.compensated_steps import Point
 from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.thermal_velocities import thermal_velocities
 

@@ -9,7 +9,7 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.compensated_steps import Point
+from kcons.steppers.stages.compensated_steps import Point
 from kcons.steppers.state import check_finite
 from kcons.steppers.stepper import explained, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction

@@ -11,8 +11,8 @@ from water_files import mda
 from kcons.constraints import Distance
 from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory, open_universe
-from kcons.mdanalysis.check.file_precision import precision_of
-from kcons.mdanalysis.check.target_file import TargetFile
+from kcons.mdanalysis.check.files.file_precision import precision_of
+from kcons.mdanalysis.check.files.target_file import TargetFile
 
 N = 30
 
@@ -308,7 +308,7 @@ def test_precision_is_read_from_the_file(tmp_path, x):
 
 def test_big_endian_dcd_and_fixed_layout(tmp_path, x):
     """The end of a DCD file is found by its records, whatever the order of bytes."""
-    from kcons.mdanalysis.check.endings import leftover
+    from kcons.mdanalysis.check.files.endings import leftover
 
     path = files.write(tmp_path / "w.dcd", x)
     data = path.read_bytes()

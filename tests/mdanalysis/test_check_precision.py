@@ -7,7 +7,7 @@ import water_files as files
 from kcons.constraints import Angle, Distance, LinearRelation
 from kcons.errors import UnreadableError
 from kcons.mdanalysis import ConstraintCheck, check_trajectory, load_trajectory
-from kcons.mdanalysis.check.file_precision import FilePrecision, precision_of
+from kcons.mdanalysis.check.files.file_precision import FilePrecision, precision_of
 
 N = 12
 BOND = Distance(files.pairs(N), files.targets(N))

@@ -13,7 +13,7 @@ from openmm_systems import alanine, context_of, dumbbell, loose_alanine, masses_
 from kcons.constraints import Distance
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, ProjectedIntegrator, Row, hold
-from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 

@@ -24,7 +24,7 @@ from kcons import System as CoreSystem
 from kcons.constraints import Angle, Distance, Sphere
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
 from kcons.openmm import CollectiveRows, Isokinetic, ProjectedIntegrator, Row, SurfaceIntegrator, hold, surface_parts
-from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import Isokinetic as CoreIsokinetic
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")

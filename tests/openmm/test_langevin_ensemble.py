@@ -8,7 +8,7 @@ from openmm_systems import alanine, context_of, loose_alanine, potential_energy,
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import Langevin, ProjectedIntegrator, hold
-from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 

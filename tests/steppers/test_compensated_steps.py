@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from kcons.steppers.compensated_steps import Point
+from kcons.steppers.stages.compensated_steps import Point
 
 ATOMS = 5
 

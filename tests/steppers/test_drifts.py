@@ -16,8 +16,8 @@ from kcons.constraints import (
     Sphere,
 )
 from kcons.errors import ConvergenceError
-from kcons.steppers.compensated_steps import Point
-from kcons.steppers.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
+from kcons.steppers.stages.compensated_steps import Point
+from kcons.steppers.stages.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
 
 
 def flown(drift, system, state, h: float, *, exact: bool = True):

@@ -21,7 +21,7 @@ from kcons.steppers import (
     System,
     run,
 )
-from kcons.steppers.fused_stages import MOST_ROWS
+from kcons.steppers.stages.fused_stages import MOST_ROWS
 
 STEPPERS = [Rattle(), Geodesic(4), Suzuki4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()]
 PAIRS = [[0, 1], [0, 2], [1, 2]]

@@ -11,10 +11,10 @@ import numpy as np
 
 from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis.check.constraint_check import ConstraintCheck
-from kcons.mdanalysis.check.file_precision import precision_of
+from kcons.mdanalysis.check.files.file_precision import precision_of
+from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.memory import give_back
 from kcons.mdanalysis.check.result import CheckResult
-from kcons.mdanalysis.check.target_file import TargetFile
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of
 

@@ -27,10 +27,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.mdanalysis.check.deviations import Deviations
-from kcons.mdanalysis.check.file_precision import FilePrecision
+from kcons.mdanalysis.check.files.file_precision import FilePrecision
+from kcons.mdanalysis.check.files.plain_dcd import Block
 from kcons.mdanalysis.check.frame_kernels import coordinate_grid, kinetic
-from kcons.mdanalysis.check.plain_dcd import Block
-from kcons.mdanalysis.check.rank import PIECE, rank_of
+from kcons.mdanalysis.check.rank_by_pieces import PIECE, rank_of
 from kcons.mdanalysis.check.row_table import RowTable
 
 #: Clusters of each kind in a sample: compiled code takes four at once, solvers up to eight.
@@ -54,7 +54,7 @@ class Frame:
         The cell.
     time : float
     in_blocks : bool
-        Whether the file can be read by `kcons.mdanalysis.check.plain_dcd`.
+        Whether the file can be read by `kcons.mdanalysis.check.files.plain_dcd`.
     """
 
     x: NDArray[np.float32]

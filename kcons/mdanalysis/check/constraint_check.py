@@ -20,8 +20,10 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
 from kcons.mdanalysis.check.atom_names import AtomNames
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
 from kcons.mdanalysis.check.deviations import UNITS, Deviations
-from kcons.mdanalysis.check.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.check.file_precision import FilePrecision, by_frame, described, precision_of
+from kcons.mdanalysis.check.files.endings import intact_frames, last_offset, leftover
+from kcons.mdanalysis.check.files.file_precision import FilePrecision, by_frame, described, precision_of
+from kcons.mdanalysis.check.files.plain_dcd import PlainDcd, plain_dcd
+from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.findings import (
     Part,
     by_unit,
@@ -32,11 +34,9 @@ from kcons.mdanalysis.check.findings import (
     verdict_of,
 )
 from kcons.mdanalysis.check.frame_kernels import coordinate_grid, farthest, kinetic
-from kcons.mdanalysis.check.plain_dcd import PlainDcd, plain_dcd
-from kcons.mdanalysis.check.rank import rank_of
+from kcons.mdanalysis.check.rank_by_pieces import rank_of
 from kcons.mdanalysis.check.result import Break, CheckResult
 from kcons.mdanalysis.check.row_table import SECOND_ORDER, RowTable, cell_matrix, size_of
-from kcons.mdanalysis.check.target_file import TargetFile
 from kcons.mdanalysis.check.temperature import BOLTZMANN, masses_of, temperature_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
@@ -65,7 +65,7 @@ class ConstraintCheck(AnalysisBase):
     targets : {'given', 'first', 'mean'}, path or TargetFile
         Where the lengths come from. 'given': what the constraints say, and the first frame for those that do not
         say. 'first': the first frame looked at. 'mean': the mean over the frames, which are read twice. A path: a
-        parameter file, see `kcons.mdanalysis.check.target_file`.
+        parameter file, see `kcons.mdanalysis.check.files.target_file`.
     tolerance : float
         Relative violation that counts as the engine's tolerance and not as a violation, in parts of the length (of
         1 rad for angles).

@@ -14,7 +14,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
 from kcons.mdanalysis.check.deviations import UNITS, Deviations
-from kcons.mdanalysis.check.file_precision import FilePrecision
+from kcons.mdanalysis.check.files.file_precision import FilePrecision
+from kcons.mdanalysis.check.files.plain_dcd import Block, look_at
 from kcons.mdanalysis.check.frame_kernels import (
     LANES,
     UNIFORM,
@@ -27,7 +28,6 @@ from kcons.mdanalysis.check.frame_kernels import (
     powers_below,
     triangles,
 )
-from kcons.mdanalysis.check.plain_dcd import Block, look_at
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 
 #: What second order adds to the error of rows other than distances, at most.

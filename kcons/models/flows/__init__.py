@@ -12,7 +12,7 @@
 from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria
 from kcons.models.flows.flow import Flow, PhaseVolume, jacobian_by_differences, phase_volume
 from kcons.models.flows.hamiltonian import HamiltonianFlow, SymplecticTrajectory
-from kcons.models.flows.isokinetic import Compression, Thermostat
+from kcons.models.flows.isokinetic_flow import Compression, Thermostat
 from kcons.models.flows.jordan import (
     JordanBlocks,
     JordanForm,
@@ -21,8 +21,8 @@ from kcons.models.flows.jordan import (
     jordan_blocks,
     jordan_form,
 )
-from kcons.models.flows.linear import LinearFlow
-from kcons.models.flows.models import DampedOscillator, HarmonicOscillator, ParticleOnSphere, Pendulum
+from kcons.models.flows.known_flows import DampedOscillator, HarmonicOscillator, ParticleOnSphere, Pendulum
+from kcons.models.flows.linear_flow import LinearFlow
 from kcons.models.flows.stability import Classification, Kind, Stability, classify
 from kcons.models.flows.variation import action, hamiltonian, lagrange_residual, momentum, velocity_of_momentum
 

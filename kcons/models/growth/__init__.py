@@ -7,14 +7,14 @@
 """
 
 from kcons.models.growth.constrained import ConstrainedGrowth
-from kcons.models.growth.ensemble import EnsembleSolution, solve_ensemble
 from kcons.models.growth.entropy import EntropyRow, NoProduction, PrescribedProduction, Relaxation, entropy_balance
 from kcons.models.growth.hypercycle import ConstrainedHypercycle, Hypercycle
 from kcons.models.growth.integration import GrowthSolution, solve
+from kcons.models.growth.many_trajectories import EnsembleSolution, solve_ensemble
 from kcons.models.growth.mixture import Mixture
 from kcons.models.growth.model import GrowthModel, Populations
-from kcons.models.growth.models import Logistic, LotkaVolterra
 from kcons.models.growth.rows import HolonomicRow, LinearRow, Row, TotalPopulation, VelocityRow
+from kcons.models.growth.simple_models import Logistic, LotkaVolterra
 
 __all__ = [
     "ConstrainedGrowth",

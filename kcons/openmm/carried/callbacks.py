@@ -32,8 +32,8 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion.motion import Motion
 from kcons.openmm.integrator.system_checks import ROW_NAME
-from kcons.steppers.compensated_steps import Point
-from kcons.steppers.drifts import NonholonomicFlight
+from kcons.steppers.stages.compensated_steps import Point
+from kcons.steppers.stages.drifts import NonholonomicFlight
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost

@@ -13,8 +13,8 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
 from kcons.openmm.collective.row_forces import energy
-from kcons.openmm.integrator.hearing import listeners
 from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
 
 if TYPE_CHECKING:

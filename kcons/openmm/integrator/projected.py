@@ -11,16 +11,16 @@ import openmm
 from openmm import unit
 
 from kcons.errors import InputError, KconsError, UnsupportedError
-from kcons.openmm.integrator.copies import as_projected, remade, settings_of
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
-from kcons.openmm.integrator.hearing import listen
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
-from kcons.openmm.integrator.settings import Settings, picoseconds
-from kcons.openmm.integrator.states_on_constraints import StatesOnConstraints
+from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
+from kcons.openmm.integrator.states.hearing import listen
+from kcons.openmm.integrator.states.settings import Settings, picoseconds
+from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
 from kcons.steppers.splitting import Splitting
 

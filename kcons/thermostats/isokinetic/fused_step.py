@@ -15,8 +15,8 @@ from kcons.motion.motion import MANY_ITERATIONS
 from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.kernels.array_views import piece
 from kcons.steppers import System
-from kcons.steppers.compensated_steps import all_finite
-from kcons.steppers.fused_stages import packed_rows
+from kcons.steppers.stages.compensated_steps import all_finite
+from kcons.steppers.stages.fused_stages import packed_rows
 from kcons.thermostats.isokinetic.kick import after_drift, before_drift
 
 #: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.

@@ -12,8 +12,8 @@ from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
-from kcons.steppers.compensated_steps import Point
 from kcons.steppers.splitting import Stage
+from kcons.steppers.stages.compensated_steps import Point
 from kcons.steppers.state import check_finite
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic import kick as closed_form

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from kcons.cli import main
-from kcons.comparison.hard_cases import chosen, load, pages, run
+from kcons.comparison.hard_cases import chosen, load, report, run
 from kcons.comparison.hard_cases.worker import Worker
 from kcons.errors import InputError
 
@@ -68,15 +68,15 @@ def test_unknown_cases_are_refused(tmp_path):
 
 def test_pages(result, tmp_path):
     found, _ = result
-    written = pages.write(found, tmp_path)
+    written = report.write(found, tmp_path)
     assert [path.name for path in written] == ["hard_cases.png", "hard_cases.html"]
     html = written[1].read_text(encoding="utf-8")
     assert "One bond with two targets" in html and "ContradictionError" in html
     assert not re.search(r"(?:src|href)=\"(?!data:|#)", html)
-    text = pages.markdown(found)
+    text = report.markdown(found)
     assert "| H02 | One bond with two targets, 1.0 and 1.001 | refused (ContradictionError) |" in text
-    assert pages.failures(found) == []
-    assert "kcons: 3 of 3 as asked for" in pages.summary(found)
+    assert report.failures(found) == []
+    assert "kcons: 3 of 3 as asked for" in report.summary(found)
 
 
 def test_command(tmp_path, capsys):

@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 
 from kcons.cli import main
-from kcons.comparison.stability import SCENES, attempt, drift, fuzz, largest_step, pages, put_into, reversal, run, trial
+from kcons.comparison.stability import (
+    SCENES,
+    attempt,
+    drift,
+    fuzz,
+    largest_step,
+    put_into,
+    report,
+    reversal,
+    run,
+    trial,
+)
 from kcons.comparison.stability.runs import Copies
 from kcons.errors import InputError
 
@@ -104,14 +115,14 @@ def test_command(tmp_path, capsys, monkeypatch):
 def test_page_shows_the_committed_results():
     result = json.loads(RESULTS.read_text(encoding="utf-8"))
     shown = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
-    for part, words in pages.markdown(result).items():
+    for part, words in report.markdown(result).items():
         assert words in shown, part
 
 
 def test_committed_results_have_no_faults():
     result = json.loads(RESULTS.read_text(encoding="utf-8"))
     assert result["environment"]["commit"]
-    assert pages.failures(result) == []
+    assert report.failures(result) == []
     assert result["fuzz"]["faults"] == []
     assert result["fuzz"]["trials"] >= 10_000
 
@@ -122,10 +133,10 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
     page.write_text((ROOT / "docs" / "stability.md").read_text(encoding="utf-8"), encoding="utf-8")
     stored = json.loads(RESULTS.read_text(encoding="utf-8"))
     stored["pieces"].pop("drift/butane", None)
-    before_it = pages.markdown(stored)["drift"]
+    before_it = report.markdown(stored)["drift"]
     page.write_text(
         page.read_text(encoding="utf-8").replace(
-            pages.markdown(json.loads(RESULTS.read_text(encoding="utf-8")))["drift"], before_it
+            report.markdown(json.loads(RESULTS.read_text(encoding="utf-8")))["drift"], before_it
         ),
         encoding="utf-8",
     )
@@ -143,14 +154,14 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
     summed = {**after["fuzz"], "trials": 7}
     assert put_into({**found, "pieces": {}, "fuzz": summed}, numbers)[1]["fuzz"] == summed
     numbers.write_text(json.dumps(after), encoding="utf-8")
-    pages.renew(page, before, after)
+    report.renew(page, before, after)
     assert "| butane | 0.02 | 10,000 | 8 |" in page.read_text(encoding="utf-8")
     once = page.read_text(encoding="utf-8")
-    pages.renew(page, before, after)
+    report.renew(page, before, after)
     assert page.read_text(encoding="utf-8") == once
     page.write_text("# Another page", encoding="utf-8")
     with pytest.raises(InputError, match="does not show the"):
-        pages.renew(page, before, after)
+        report.renew(page, before, after)
 
 
 def test_a_scene_that_is_not_there():

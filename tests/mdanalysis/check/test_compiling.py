@@ -16,7 +16,7 @@ from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.mdanalysis.check import compiling
 from kcons.mdanalysis.check.compiling import Frame, compiled_elsewhere, sample_of
-from kcons.mdanalysis.check.file_precision import FilePrecision
+from kcons.mdanalysis.check.files.file_precision import FilePrecision
 
 N = 40
 #: A check in a process of its own: kernels of kcons that it compiled itself, and other processes that it started.

@@ -11,8 +11,8 @@ from water_files import mda
 
 from kcons.constraints import Distance
 from kcons.mdanalysis import ConstraintCheck
-from kcons.mdanalysis.check import plain_dcd as dcd
-from kcons.mdanalysis.check.plain_dcd import plain_dcd
+from kcons.mdanalysis.check.files import plain_dcd as dcd
+from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 
 N = 25
 
@@ -74,7 +74,7 @@ def test_the_check_says_what_it_says_frame_by_frame(tmp_path, monkeypatch):
         np.concatenate([files.pairs(N), [[0, 3], [3, 6], [6, 9]]]), np.concatenate([files.targets(N), [3.0, 3.0, 3.0]])
     )
     blocks = ConstraintCheck(made(path), rows).run().check
-    monkeypatch.setattr("kcons.mdanalysis.check.plain_dcd", lambda reader: None)
+    monkeypatch.setattr("kcons.mdanalysis.check.files.plain_dcd", lambda reader: None)
     frames = ConstraintCheck(made(path), rows).run().check
     assert asdict(blocks) == asdict(frames)
 

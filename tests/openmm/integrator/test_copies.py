@@ -17,8 +17,8 @@ from openmm_systems import (
 
 from kcons.errors import InputError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.copies import program_of
 from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.integrator.states.copies import program_of
 from kcons.steppers import Geodesic
 from kcons.steppers.splitting import Splitting
 

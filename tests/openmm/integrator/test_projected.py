@@ -26,7 +26,7 @@ from openmm_systems import (
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.copies import program_of
+from kcons.openmm.integrator.states.copies import program_of
 from kcons.openmm.integrator.system_checks import refuse_barostat
 from kcons.steppers import Geodesic
 

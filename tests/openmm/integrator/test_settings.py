@@ -25,7 +25,7 @@ from kcons.openmm import (
     SurfaceIntegrator,
     hold,
 )
-from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 X = np.random.default_rng(3).random((8, 3)) * 0.3
 MASSES = np.full(8, 12.0)

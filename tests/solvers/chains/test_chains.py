@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.strips import SHORT
 
 

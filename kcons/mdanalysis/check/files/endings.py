@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from MDAnalysis.lib.util import anyopen
 
-from kcons.mdanalysis.check.file_precision import XTC_MAGIC
+from kcons.mdanalysis.check.files.file_precision import XTC_MAGIC
 from kcons.mdanalysis.check.result import Break
 
 

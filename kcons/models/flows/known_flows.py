@@ -13,7 +13,7 @@ from kcons.errors import InputError
 from kcons.models.flows.flow import FloatArray, Flow
 from kcons.models.flows.hamiltonian import HamiltonianFlow
 from kcons.models.flows.jordan import JordanBlocks, JordanForm, jordan_block
-from kcons.models.flows.linear import LinearFlow
+from kcons.models.flows.linear_flow import LinearFlow
 
 
 class DampedOscillator(LinearFlow):

@@ -13,11 +13,11 @@ import openmm
 from openmm import unit
 
 from kcons.errors import UnsupportedError
-from kcons.openmm.integrator.copies import settings_of
 from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.states_on_constraints import StatesOnConstraints
+from kcons.openmm.integrator.states.copies import settings_of
+from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0

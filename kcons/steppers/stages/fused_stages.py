@@ -18,11 +18,11 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import MANY_ITERATIONS, Motion
 from kcons.plan.plan import DistanceClusters
-from kcons.solvers.chains.chains import Chains
+from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.kernels.array_views import piece
 from kcons.solvers.rigid_triangles import RigidTriangles
-from kcons.steppers.compensated_steps import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
+from kcons.steppers.stages.compensated_steps import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 96

@@ -9,13 +9,13 @@ import openmm
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.ensembles.isokinetic import kelvins
-from kcons.openmm.ensembles.langevin import Langevin
+from kcons.openmm.ensembles.isokinetic_ensemble import kelvins
+from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.states_on_constraints import value_in
+from kcons.openmm.integrator.states.states_on_constraints import value_in
 from kcons.steppers.splitting import Splitting
 
 #: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
@@ -158,7 +158,7 @@ class Settings(Integrator):
         """As `setGlobalVariableByName`."""
         self.setGlobalVariableByName(self.getGlobalVariableName(index), value)
 
-    # -- what the Context is told, see kcons.openmm.integrator.hearing -------------------------------------
+    # -- what the Context is told, see kcons.openmm.integrator.states.hearing -------------------------------------
 
     def _hear_moved(self) -> None:
         """Something has moved x or v."""

@@ -18,7 +18,7 @@ from kcons.constraints.surface import Sphere
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.motion.motion import Motion
-from kcons.steppers.compensated_steps import Point
+from kcons.steppers.stages.compensated_steps import Point
 
 _MAX_ITERATIONS = 50
 _EPS = float(np.finfo(float).eps)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from openmm import unit
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.openmm.ensembles.isokinetic import GAS_CONSTANT, kelvins
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.program import Program
 from kcons.steppers.splitting import Splitting

@@ -8,8 +8,8 @@ import openmm
 from openmm import unit
 
 from kcons.openmm.integrator.guard import Guard
-from kcons.openmm.integrator.minimization import descend
 from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.states.minimization import descend
 
 
 class StatesOnConstraints(openmm.Integrator):

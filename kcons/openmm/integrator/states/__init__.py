@@ -1,0 +1,8 @@
+"""A Context, its states, and what is told to them.
+
+- `settings`: what an integrator was made with, and may be told later
+- `hearing`: States, checkpoints and files that a Context loads
+- `copies`: copies, pickles and XML
+- `minimization`: the energy minimised on the constraints
+- `states_on_constraints`: states on the constraints, with velocities of a temperature
+"""
