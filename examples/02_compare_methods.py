@@ -8,8 +8,7 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from kcons.comparison import scenes
-from kcons.comparison.work_precision import measure, report
+from kcons.comparison import measure, report, scenes
 
 scene = scenes.build("chain", size=10)
 result = measure.compare(scene, methods=["rattle", "ase-kcons", "ase-bonds"], budget=10)

@@ -31,16 +31,14 @@ from ase.md.verlet import VelocityVerlet
 from rich.console import Console
 
 import kcons
-from kcons import State, System
+from kcons import ConstraintSet, State, System
 from kcons.ase import constrain
-from kcons.comparison.scenes.openmm_host import system_of
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision import measure as compare
+from kcons.comparison import measure as compare
+from kcons.comparison import scripts, system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
-from kcons.plan.plan import DistanceClusters, make_plan
-from kcons.solvers.sparse.distances import SparseDistances
+from kcons.plan import DistanceClusters, make_plan
+from kcons.solvers import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
 STEP = 2.0  # fs
@@ -254,7 +252,7 @@ def openmm_constraints(x: np.ndarray, masses: np.ndarray, system: Any, tolerance
     import openmm
     from openmm import unit
 
-    from kcons.openmm.integrator.guard import positions_of, velocities_of
+    from kcons.openmm import positions_of, velocities_of
 
     table = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
     pairs = [(i, j) for i, j, _ in table]

@@ -22,11 +22,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison import scenes
-from kcons.comparison.methods import methods
-from kcons.comparison.work_precision import measure
+from kcons import ConstraintSet
+from kcons.comparison import measure, methods, scenes
 from kcons.constraints import Sphere
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion import Motion
 from kcons.steppers import ProjectedRungeKutta4, ProjectedVerlet, State, Stepper, System, run
@@ -223,7 +221,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from kcons.comparison.work_precision import report
+    from kcons.comparison import report
 
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -24,8 +24,7 @@ from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, constrain, rigid_water
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision.measure import environment
+from kcons.comparison import environment, scripts
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
 

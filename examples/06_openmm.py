@@ -24,10 +24,9 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision import measure as compare
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.comparison import measure as compare
+from kcons.comparison import scripts
+from kcons.openmm import SCHEMES, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 TOLERANCE = 1e-10

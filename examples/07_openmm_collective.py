@@ -23,7 +23,7 @@ from openmm import app, unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison.study import scripts
+from kcons.comparison import scripts
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

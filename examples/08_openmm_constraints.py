@@ -29,19 +29,21 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison.hard_cases.rings import ring
-from kcons.comparison.scenes.openmm_host import system_of
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision import measure as compare
+from kcons import ConstraintSet
+from kcons.comparison import measure as compare
+from kcons.comparison import ring, scripts, system_of
 from kcons.constraints import Distance
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion import Motion
-from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.hold import hold, take_constraints
-from kcons.openmm.carried.requirements import masses_of
-from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm import (
+    CarriedConstraints,
+    ProjectedIntegrator,
+    hold,
+    masses_of,
+    positions_of,
+    take_constraints,
+    velocities_of,
+)
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 KT = 2.494  # 300 K in kJ/mol

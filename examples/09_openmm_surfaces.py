@@ -25,10 +25,9 @@ from openmm import unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison.work_precision import measure
+from kcons.comparison import measure
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
-from kcons.openmm import ExpressionSurface, SurfaceIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm import SCHEMES, ExpressionSurface, SurfaceIntegrator
 
 CUTOFFS = (0.85, 1.0, 1.2)  # nm; 2.5 sigma, OpenMM's default, 3.5 sigma
 SPHERE = "sqrt((x-a)^2+(y-b)^2+(z-c)^2)-0.5"

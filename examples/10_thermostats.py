@@ -29,13 +29,11 @@ from ase import Atoms, units
 from rich.console import Console
 from rich.table import Table
 
+from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
-from kcons.comparison.scenes import fluid
-from kcons.comparison.scenes.lennard_jones import LennardJones
-from kcons.comparison.scenes.potential import Potential, PotentialCalculator
-from kcons.comparison.work_precision import measure as compare
+from kcons.comparison import LennardJones, Potential, PotentialCalculator, fluid
+from kcons.comparison import measure as compare
 from kcons.constraints import Distance
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System, run
 from kcons.thermostats import Isokinetic, Langevin, configurational_temperature, mean, thermal_velocities

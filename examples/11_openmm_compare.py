@@ -26,11 +26,7 @@ import openmm
 from rich.console import Console
 
 from kcons.cli.progress import Bars
-from kcons.comparison import scenes
-from kcons.comparison.scenes import Scene
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision import measure, report
-from kcons.comparison.work_precision.measure import Comparison, Measurement
+from kcons.comparison import Comparison, Measurement, Scene, measure, report, scenes, scripts
 from kcons.openmm import ProjectedIntegrator, hold
 
 #: Scenes, the errors in Å that they are asked for, and steps a turn.

@@ -26,8 +26,7 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison.study import scripts
-from kcons.comparison.work_precision import measure
+from kcons.comparison import measure, scripts
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kcons.comparison.solvers_alone import solver_precision
-from kcons.comparison.study import scripts
+from kcons.comparison import scripts, solver_precision
 
 
 def main() -> None:

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from kcons.comparison.solvers_alone import scaling
-from kcons.comparison.study import scripts
+from kcons.comparison import scaling, scripts
 
 
 def main() -> None:

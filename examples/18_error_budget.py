@@ -18,10 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kcons import State, System, run, steppers
-from kcons.comparison import scenes
-from kcons.comparison.methods.methods import METHODS
-from kcons.comparison.scenes import Reference
-from kcons.comparison.work_precision import measure as compare
+from kcons.comparison import METHODS, Reference, scenes
+from kcons.comparison import measure as compare
 
 STEP_METHODS = ("rattle", "blanes-moan4", "blanes-moan6")
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)

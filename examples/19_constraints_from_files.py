@@ -22,9 +22,8 @@ import kcons.ase
 import kcons.mdanalysis
 import kcons.openmm
 from kcons import Motion
-from kcons.comparison.scenes.any_file import read
-from kcons.topology import Snapshot, Topology
-from kcons.topology.rows_by_name import HeldRows, held_rows
+from kcons.comparison import read
+from kcons.topology import HeldRows, Snapshot, Topology, held_rows
 
 VILLIN = Path(app.__file__).parent / "data" / "test.pdb"
 KINDS = ("hbonds", "allbonds", "hangles")

@@ -26,7 +26,7 @@ with warnings.catch_warnings():
     import MDAnalysis as mda
 
 from kcons import __version__
-from kcons.comparison.study.machine import environment
+from kcons.comparison import environment
 from kcons.constraints import Distance
 from kcons.mdanalysis import ConstraintCheck
 

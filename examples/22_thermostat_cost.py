@@ -18,10 +18,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator
 
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.comparison import scenes
-from kcons.comparison.scenes.fluid import Fluid
-from kcons.comparison.study import scripts
-from kcons.comparison.study.machine import environment
+from kcons.comparison import Fluid, environment, scenes, scripts
 from kcons.thermostats import thermal_velocities
 
 #: Fluid, molecules, steps of a block: 10 to 20 ms.

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison.work_precision import measure
+from kcons.comparison import measure
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")

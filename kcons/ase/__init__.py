@@ -4,11 +4,11 @@ ASE applies constraint objects one after another, and each undoes the work of th
 whole set and solves it as one. Units are ASE's; targets are in angstrom and radian. Importing this package registers
 the object with ASE, which makes files that contain it readable.
 
-- `topology`, `water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
-- `binding`, `respect`, `constraint`: the object, and whether the caller respects it
+- `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
+- `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `virial`: the stress of the constraint forces
 - `calculator`: forces along the constraints, for optimisers
-- `dynamics`, `thermostats`: dynamics with any stepper
+- `dynamics`, `thermostat_dynamics`: dynamics with any stepper
 """
 
 from kcons.ase.calculator import ConstrainedCalculator

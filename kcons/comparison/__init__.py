@@ -8,3 +8,38 @@
 - `solvers_alone`: constraint solvers without dynamics
 - `hard_cases`, `stability`: where constraints are difficult, and how far steps can be pushed
 """
+
+from importlib import import_module
+from typing import Any
+
+#: What documents and examples use, by the module that has it; imported when it is asked for.
+_MODULES = {
+    "averages": ("sampling",),
+    "methods": ("methods",),
+    "scenes": ("fluid",),
+    "solvers_alone": ("scaling", "solver_precision"),
+    "study": ("scripts",),
+    "work_precision": ("fronts", "measure", "recommendation", "report"),
+}
+_NAMES = {
+    "hard_cases.rings": ("ring",),
+    "methods.methods": ("METHODS",),
+    "scenes": ("Reference", "Scene"),
+    "scenes.any_file": ("read",),
+    "scenes.fluid": ("Fluid",),
+    "scenes.lennard_jones": ("LennardJones",),
+    "scenes.openmm_host": ("system_of",),
+    "scenes.potential": ("Potential", "PotentialCalculator"),
+    "study.machine": ("environment",),
+    "work_precision.measurement": ("Comparison", "Measurement"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for folder, modules in _MODULES.items():
+        if name in modules:
+            return import_module(f"{__name__}.{folder}.{name}")
+    for module, names in _NAMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

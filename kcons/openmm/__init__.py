@@ -13,17 +13,21 @@ collective variables, surfaces and the constraint objects of kcons.
 
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold, take_constraints
+from kcons.openmm.carried.requirements import masses_of
 from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
+from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
+from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.surfaces.formulas import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 from kcons.openmm.topology import constraints_of
 
 __all__ = [
+    "SCHEMES",
     "CarriedConstraints",
     "CollectiveRows",
     "ExpressionSurface",
@@ -36,6 +40,9 @@ __all__ = [
     "constraints_of",
     "each_term",
     "hold",
+    "masses_of",
+    "positions_of",
     "surface_parts",
     "take_constraints",
+    "velocities_of",
 ]

@@ -7,6 +7,6 @@
 - `plan`: the clusters, and the table that picks the solver of each
 """
 
-from kcons.plan.plan import Plan, make_plan
+from kcons.plan.plan import DistanceClusters, Plan, make_plan
 
-__all__ = ["Plan", "make_plan"]
+__all__ = ["DistanceClusters", "Plan", "make_plan"]

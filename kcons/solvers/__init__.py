@@ -6,3 +6,7 @@
 - `general_clusters`: any rows whatever
 - `fused_distances`: distances of every shape in one call
 """
+
+from kcons.solvers.sparse.distances import SparseDistances
+
+__all__ = ["SparseDistances"]

@@ -2,9 +2,9 @@
 
 A stepper never changes its input. Where it raises, nothing has happened.
 
-- `state`, `files`, `friction`: where a system is, and what acts on it
+- `state`, `files`: where a system is, and what acts on it
 - `stepper`: what a stepper is
-- `drifts`, `compensated_steps`, `fused_stages`: what steps are made of
+- `stages`: what steps are made of
 - `splitting`: kicks and drifts in turn
 - `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
 - `extrapolation`: steps that choose their own size

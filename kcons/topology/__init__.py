@@ -9,6 +9,7 @@
 - `other_units`: constraints in another unit of length
 """
 
+from kcons.topology.rows_by_name import HeldRows, held_rows
 from kcons.topology.topology import Snapshot, Topology
 
-__all__ = ["Snapshot", "Topology"]
+__all__ = ["HeldRows", "Snapshot", "Topology", "held_rows"]

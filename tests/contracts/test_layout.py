@@ -71,11 +71,13 @@ def test_no_circle_of_imports():
 
 
 def test_documents_and_examples_import_public_names():
-    """`kcons` and `kcons.X`; of what is deeper nothing."""
+    """`kcons` and `kcons.X`; of what is deeper the folders that are a subject of their own."""
+    own = {"cli.progress", "models.flows", "models.growth", "comparison.hard_cases", "comparison.stability"}
     deep = []
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").glob("*.py"))]:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if re.match(r"\s*(from|import) kcons\.\w+\.\w", line):
+            found = re.match(r"\s*(?:from|import) kcons\.(\w+\.[\w.]+)", line)
+            if found and found[1] not in own:
                 deep.append(f"{path.name}:{number}: {line.strip()}")
     assert deep == []
 

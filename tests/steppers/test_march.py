@@ -9,7 +9,7 @@ import pytest
 
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.steppers import Rattle, ReversibilityCheck, State, Suzuki4, run
-from tests.steppers.test_fused_stages import GROUPS, STEPPERS, SYSTEMS, molecules, springs, triangles
+from tests.steppers.stages.test_fused_stages import GROUPS, STEPPERS, SYSTEMS, molecules, springs, triangles
 
 ARRAYS = ("positions", "velocities", "forces", "remainder")
 

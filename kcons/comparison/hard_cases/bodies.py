@@ -6,9 +6,9 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import Frame, Program, together
 from kcons.comparison.hard_cases.motions import OMEGA, every, flat_body, move, tumble, worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import Frame, Program, together
 
 TRIANGLE = [(0, 1), (0, 2), (1, 2)]
 WATER = np.array([[0.0, 0.0, 0.0], [0.9572, 0.0, 0.0], [-0.23999, 0.92663, 0.0]])

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from kcons.comparison.hard_cases.program import CannotExpressError, Program
+from kcons.comparison.hard_cases.contract import CannotExpressError, Program
 from kcons.errors import KconsError
 
 Kind = Literal["bound", "raise", "warn-or-raise"]

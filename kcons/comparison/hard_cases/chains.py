@@ -9,9 +9,9 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import Frame, Program
 from kcons.comparison.hard_cases.motions import move, worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import Frame, Program
 from kcons.comparison.hard_cases.programs import Core
 
 

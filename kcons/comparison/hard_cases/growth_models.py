@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import Program
 from kcons.comparison.hard_cases.problem import Array
-from kcons.comparison.hard_cases.program import Program
 from kcons.comparison.hard_cases.steps import each_refused
 
 NONE = "no growth models and no linear flows"

@@ -10,8 +10,8 @@ from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
+from kcons.comparison.hard_cases.contract import Program
 from kcons.comparison.hard_cases.problem import Problem
-from kcons.comparison.hard_cases.program import Program
 from kcons.comparison.hard_cases.steps import each_refused
 from kcons.constraints import LinearCombination, Plane
 

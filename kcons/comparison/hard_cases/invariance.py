@@ -13,9 +13,9 @@ from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
+from kcons.comparison.hard_cases.contract import CannotExpressError, Program
 from kcons.comparison.hard_cases.long_runs import pendulum
 from kcons.comparison.hard_cases.problem import Array, Numbers, Problem
-from kcons.comparison.hard_cases.program import CannotExpressError, Program
 from kcons.comparison.hard_cases.programs import Core, PlainAse, PlainOpenMM
 from kcons.comparison.hard_cases.steps import each_refused
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import Frame, Program
 from kcons.comparison.hard_cases.motions import worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import Frame, Program
 from kcons.comparison.hard_cases.programs import Core
 from kcons.errors import KconsError
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, outcome
+from kcons.comparison.hard_cases.contract import Frame, Program
 from kcons.comparison.hard_cases.problem import Array, Pairs, Problem
-from kcons.comparison.hard_cases.program import Frame, Program
 
 OMEGA = np.array([0.9, -0.5, 0.7])
 

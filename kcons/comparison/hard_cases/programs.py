@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import (
+from kcons.comparison.hard_cases.contract import (
     CannotExpressError,
     Course,
     Frame,
@@ -22,6 +21,7 @@ from kcons.comparison.hard_cases.program import (
     Program,
     Watch,
 )
+from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion

@@ -6,9 +6,9 @@ import numpy as np
 
 from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import Frame, Program
 from kcons.comparison.hard_cases.motions import OMEGA, every, flat_body, move, worst_residual
 from kcons.comparison.hard_cases.problem import Array, Pairs, Problem
-from kcons.comparison.hard_cases.program import Frame, Program
 
 SINGULAR = "right to 10 x the error of RATTLE and flat to 1e-8, or refused with the count of degrees of freedom"
 

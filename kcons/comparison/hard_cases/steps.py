@@ -12,9 +12,9 @@ from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.bodies import TRIANGLE
 from kcons.comparison.hard_cases.case import Check, Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
+from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, Program, together
 from kcons.comparison.hard_cases.motions import worst_residual
 from kcons.comparison.hard_cases.problem import Problem
-from kcons.comparison.hard_cases.program import CannotExpressError, Frame, Program, together
 from kcons.comparison.hard_cases.programs import Core, PlainAse
 from kcons.comparison.hard_cases.starts import rotor
 from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, KahanLi6, Rattle, Stepper, Suzuki4

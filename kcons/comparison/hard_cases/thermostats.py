@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
+from kcons.comparison.hard_cases.contract import CannotExpressError, Program
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import CannotExpressError, Program
 from kcons.comparison.hard_cases.programs import Core, KconsInAse, KconsInOpenMM
 from kcons.comparison.hard_cases.steps import each_refused
 from kcons.constraints import Plane, Sphere

@@ -4,7 +4,7 @@
 - `runs`: largest stable steps, drift of the energy, reversibility
 - `fuzz`: random molecules
 - `study`: all of it, kept as it comes in
-- `pages`: tables and a picture
+- `report`: tables and a picture
 """
 
 from kcons.comparison.stability.fuzz import Trial, trial

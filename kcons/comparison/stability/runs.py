@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, NotIntactError, Program
 from kcons.comparison.hard_cases.long_runs import secular_drift
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.program import CannotExpressError, Frame, NotIntactError, Program
 from kcons.comparison.hard_cases.programs import Core, PlainAse, PlainOpenMM
 from kcons.comparison.stability.scenes import SCENES
 from kcons.constraints import Constraint, Distance, FixedAtoms

@@ -4,9 +4,9 @@
 - `equilibria`: where it rests
 - `spectrum`, `imaginary_axis`, `jordan`: eigenvalues as far as they can be told
 - `stability`: the classification of equilibria
-- `linear`: linear flows
-- `hamiltonian`, `isokinetic`, `variation`: mechanics as flows
-- `models`: flows with known solutions
+- `linear_flow`: linear flows
+- `hamiltonian`, `isokinetic_flow`, `variation`: mechanics as flows
+- `known_flows`: flows with known solutions
 """
 
 from kcons.models.flows.equilibria import Equilibrium, equilibrium_at, find_equilibria

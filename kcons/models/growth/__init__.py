@@ -1,9 +1,9 @@
 """Populations that grow under constraints (notes sections 3 and 4.3).
 
-- `model`, `models`, `hypercycle`, `mixture`: models of growth
+- `model`, `simple_models`, `hypercycle`, `mixture`: models of growth
 - `rows`, `orthogonal_rows`, `entropy`: what is held
 - `constrained`: a model with what is held
-- `compensated_sums`, `integration`, `ensemble`: one trajectory, and many
+- `compensated_sums`, `integration`, `many_trajectories`: one trajectory, and many
 """
 
 from kcons.models.growth.constrained import ConstrainedGrowth

@@ -1,6 +1,6 @@
 """Ensembles for the integrators.
 
 - `conserved_momenta`: momenta that a thermostat leaves alone
-- `langevin`: Langevin dynamics
-- `isokinetic`: constant kinetic energy
+- `langevin_ensemble`: Langevin dynamics
+- `isokinetic_ensemble`: constant kinetic energy
 """

@@ -4,6 +4,6 @@
 - `part`, `interface`, `ensemble`: what an integrator is put together from
 - `step_writer`, `lean_step_writer`, `step_counts`: the program of one step, and what it costs
 - `system_checks`, `guard`: what a System holds, and whether it was held
-- `settings`, `hearing`, `copies`, `states_on_constraints`, `minimization`: a Context and its states
-- `projected`, `rattle`: `ProjectedIntegrator` and `RattleIntegrator`
+- `states`: a Context, its states, and what is told to them
+- `projected`, `rattle_integrator`: `ProjectedIntegrator` and `RattleIntegrator`
 """

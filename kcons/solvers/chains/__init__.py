@@ -2,5 +2,5 @@
 
 - `strips`: how chains are laid out, eight to a strip
 - `sweeps`: Newton's method in two sweeps along a chain
-- `chains`: the solver
+- `open_chains`: the solver
 """

@@ -23,7 +23,7 @@ from kcons.openmm import (
     hold,
     surface_parts,
 )
-from tests.openmm.integrator.test_settings import (
+from tests.openmm.integrator.states.test_settings import (
     CENTRE,
     KINDS,
     RADIUS,
