@@ -37,8 +37,8 @@ from kcons.comparison import measure as compare
 from kcons.comparison import scripts, system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
-from kcons.plan import DistanceClusters, make_plan
-from kcons.solvers import SparseDistances
+from kcons.plan import make_plan
+from kcons.solvers import DistanceClusters, SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
 STEP = 2.0  # fs

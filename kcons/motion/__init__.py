@@ -2,6 +2,7 @@
 
 - `motion`: `Motion`, the engine itself
 - `certificate`: results checked by the constraints as they were given
+- `failures`: what to tell the user where a solve failed
 - `report`: what is held, and how well
 - `condition`: condition numbers of clusters
 - `restoring`: positions that are off, brought onto the constraints

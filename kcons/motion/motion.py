@@ -19,8 +19,9 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
-from kcons.motion import report as diagnosis
+from kcons.motion import failures
 from kcons.motion.certificate import certify
+from kcons.motion.report import Report, make_report
 from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
 from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Task, Work
@@ -499,7 +500,7 @@ class Motion:
             if not outcome.converged:
                 if saved is not None:
                     np.copyto(y, saved)
-                raise diagnosis.tangents_failed(self._local, self._atoms, x, y, outcome, solver, what, plan)
+                raise failures.tangents_failed(self._local, self._atoms, x, y, outcome, solver, what, plan)
             found.append(lam)
         if multipliers is not None:
             self._collect(found, multipliers)
@@ -544,7 +545,7 @@ class Motion:
                 b = b + feedback
         if not np.all(np.isfinite(b)):
             arrays = {"velocity": local_v, "position": local_x}
-            raise diagnosis.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
+            raise failures.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
         mu = np.zeros(self._local.n_rows)
         self._tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
@@ -599,9 +600,7 @@ class Motion:
         if self.conversions:
             certify(self._given, here, speed, time, slack=10 * MISFIT, still=still)
 
-    def report(
-        self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True
-    ) -> diagnosis.Report:
+    def report(self, x: ArrayLike, v: ArrayLike | None = None, time: float = 0.0, *, condition: bool = True) -> Report:
         """Rows, rank, condition, residuals, iterations and the solver of each kind of cluster, at `x` (and `v`).
 
         ``condition=False`` leaves out the condition numbers, which take longer than all else in the report.
@@ -609,9 +608,7 @@ class Motion:
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()
-        return diagnosis.make_report(
-            self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition
-        )
+        return make_report(self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition)
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"

@@ -4,9 +4,10 @@
 - `independent_blocks`: pieces of a cluster whose ranks add up
 - `rank`: the number of independent rows
 - `second_order`: rows that are singular only at second order
-- `plan`: the clusters, and the table that picks the solver of each
+- `solver_table`: which solver serves which shape
+- `plan`: the clusters of a set, with a solver each
 """
 
-from kcons.plan.plan import DistanceClusters, Plan, make_plan
+from kcons.plan.plan import Plan, make_plan
 
-__all__ = ["DistanceClusters", "Plan", "make_plan"]
+__all__ = ["Plan", "make_plan"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -14,54 +13,13 @@ from kcons.constraints.images import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
-from kcons.plan.rank import rank_of_small, ranked, small_enough
-from kcons.solvers.chains.open_chains import Chains
-from kcons.solvers.cluster_solver import Outcome
+from kcons.plan.rank import rank_of_shape, ranked, small_enough
+from kcons.plan.solver_table import solver_of
+from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.general_clusters import GeneralClusters
-from kcons.solvers.rigid_triangles import RigidTriangles
-from kcons.solvers.small_clusters import SmallClusters
-from kcons.solvers.sparse.distances import SparseDistances, lengths_resolved
-from kcons.solvers.sparse.mixed_rows import SparseRows
 
-#: Rounds of Newton that a chain may take until its stored positions show the lengths.
-MAX_ROUNDS = 4
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
-
-
-class ClusterSolver(Protocol):
-    """A solver of one kind for all clusters of one shape.
-
-    Both methods work in place on the whole local arrays, touch only the atoms of their rows, and leave
-    everything as it was when the outcome is not converged. `targets` and `rates` are indexed by row of
-    the set (None: the targets found at set-up; no motion of the surface).
-    """
-
-    name: str
-    rows: IntArray
-
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome: ...
-
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome: ...
 
 
 @dataclass(frozen=True)
@@ -262,12 +220,12 @@ def make_plan(
             plan.loose = None
     whole_positions = constraint_set.whole(positions)
     for shape, whole in _shapes(constraint_set, labels, inverse_masses):
-        solver = _solver(shape, constraint_set, inverse_masses, labels, time)
+        solver = solver_of(shape, constraint_set, inverse_masses, labels, time)
         if shape.independent:
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = _rank(shape, inverse_masses, whole_positions, lattice, solver, time)
+            rank = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
         clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
         if clusters and shape.kind in ("sparse", "mixed") and small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
@@ -282,7 +240,7 @@ def make_plan(
             if not isinstance(solver, GeneralClusters):
                 if shape.kind == "sparse" and not plan.late[shape.rows].any() and small_enough(clusters):
                     ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
-                solver = _solver(shape, constraint_set, inverse_masses, labels, time, plan.late)
+                solver = solver_of(shape, constraint_set, inverse_masses, labels, time, plan.late)
         plan.solvers.append(solver)
         plan.whole.append(whole and not (isinstance(solver, GeneralClusters) and solver.winds))
         plan.rank += rank
@@ -328,161 +286,3 @@ def _pinned(constraint_set: ConstraintSet) -> tuple[IntArray, IntArray]:
     if not atoms:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(atoms), np.concatenate(rows)
-
-
-class DistanceClusters:
-    """A solver of distance rows, as a `ClusterSolver`: picks its rows out of arrays over the whole set."""
-
-    def __init__(self, solver: DistanceSolver, targets: FloatArray) -> None:
-        self.name = solver.name
-        self.rows = solver.rows.ravel()
-        self.solver = solver
-        self._lengths = np.ascontiguousarray(targets[self.rows])
-
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
-        lengths = self._lengths if targets is None else targets[self.rows]
-        return self.solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, multipliers)
-
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome:
-        return self.solver.tangents(x, y, None if rates is None else rates[self.rows], lattice, multipliers)
-
-
-class LongChains(DistanceClusters):
-    """Chains with a last look at the positions themselves.
-
-    The multipliers of a long stretched chain can be so large that their rounding shows in the positions
-    although the bond vectors of the iteration were exact; another round from there takes it away.
-    """
-
-    def __init__(self, solver: Chains, pairs: IntArray, targets: FloatArray) -> None:
-        super().__init__(solver, targets)
-        self._pairs = pairs.astype(np.uint32)
-
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
-        lengths = self._lengths if targets is None else targets[self.rows]
-        outcome = self.solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, multipliers)
-        more = None
-        for _ in range(MAX_ROUNDS):
-            if not outcome.converged or lengths_resolved(x_new, self._pairs, lengths, lattice):
-                return outcome
-            more = None if multipliers is None else np.empty(len(multipliers))
-            again = self.solver.positions(x_new, x_ref, lengths, lattice, velocities, inv_dt, more)
-            if not again.converged:
-                return outcome
-            if multipliers is not None and more is not None:
-                multipliers += more
-        return outcome
-
-
-def sparse_distances(
-    constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray, time: float = 0.0
-) -> DistanceClusters:
-    """The sparse solver, which has step control, for distance rows."""
-    pairs = np.array([constraint_set.row_atoms(int(row)) for row in rows], dtype=np.int64)
-    targets = constraint_set.target(time)
-    return DistanceClusters(SparseDistances(rows, pairs, targets[rows], inverse_masses), targets)
-
-
-class DistanceSolver(Protocol):
-    """The kernels behind `DistanceClusters`; lengths and rates come in the order of `rows`."""
-
-    name: str
-    rows: IntArray
-
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        lengths: FloatArray,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-    ) -> Outcome: ...
-
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-    ) -> Outcome: ...
-
-
-def _solver(
-    shape: Shape,
-    constraint_set: ConstraintSet,
-    inverse_masses: FloatArray,
-    labels: IntArray,
-    time: float,
-    late: BoolArray | None = None,
-) -> ClusterSolver:
-    """The table: which solver serves which shape."""
-    rows = shape.rows
-    if shape.kind == "general":
-        return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
-    if shape.kind == "mixed":
-        return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
-    targets = constraint_set.target(time)
-    solver: DistanceSolver
-    if shape.kind == "water":
-        solver = RigidTriangles(rows, shape.atoms, targets[rows], inverse_masses[shape.atoms[0]])
-    elif shape.kind == "lanes":
-        solver = SmallClusters(rows, shape.atoms, shape.pairs, targets[rows], inverse_masses[shape.atoms[0]])
-    elif shape.kind == "chain":
-        chains = Chains(rows, shape.starts, shape.atoms, targets[rows], inverse_masses[shape.atoms])
-        return LongChains(chains, shape.pairs, targets)
-    else:
-        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses, None if late is None else late[rows])
-    return DistanceClusters(solver, targets)
-
-
-def _rank(
-    shape: Shape,
-    inverse_masses: FloatArray,
-    positions: FloatArray,
-    lattice: FloatArray | None,
-    solver: ClusterSolver,
-    time: float,
-) -> int:
-    """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, SparseRows):
-        return solver.rank(positions, lattice)
-    if isinstance(solver, DistanceClusters):
-        sparse = solver.solver
-        if isinstance(sparse, SparseDistances):
-            return sparse.rank(positions, lattice)
-        return rank_of_small(shape, inverse_masses, positions, lattice)
-    assert isinstance(solver, GeneralClusters)
-    return solver.rank(positions, time)

@@ -9,7 +9,11 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.images import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
-from kcons.solvers.general_clusters import RANK_TOLERANCE
+from kcons.solvers.cluster_solver import ClusterSolver
+from kcons.solvers.distance_clusters import DistanceClusters
+from kcons.solvers.general_clusters import RANK_TOLERANCE, GeneralClusters
+from kcons.solvers.sparse.distances import SparseDistances
+from kcons.solvers.sparse.mixed_rows import SparseRows
 
 #: Largest cluster, in rows, in which dependent rows are looked for one by one, to be eliminated last.
 ORDERED_ROWS = 400
@@ -68,3 +72,23 @@ def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArra
     unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
     s = np.linalg.svd(unit, compute_uv=False)
     return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
+
+
+def rank_of_shape(
+    shape: Shape,
+    inverse_masses: FloatArray,
+    positions: FloatArray,
+    lattice: FloatArray | None,
+    solver: ClusterSolver,
+    time: float,
+) -> int:
+    """Independent rows of a shape whose graph does not tell."""
+    if isinstance(solver, SparseRows):
+        return solver.rank(positions, lattice)
+    if isinstance(solver, DistanceClusters):
+        sparse = solver.solver
+        if isinstance(sparse, SparseDistances):
+            return sparse.rank(positions, lattice)
+        return rank_of_small(shape, inverse_masses, positions, lattice)
+    assert isinstance(solver, GeneralClusters)
+    return solver.rank(positions, time)

@@ -522,4 +522,34 @@ MUTANTS = [
         "np.where(periodic, 1.0, 1.0)",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
+    (
+        "constraints/constraint_set.py",
+        "change = change[self.lattice[1].any(axis=0)]",
+        "change = change[:]",
+        "tests/constraints/test_images.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
+    ),
+    (
+        "constraints/constraint_set.py",
+        "return np.where(same[:, None, None], near, r)",
+        "return r",
+        "tests/constraints/test_images.py::test_lengths_found_far_away_can_be_held_near_the_origin",
+    ),
+    (
+        "constraints/contradictions.py",
+        "same = open_ & (given[place] == key)",
+        "same = open_ & (given[place] != given[place])",
+        "tests/constraints/test_images.py::test_a_length_found_and_the_same_one_given",
+    ),
+    (
+        "topology/guessed_bonds.py",
+        "wrapped = y if cell is None else wrapped_into(y, cell, pbc)[1]",
+        "wrapped = y",
+        "tests/motion/restoring/test_moved_groups.py::test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
+    ),
+    (
+        "motion/failures.py",
+        "STRAIGHT = 0.1",
+        "STRAIGHT = 1e-9",
+        "tests/motion/test_failures.py::test_a_run_that_ends_where_a_dihedral_is_straight_names_no_time_step",
+    ),
 ]

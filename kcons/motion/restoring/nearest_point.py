@@ -11,9 +11,10 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
-from kcons.motion import report
-from kcons.plan.plan import ClusterSolver, LongChains, Plan, sparse_distances
-from kcons.solvers.cluster_solver import Outcome
+from kcons.motion import failures
+from kcons.plan.plan import Plan
+from kcons.solvers.cluster_solver import ClusterSolver, Outcome
+from kcons.solvers.distance_clusters import LongChains, sparse_distances
 from kcons.solvers.general_clusters import GeneralClusters
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
@@ -100,7 +101,7 @@ class Rescuers:
         """
         x, velocities = task.x_new, task.velocities
         saved = x.copy(), None if velocities is None else velocities.copy()
-        error = report.unusable(self._local, self._numbers, {"x_new": x, "x_ref": task.x_ref}, outcome, solver)
+        error = failures.unusable(self._local, self._numbers, {"x_new": x, "x_ref": task.x_ref}, outcome, solver)
         if self.work is not None:
             self.work.rescues -= 1
         if error is None and (self.work is None or self.work.rescues >= 0):
@@ -110,7 +111,7 @@ class Rescuers:
         np.copyto(x, saved[0])
         if velocities is not None and saved[1] is not None:
             np.copyto(velocities, saved[1])
-        raise error or report.positions_failed(self._local, self._numbers, task.x_ref, outcome, solver, self._plan)
+        raise error or failures.positions_failed(self._local, self._numbers, task.x_ref, outcome, solver, self._plan)
 
     def _damped(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
@@ -204,7 +205,7 @@ class FarStart:
     def _reach(self, x: FloatArray, time: float) -> None:
         """Some point on the constraints, for starts too far off for one projection, in place."""
         start = x.copy()
-        error = report.not_finite(self._local, self._numbers, {"positions": start})
+        error = failures.not_finite(self._local, self._numbers, {"positions": start})
         if error is not None:
             raise error
         if not self._gauss_newton(x, time):
@@ -213,7 +214,7 @@ class FarStart:
             general = self._plan.general_for_all(RESCUE_ROWS, equal=True)
             outcome = general.restore(x, time=time)
             if not outcome.converged:
-                raise report.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
+                raise failures.restore_failed(self._local, self._numbers, x, start, outcome, general, time)
 
     def _settle(self, start: FloatArray, x: FloatArray, time: float) -> bool:
         """x <- start + M^-1 A(x)^T Lambda by fixed-point iteration with the fast solvers, in place.

@@ -1,0 +1,45 @@
+"""The table: which solver serves which shape."""
+
+from __future__ import annotations
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.images import BoolArray
+from kcons.constraints.target import FloatArray
+from kcons.plan.clusters import Shape
+from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.cluster_solver import ClusterSolver, DistanceSolver
+from kcons.solvers.distance_clusters import DistanceClusters, LongChains
+from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.small_clusters import SmallClusters
+from kcons.solvers.sparse.distances import SparseDistances
+from kcons.solvers.sparse.mixed_rows import SparseRows
+
+
+def solver_of(
+    shape: Shape,
+    constraint_set: ConstraintSet,
+    inverse_masses: FloatArray,
+    labels: IntArray,
+    time: float,
+    late: BoolArray | None = None,
+) -> ClusterSolver:
+    """The table: which solver serves which shape."""
+    rows = shape.rows
+    if shape.kind == "general":
+        return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+    if shape.kind == "mixed":
+        return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
+    targets = constraint_set.target(time)
+    solver: DistanceSolver
+    if shape.kind == "water":
+        solver = RigidTriangles(rows, shape.atoms, targets[rows], inverse_masses[shape.atoms[0]])
+    elif shape.kind == "lanes":
+        solver = SmallClusters(rows, shape.atoms, shape.pairs, targets[rows], inverse_masses[shape.atoms[0]])
+    elif shape.kind == "chain":
+        chains = Chains(rows, shape.starts, shape.atoms, targets[rows], inverse_masses[shape.atoms])
+        return LongChains(chains, shape.pairs, targets)
+    else:
+        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses, None if late is None else late[rows])
+    return DistanceClusters(solver, targets)
