@@ -7,7 +7,7 @@
 - `surface`, `collective`, `custom`: surfaces, groups, functions of one's own
 - `velocity`: rows linear in the velocities
 - `contradictions`: targets that exclude each other
-- `images`: which periodic images rows mean
+- `images`, `in_cell`: which periodic images rows mean, and the cell
 - `constraint_set`: many constraints as one sigma, A and b
 """
 

@@ -17,12 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.images import find_images, image_error, in_one_piece, minimum_image
+from kcons.constraints.images import find_images, image_error, minimum_image
+from kcons.constraints.in_cell import InCell, finite_array, in_one_piece
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
-
-#: Change of a cell vector, in parts of its length, over which images of atoms that nothing ties together are followed.
-MOST_STRAIN = 0.1
 
 
 class Residuals(NamedTuple):
@@ -39,7 +37,7 @@ class Residuals(NamedTuple):
     sizes: FloatArray
 
 
-class ConstraintSet:
+class ConstraintSet(InCell):
     """All that is held in one system.
 
     Parameters
@@ -91,10 +89,10 @@ class ConstraintSet:
         for item in given:
             if not isinstance(item, Constraint):
                 raise InputError(f"{item!r} is no kcons constraint", item="constraints")
-        x = _array(positions, "positions")
+        x = finite_array(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
-        m = _array(masses, "masses")
+        m = finite_array(masses, "masses")
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
@@ -123,66 +121,6 @@ class ConstraintSet:
         self._set_scale(x, time)
 
     # -- construction ---------------------------------------------------------------------------
-
-    def _set_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool]) -> None:
-        self.lattice: FloatArray | None = None
-        if cell is None:
-            return
-        matrix = _array(cell, "cell")
-        if matrix.shape == (3,):
-            matrix = np.diag(matrix)
-        if matrix.shape != (3, 3):
-            raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
-        periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
-        if not np.all(np.isfinite(matrix)):
-            raise InputError("cell has a NaN or infinity", item="cell")
-        if not periodic.any():
-            return
-        # Directions without periodicity need any independent vector for the inverse to exist.
-        full = _completed(matrix, periodic)
-        inverse = np.linalg.inv(full)
-        inverse[:, ~periodic] = 0.0
-        self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
-
-    def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
-        """Change the cell in place (barostats); targets are unchanged.
-
-        Raises
-        ------
-        InputError
-            A degenerate cell; a first cell, or a new periodic direction, for rows that have to be sorted by their
-            images, which needs positions; a change by more than a tenth for atoms that nothing ties together.
-        """
-        before = self.lattice
-        self._set_cell(cell, pbc)
-        if self.lattice is None or all(c.family == "Distance" and not c.moving for c in self.constraints if c.relative):
-            return
-        if before is not None and self.images is not None and np.any(self.images.loose >= 0):
-            change = np.linalg.norm(self.lattice[0] - before[0], axis=1) / np.linalg.norm(before[0], axis=1)
-            change = change[self.lattice[1].any(axis=0)]  # the vector of a direction without periodicity is arbitrary
-            if np.any(change > MOST_STRAIN):
-                self.lattice = before
-                raise InputError(
-                    f"the cell changes by {change.max():.0%} at once, more than a tenth: which images rows mean among "
-                    "atoms that nothing ties together cannot be followed; make a new ConstraintSet with the cell",
-                    item="cell",
-                )
-        periodic = np.zeros(3, bool) if before is None else before[1].any(axis=0)
-        if np.any(self.lattice[1].any(axis=0) & ~periodic):
-            self.lattice = before
-            raise InputError(
-                "this set was made without this periodic direction, and which images its rows mean has to be found "
-                "anew; make a new ConstraintSet with the cell",
-                item="cell",
-            )
-
-    @property
-    def half_width(self) -> float:
-        """Half the smallest perpendicular width of the periodic cell; infinite without one."""
-        if self.lattice is None:
-            return np.inf
-        norms = np.linalg.norm(self.lattice[1], axis=0)
-        return 0.5 / float(norms.max())
 
     def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
         """Check against half the box that images are unambiguous; without `positions`, of held distances only.
@@ -238,19 +176,6 @@ class ConstraintSet:
                     atoms=item.atoms[k, slot : slot + 2],
                 )
 
-    def refuse_loose_links(self, whole: FloatArray, numbers: IntArray | None = None) -> None:
-        """Raise `ImageError` where atoms of a row, made whole, are half the cell apart and nothing ties them.
-
-        `numbers` are the names of the atoms in messages, if not their own numbers.
-        """
-        if self.images is None or self.lattice is None:
-            return
-        link = self.images.reached_half(whole, self.lattice)
-        if link >= 0:
-            pair = np.array([self.images.parents[link], self.images.atoms[link]])
-            row = int(self.images.loose[link])
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
-
     def refuse_other_images(
         self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
     ) -> None:
@@ -282,18 +207,6 @@ class ConstraintSet:
             atoms = self.row_atoms(row)
             pair = atoms[[0, int(np.argmax(changed[atoms]))]]
             raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
-
-    @cached_property
-    def _longest_plain(self) -> tuple[float, int]:
-        """Longest constant distance that was shorter than half the box at set-up, and its row."""
-        longest, row = 0.0, 0
-        for item, start in zip(self.constraints, self.starts, strict=False):
-            if item.family != "Distance" or item.moving or item.n_rows == 0:
-                continue
-            lengths = item.target_at(0.0) if item.whole is None else np.where(item.whole, 0.0, item.target_at(0.0))
-            if lengths.max() > longest:
-                longest, row = float(lengths.max()), int(start + np.argmax(lengths))
-        return longest, row
 
     def _set_scale(self, x: FloatArray, time: float) -> None:
         """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
@@ -359,21 +272,6 @@ class ConstraintSet:
         """True for position rows, False for velocity rows, shape (n_rows,)."""
         return np.concatenate([np.full(c.n_rows, c.holonomic) for c in self.constraints] or [np.zeros(0, bool)])
 
-    def locate(self, row: int) -> tuple[Constraint, int]:
-        """The constraint object that holds `row`, and the row's number within it."""
-        k = int(np.searchsorted(self.starts, row, side="right")) - 1
-        return self.constraints[k], int(row - self.starts[k])
-
-    def row_name(self, row: int) -> str:
-        """For example '#3 Distance(4, 5)'."""
-        item, k = self.locate(row)
-        return f"#{row} {item.row_name(k)}"
-
-    def row_atoms(self, row: int) -> IntArray:
-        """Atoms of one row."""
-        item, k = self.locate(row)
-        return item.atoms[k]
-
     @cached_property
     def incidence(self) -> sp.csr_array:
         """Which row touches which atom, shape (n_rows, n_atoms), entries 1."""
@@ -382,7 +280,7 @@ class ConstraintSet:
             [np.full(c.n_rows, c.width, dtype=np.int64) for c in self.constraints] or [np.zeros(0, np.int64)]
         )
         indptr = np.concatenate([[0], np.cumsum(widths)])
-        return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
+        return sp.csrfinite_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
 
     @cached_property
     def touched(self) -> IntArray:
@@ -399,46 +297,6 @@ class ConstraintSet:
         return self.n_atoms - int(np.sum(sites))
 
     # -- sigma, A, b ----------------------------------------------------------------------------
-
-    def whole(self, x: FloatArray) -> FloatArray:
-        """Positions in which atoms of whole rows stand in the images that these rows mean; see `constraints.images`.
-
-        `x` itself where all rows are plain.
-        """
-        if self.lattice is None or self.images is None:
-            return x
-        return self.images.make_whole(x, self.lattice)
-
-    def gather(self, item: Constraint, x: FloatArray) -> FloatArray:
-        """Positions of a constraint's atoms, shape (n_rows, width, 3), in the images that its rows mean."""
-        return self._gather(item, x, self.whole(x))
-
-    def _gather(self, item: Constraint, x: FloatArray, whole: FloatArray) -> FloatArray:
-        # Fixed atoms stand where they are told to, in no other image.
-        r = (x if item.family == "FixedAtoms" else whole)[item.atoms]
-        if self.lattice is None or not item.relative:
-            return r
-        if item.whole is None:
-            steps = minimum_image(np.diff(r, axis=1), self.lattice)
-            r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
-            return r
-        plain = ~item.whole
-        if plain.any():
-            steps = minimum_image(np.diff(r[plain], axis=1), self.lattice)
-            r[plain, 1:] = r[plain, :1] + np.cumsum(steps, axis=1)
-        if item.windings is not None:
-            r[item.whole] += item.windings[item.whole] @ self.lattice[0]
-        return r
-
-    def _one_piece(self, item: Constraint, r: FloatArray, together: FloatArray) -> FloatArray:
-        """`r` of open rows from positions in one piece, where these mean the same images."""
-        if self.lattice is None or not item.relative:
-            return r
-        near = together[item.atoms]
-        same = ~np.round(np.diff(near, axis=1) @ self.lattice[1]).any(axis=(1, 2))
-        if item.whole is not None:
-            same &= ~item.whole
-        return np.where(same[:, None, None], near, r)
 
     def target(self, time: float = 0.0) -> FloatArray:
         """What each row is held at, shape (n_rows,)."""
@@ -475,9 +333,9 @@ class ConstraintSet:
             columns.append((3 * c.atoms[:, :, None] + np.arange(3)).ravel())
             widths.append(np.full(c.n_rows, 3 * c.width, dtype=np.int64))
         if not data:
-            return sp.csr_array((0, 3 * self.n_atoms))
+            return sp.csrfinite_array((0, 3 * self.n_atoms))
         indptr = np.concatenate([[0], np.cumsum(np.concatenate(widths))])
-        return sp.csr_array(
+        return sp.csrfinite_array(
             (np.concatenate(data), np.concatenate(columns), indptr), shape=(self.n_rows, 3 * self.n_atoms)
         )
 
@@ -613,21 +471,6 @@ def _joined(pieces: Sequence[FloatArray]) -> FloatArray:
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:
     return c.target.rate_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else np.zeros(c.n_rows)
-
-
-def _array(values: ArrayLike, item: str) -> FloatArray:
-    return np.ascontiguousarray(numbers(values, item))
-
-
-def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
-    """Cell whose non-periodic vectors are replaced by unit vectors normal to the periodic ones."""
-    full = matrix.copy()
-    basis = matrix[periodic]
-    _, singular, vh = np.linalg.svd(basis)
-    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
-        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
-    full[~periodic] = vh[len(basis) :]
-    return full
 
 
 def _compact(item: Constraint, atoms: IntArray) -> Constraint:

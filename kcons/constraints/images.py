@@ -199,41 +199,6 @@ def find_images(
     return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep], images.longest)
 
 
-def in_one_piece(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
-    """Positions in which what open rows tie together is not cut by the boundary; `x` itself where nothing is.
-
-    Each atom is rounded once, so that lengths and angles of one body fit each other to rounding wherever its atoms are
-    stored. Rows that close through the boundary still do.
-    """
-    pairs = [
-        np.stack([c.atoms[:, :-1], c.atoms[:, 1:]], axis=-1).reshape(-1, 2)
-        for c in constraints
-        if c.relative and c.target is None
-    ]
-    if lattice is None or not pairs:
-        return x
-    links = np.concatenate(pairs)
-    if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
-        return x
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
-
-    n = len(x)
-    graph = sp.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    roots = np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
-    # One more node, from which all pieces hang.
-    ends = np.concatenate([links, np.stack([np.full(len(roots), n), roots], axis=1)])
-    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n + 1, n + 1))
-    parent = breadth_first_order(tree, n, directed=False)[1].astype(np.int64)
-    parent[n] = n
-    parent[roots] = roots
-    cells = np.zeros((n + 1, 3))
-    cells[:n] = -np.round((x - x[parent[:n]]) @ lattice[1])
-    while np.any(parent != parent[parent]):
-        cells += cells[parent]
-        parent = parent[parent]
-    return x + cells[:n] @ lattice[0]
-
-
 class _Links:
     """The links that the rows of one constraint offer, between neighbours in the list and others.
 

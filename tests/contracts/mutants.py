@@ -523,13 +523,13 @@ MUTANTS = [
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
     (
-        "constraints/constraint_set.py",
+        "constraints/in_cell.py",
         "change = change[self.lattice[1].any(axis=0)]",
         "change = change[:]",
         "tests/constraints/test_images.py::test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell",
     ),
     (
-        "constraints/constraint_set.py",
+        "constraints/in_cell.py",
         "return np.where(same[:, None, None], near, r)",
         "return r",
         "tests/constraints/test_images.py::test_lengths_found_far_away_can_be_held_near_the_origin",
