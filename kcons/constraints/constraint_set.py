@@ -280,7 +280,7 @@ class ConstraintSet(InCell):
             [np.full(c.n_rows, c.width, dtype=np.int64) for c in self.constraints] or [np.zeros(0, np.int64)]
         )
         indptr = np.concatenate([[0], np.cumsum(widths)])
-        return sp.csrfinite_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
+        return sp.csr_array((np.ones(len(columns)), columns, indptr), shape=(self.n_rows, self.n_atoms))
 
     @cached_property
     def touched(self) -> IntArray:
@@ -333,9 +333,9 @@ class ConstraintSet(InCell):
             columns.append((3 * c.atoms[:, :, None] + np.arange(3)).ravel())
             widths.append(np.full(c.n_rows, 3 * c.width, dtype=np.int64))
         if not data:
-            return sp.csrfinite_array((0, 3 * self.n_atoms))
+            return sp.csr_array((0, 3 * self.n_atoms))
         indptr = np.concatenate([[0], np.cumsum(np.concatenate(widths))])
-        return sp.csrfinite_array(
+        return sp.csr_array(
             (np.concatenate(data), np.concatenate(columns), indptr), shape=(self.n_rows, 3 * self.n_atoms)
         )
 
