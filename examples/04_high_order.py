@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import ConstraintSet
-from kcons.comparison import measure, methods, scenes
+from kcons.comparison import measure, scenes
 from kcons.constraints import Sphere
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -46,8 +46,8 @@ ENERGY_STEPS, ENERGY_TIME = {True: (0.1, 0.01), False: (0.1,)}, {True: 1000.0, F
 
 def curve(scene: scenes.Scene, reference: scenes.Reference, name: str, full: bool) -> list[dict[str, float]]:
     """Step, force evaluations and error, from coarse to fine."""
-    method = methods.METHODS[name]
-    assert isinstance(method, methods.CoreStepper)
+    method = METHODS[name]
+    assert isinstance(method, CoreStepper)
     system = System(scene.motion, scene.potential.forces)
     cost = method.stepper.force_evaluations
     found: list[dict[str, float]] = []
@@ -89,7 +89,7 @@ def cpu_seconds(scene: scenes.Scene, name: str, points: list[dict[str, float]]) 
     if dt is None:
         return None
     steps = round(scene.horizon / dt)
-    stepper = methods.METHODS[name].make(dt)
+    stepper = METHODS[name].make(dt)
     system = System(scene.motion, scene.potential.forces)
     times = []
     for _ in range(2):
@@ -102,7 +102,7 @@ def cpu_seconds(scene: scenes.Scene, name: str, points: list[dict[str, float]]) 
 
 def work_precision(full: bool, console: Console) -> dict[str, Any]:
     """The curves of all systems."""
-    names = [n for n, m in methods.METHODS.items() if isinstance(m, methods.CoreStepper) and (full or m.usual)]
+    names = [n for n, m in METHODS.items() if isinstance(m, CoreStepper) and (full or m.usual)]
     systems: dict[str, Any] = {}
     for name in SYSTEMS:
         scene = scenes.build(name)
@@ -151,7 +151,7 @@ def energy_slope(stepper: Stepper, dt: float, time: float) -> float:
 
 def energy_slopes(full: bool, console: Console) -> dict[str, dict[str, float]]:
     """Slopes of each stepper at each time step."""
-    steppers = {n: m.make for n, m in methods.METHODS.items() if isinstance(m, methods.CoreStepper)}
+    steppers = {n: m.make for n, m in METHODS.items() if isinstance(m, CoreStepper)}
     steppers["projected-verlet, project=True"] = lambda dt: ProjectedVerlet(project=True)
     steppers["projected-rk4, project=True"] = lambda dt: ProjectedRungeKutta4(project=True)
     slopes: dict[str, dict[str, float]] = {}
@@ -175,7 +175,7 @@ def show(result: dict[str, Any], console: Console) -> None:
             table.add_column(heading, justify="right", no_wrap=True)
     systems = result["systems"]
     for stepper in systems[SYSTEMS[0]]["curves"]:
-        scheme = methods.METHODS[stepper].stepper
+        scheme = METHODS[stepper].stepper
         cells = []
         for name in SYSTEMS:
             curves = systems[name]["curves"]
@@ -237,7 +237,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
                 marker=marker,
                 markersize=4,
                 linewidth=1.2,
-                linestyle="-" if methods.METHODS[stepper].stepper.symplectic else "--",
+                linestyle="-" if METHODS[stepper].stepper.symplectic else "--",
                 label=stepper,
             )
         axes.axhline(GOAL, color="black", linewidth=0.8, linestyle=":")

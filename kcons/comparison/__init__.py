@@ -15,7 +15,6 @@ from typing import Any
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
     "averages": ("sampling",),
-    "methods": ("methods",),
     "scenes": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("scripts",),
@@ -23,7 +22,7 @@ _MODULES = {
 }
 _NAMES = {
     "hard_cases.rings": ("ring",),
-    "methods.methods": ("METHODS",),
+    "methods.methods": ("METHODS", "CoreStepper"),
     "scenes": ("Reference", "Scene"),
     "scenes.any_file": ("read",),
     "scenes.fluid": ("Fluid",),
