@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import ConstraintSet
-from kcons.comparison import measure, scenes
+from kcons.comparison import METHODS, CoreStepper, measure, scenes
 from kcons.constraints import Sphere
 from kcons.errors import KconsError
 from kcons.motion import Motion
