@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import importlib.util
 import re
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+import kcons
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "kcons"
@@ -86,3 +90,23 @@ def test_names_of_modules_are_their_own():
     """No two modules share a name, but for those whose folder says whose they are."""
     stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
     assert {name for name, count in stems.items() if count > 1} <= SHARED
+
+
+@pytest.mark.parametrize(("old", "new"), kcons.MOVED.items())
+def test_modules_are_found_by_the_names_they_had(old, new):
+    """One module under both names, and it knows itself by the new one."""
+    module = importlib.import_module(f"kcons.{old}")
+    assert module is importlib.import_module(f"kcons.{new}")
+    assert module.__name__ == f"kcons.{new}" and module.__spec__.name == f"kcons.{new}"
+    assert getattr(kcons, old) is module
+
+
+def test_what_is_inside_a_moved_folder_is_found_too():
+    from kcons.flows.linear_flow import LinearFlow as old
+
+    from kcons.models.flows.linear_flow import LinearFlow as new
+
+    assert old is new
+    with pytest.raises(ImportError, match=r"kcons\.models\.flows\.nothing"):
+        importlib.import_module("kcons.flows.nothing")
+    assert importlib.util.find_spec("kcons.nothing") is None
