@@ -106,7 +106,7 @@ class ConstraintSet(InCell):
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
-        together = in_one_piece(weighted, x, self.lattice)
+        together = in_one_piece(marked, y, self.lattice)
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)

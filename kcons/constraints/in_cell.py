@@ -192,14 +192,17 @@ def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
 
 
 def in_one_piece(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
-    """Positions in which what open rows tie together is not cut by the boundary; `x` itself where nothing is.
+    """Positions in which what open plain rows tie together is not cut by the boundary; `x` itself where nothing is.
+
+    `x` has the atoms of whole rows in the images that these mean.
 
     Each atom is rounded once, so that lengths and angles of one body fit each other to rounding wherever its atoms are
     stored. Rows that close through the boundary still do.
     """
     pairs = [
-        np.stack([c.atoms[:, :-1], c.atoms[:, 1:]], axis=-1).reshape(-1, 2)
+        np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
         for c in constraints
+        for atoms in [c.atoms if c.whole is None else c.atoms[~c.whole]]
         if c.relative and c.target is None
     ]
     if lattice is None or not pairs:
