@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import cell_judge
 import numpy as np
 import pytest
@@ -150,3 +153,9 @@ def test_cases_repeat():
         return [(v.operation, v.outcome, v.off) for v in judge(seed).verdicts]
 
     assert verdicts(3) == verdicts(3)
+
+
+def test_the_committed_run_has_no_faults():
+    found = json.loads((Path(__file__).parents[2] / "docs" / "results" / "random_cells.json").read_text())
+    assert found["cases"] == 10_000 and found["first"] == 0 and found["faults"] == {}
+    assert found["outcomes"]["right"] > 8000 and found["outcomes"]["silent"] == found["outcomes"]["unfounded"] == 0
