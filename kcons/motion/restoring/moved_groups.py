@@ -37,7 +37,7 @@ NEAR = 0.25
 #: Rounds in which every row makes its own motion, and how many motions there may be in all.
 SWEEPS, MOST_MOVES = 40, 15_000
 #: Rows and motions beyond which no Newton steps among them are tried; steps, and starts from turned bonds.
-MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 40, 3
+MOST_ROWS, MOST_MOTIONS, STEPS, KICKS = 400, 400, 30, 2
 #: Steps in which all atoms give way, the weight of rows against that of a change which is just allowed, and atoms up to
 #: which this is tried.
 EASING, HEAVY, MOST_EASED = 60, 1e4, 2000
