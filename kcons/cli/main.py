@@ -87,34 +87,34 @@ def _parser() -> argparse.ArgumentParser:
     files.add_argument("--rigid-residues", nargs="+", metavar="NAME", help="residues held rigid")
     common.add_argument("--list", action="store_true", help="list scenes and methods, and leave")
 
-    measure = commands.add_parser(
+    compare = commands.add_parser(
         "compare",
         parents=[common],
         help="how much error each method makes, for how much time",
         description="Run a scene through several methods; table, plot and JSON of error against cost. Trajectories "
         "are compared, or averages of the scenes at a temperature.",
     )
-    measure.add_argument(
+    compare.add_argument(
         "--dt",
         type=numbers,
         help="time steps, comma separated, in the unit the scene shows; "
         "steppers with several force evaluations a step take longer ones at the same cost",
     )
-    measure.add_argument(
+    compare.add_argument(
         "--methods",
         type=names,
         help="methods, comma separated, or all; openmm stands for those of OpenMM (default: the usual ones)",
     )
-    measure.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
-    measure.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
-    measure.add_argument("--budget", type=float, help="seconds for each method (default 20)")
-    measure.add_argument(
+    compare.add_argument("--out", type=Path, help="folder for compare.json, .png and .txt (default ./compare-SCENE)")
+    compare.add_argument("--quick", action="store_true", help="smaller system, half the horizon, a budget of 5 s")
+    compare.add_argument("--budget", type=float, help="seconds for each method (default 20)")
+    compare.add_argument(
         "--target-error",
         type=float,
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
-    report = measure.add_argument_group("the whole comparison")
+    report = compare.add_argument_group("the whole comparison")
     report.add_argument(
         "--all",
         action="store_true",
@@ -123,10 +123,10 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument(
         "--only", type=names, metavar="PARTS", help="of these, comma separated (--all --list shows them)"
     )
-    report.add_argument("--fresh", action="store_true", help="measure again what is there already")
+    report.add_argument("--fresh", action="store_true", help="compare again what is there already")
     report.add_argument("--redraw", type=Path, metavar="DIR", help="pictures and page from the numbers in DIR, no run")
     report.add_argument("--into", type=Path, metavar="PAGE", help="with --redraw: the table into this page, too")
-    measure.set_defaults(run=_compare)
+    compare.set_defaults(run=_compare)
 
     plan = commands.add_parser(
         "plan",

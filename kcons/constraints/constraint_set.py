@@ -18,7 +18,7 @@ from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.images import find_images, image_error, minimum_image
-from kcons.constraints.in_cell import InCell, finite_array, in_one_piece
+from kcons.constraints.in_cell import InCell, contiguous, whole_bodies
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 
@@ -89,10 +89,10 @@ class ConstraintSet(InCell):
         for item in given:
             if not isinstance(item, Constraint):
                 raise InputError(f"{item!r} is no kcons constraint", item="constraints")
-        x = finite_array(positions, "positions")
+        x = contiguous(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")
-        m = finite_array(masses, "masses")
+        m = contiguous(masses, "masses")
         if m.shape != (len(x),):
             raise InputError(f"masses must have shape ({len(x)},), not {m.shape}", item="masses")
         self.n_atoms = len(x)
@@ -106,7 +106,7 @@ class ConstraintSet(InCell):
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)
-        together = in_one_piece(marked, y, self.lattice)
+        together = whole_bodies(marked, y, self.lattice)
         bound: list[Constraint] = []
         for start, item in zip(self.starts, marked, strict=False):
             r = self._gather(item, x, y)

@@ -54,7 +54,7 @@ class InCell:
         self.lattice: FloatArray | None = None
         if cell is None:
             return
-        matrix = finite_array(cell, "cell")
+        matrix = contiguous(cell, "cell")
         if matrix.shape == (3,):
             matrix = np.diag(matrix)
         if matrix.shape != (3, 3):
@@ -65,7 +65,7 @@ class InCell:
         if not periodic.any():
             return
         # Directions without periodicity need any independent vector for the inverse to exist.
-        full = _completed(matrix, periodic)
+        full = completed(matrix, periodic)
         inverse = np.linalg.inv(full)
         inverse[:, ~periodic] = 0.0
         self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
@@ -176,11 +176,11 @@ class InCell:
         return np.where(same[:, None, None], near, r)
 
 
-def finite_array(values: ArrayLike, item: str) -> FloatArray:
+def contiguous(values: ArrayLike, item: str) -> FloatArray:
     return np.ascontiguousarray(numbers(values, item))
 
 
-def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
+def completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
     """Cell whose non-periodic vectors are replaced by unit vectors normal to the periodic ones."""
     full = matrix.copy()
     basis = matrix[periodic]
@@ -191,7 +191,7 @@ def _completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
     return full
 
 
-def in_one_piece(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
+def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
     """Positions in which what open plain rows tie together is not cut by the boundary; `x` itself where nothing is.
 
     `x` has the atoms of whole rows in the images that these mean.

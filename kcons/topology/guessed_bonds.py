@@ -6,6 +6,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.images import minimum_image
+from kcons.constraints.in_cell import completed
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
@@ -226,11 +227,8 @@ def wrapped_into(
     x: FloatArray, cell: FloatArray, pbc: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fractional and Cartesian coordinates in the cell along its periodic axes, the cell completed, and its inverse."""
-    full = cell.copy()
-    axes = np.flatnonzero(pbc)
-    if len(axes) < 3:
-        full[~pbc] = np.linalg.svd(cell[axes])[2][len(axes) :]
+    full = completed(cell, pbc)
     inverse = np.linalg.inv(full)
     fractional = x @ inverse
-    fractional[:, axes] -= np.floor(fractional[:, axes])
+    fractional[:, pbc] -= np.floor(fractional[:, pbc])
     return fractional, fractional @ full, full, np.asarray(inverse)

@@ -229,7 +229,7 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
 def _any(method: str, setting: float) -> list[str]:
     return [
         "from kcons.comparison import scenes",
-        "from kcons.comparison.methods.methods import METHODS",
+        "from kcons.comparison import METHODS",
         "",
         "scene = SCENE",
         f'run = METHODS["{method}"].start(scene, {setting!r})',
