@@ -16,7 +16,7 @@ from kcons.errors import InputError
 from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
 from kcons.topology.topology import Snapshot, Topology, selected_atoms, selected_numbers, sorted_pairs
 
-__all__ = ["constraints_of", "openmm_topology", "snapshot_of"]
+__all__ = ["bonds_of", "constraints_of", "openmm_topology", "snapshot_of"]
 
 #: One angstrom in nm.
 ANGSTROM = 0.1
@@ -227,3 +227,20 @@ def _plain(values: Any, wanted: Any) -> FloatArray:
     if isinstance(values, list | tuple) and len(values) and unit.is_quantity(values[0]):
         return np.array([v.value_in_unit(wanted) for v in values], dtype=np.float64)
     return np.array(values, dtype=np.float64)
+
+
+def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:
+    """Pairs of particles that harmonic bonds or constraints of the System join, shape (n, 2).
+
+    Springs of which most are off their lengths at `x` by more than a quarter make no structure: none counts then.
+    """
+    pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
+    for force in system.getForces():
+        if isinstance(force, openmm.HarmonicBondForce) and force.getNumBonds():
+            springs = [force.getBondParameters(k) for k in range(force.getNumBonds())]
+            ends = np.array([spring[:2] for spring in springs])
+            rest = np.array([spring[2].value_in_unit(unit.nanometer) for spring in springs])
+            apart = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
+            if np.median(np.abs(apart - rest)) <= 0.25 * np.median(rest):
+                pairs += ends.tolist()
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

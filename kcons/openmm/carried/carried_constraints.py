@@ -31,7 +31,6 @@ from kcons.openmm.carried.callbacks import (
     force_name,
 )
 from kcons.openmm.carried.requirements import (
-    bonds_of,
     free_groups,
     masses_of,
     nanometers,
@@ -40,9 +39,9 @@ from kcons.openmm.carried.requirements import (
     refuse_virtual_sites,
     with_massless_atoms,
 )
-from kcons.openmm.integrator.guard import NEAR
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.part import NEAR, Miss
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.topology import bonds_of
 from kcons.steppers.state import START_TOLERANCE
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.

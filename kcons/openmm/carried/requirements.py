@@ -115,20 +115,3 @@ def _row_between(held: ConstraintSet, molecules: Any) -> int | None:
         if apart.any():
             return int(start + np.argmax(apart))
     return None
-
-
-def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:
-    """Pairs of particles that harmonic bonds or constraints of the System join, shape (n, 2).
-
-    Springs of which most are off their lengths at `x` by more than a quarter make no structure: none counts then.
-    """
-    pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
-    for force in system.getForces():
-        if isinstance(force, openmm.HarmonicBondForce) and force.getNumBonds():
-            springs = [force.getBondParameters(k) for k in range(force.getNumBonds())]
-            ends = np.array([spring[:2] for spring in springs])
-            rest = np.array([spring[2].value_in_unit(unit.nanometer) for spring in springs])
-            apart = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
-            if np.median(np.abs(apart - rest)) <= 0.25 * np.median(rest):
-                pairs += ends.tolist()
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -2,6 +2,7 @@
 
 - `small_algebra`: small systems of equations in the language of CustomIntegrator
 - `row_forces`: values and gradients of rows by OpenMM's forces
+- `plain_rows`: rows that are internal coordinates, as constraints of kcons
 - `context_rows`: the rows in a Context
 - `row_program`: the part of the program that holds them
 - `collective_rows`: `CollectiveRows`, what users make

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openmm
+from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints.target import FloatArray
@@ -290,17 +291,32 @@ class CollectiveRows(GroupRows):
 
     # -- restoring and checking -----------------------------------------------------------------
 
-    def apply_positions(self, context: openmm.Context, tolerance: float | None = None) -> int:
+    def apply_positions(
+        self, context: openmm.Context, tolerance: float | None = None, *, bonds: ArrayLike | None = None
+    ) -> int:
         """Bring the positions of the context onto the rows and the System's constraints; returns the iterations.
 
-        Newton with step control. Velocities stay as they are.
+        Newton with step control. Where rows are distances, angles or dihedrals of particles or distances of
+        centres of mass and the targets are far, groups are moved whole first, by the same code as `hold`
+        (`Motion.restore_positions`): bonds and angles stay as they are. Velocities stay as they are.
+
+        Parameters
+        ----------
+        context : openmm.Context
+        tolerance : float, optional
+            That of the rows unless given.
+        bonds : array_like of int, shape (n, 2), optional
+            The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
+            Newton's method alone, whatever becomes of bonds and angles.
 
         Raises
         ------
         ConvergenceError
             No solution; the positions are unchanged.
+        InfeasibleError
+            Rows that are plain coordinates cannot be reached with bonds and angles as they are; likewise.
         """
-        return self.at(context).apply_positions(self.tolerance if tolerance is None else tolerance)
+        return self.at(context).apply_positions(self.tolerance if tolerance is None else tolerance, bonds)
 
     def apply_velocities(self, context: openmm.Context) -> None:
         """Make the velocities of the context tangent to the rows and to the System's constraints.
@@ -312,17 +328,19 @@ class CollectiveRows(GroupRows):
         """
         self.at(context).apply_velocities()
 
-    def restore(self, context: openmm.Context, tolerance: float | None = None) -> None:
+    def restore(
+        self, context: openmm.Context, tolerance: float | None = None, *, bonds: ArrayLike | None = None
+    ) -> None:
         """`apply_positions`, then `apply_velocities`.
 
         Raises
         ------
-        ConvergenceError, SingularGeometryError
+        ConvergenceError, InfeasibleError, SingularGeometryError
             As these.
         CertificateError
             The rows say that they are not fulfilled afterwards.
         """
-        self.apply_positions(context, tolerance)
+        self.apply_positions(context, tolerance, bonds=bonds)
         self.apply_velocities(context)
         miss = self.worst_miss(context)
         if miss is not None:

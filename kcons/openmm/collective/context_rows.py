@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import openmm
+from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
-from kcons.openmm.collective.row_forces import energy
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.collective.plain_rows import near_targets
+from kcons.openmm.collective.row_forces import energy, forces_in
+from kcons.openmm.integrator.part import BOND, NEAR, Miss
 from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
+from kcons.openmm.topology import bonds_of
 
 if TYPE_CHECKING:
     from kcons.openmm.collective.row_program import GroupRows
@@ -200,7 +203,7 @@ class ContextRows:
 
     # -- projections ----------------------------------------------------------------------------
 
-    def apply_positions(self, tolerance: float) -> int:
+    def apply_positions(self, tolerance: float, bonds: ArrayLike | None = None) -> int:
         """See `CollectiveRows.apply_positions`."""
         scales = np.array(self.rows.scales)
         start, velocities = self.positions, self.velocities
@@ -216,7 +219,7 @@ class ContextRows:
         constrained = self.context.getSystem().getNumConstraints() > 0
         done = 0
         try:
-            size, off = size_at(start)
+            size, off = size_at(self._led(start, bonds))
             for done in range(_MAX_NEWTON):
                 if size <= tolerance:
                     self.context.setVelocities(velocities)
@@ -247,6 +250,17 @@ class ContextRows:
             iterations=done,
             row=row,
         )
+
+    def _led(self, start: FloatArray, bonds: ArrayLike | None) -> FloatArray:
+        """Where Newton's method begins: for far targets of plain rows groups are moved whole first."""
+        miss = self.worst_miss(velocities=False)
+        pairs = bonds_of(self.context.getSystem(), start) if bonds is None else np.asarray(bonds)
+        if miss is None or miss.near or not len(pairs):
+            return start
+        forces = [forces_in(self.context.getSystem(), group) for group in self.rows._groups]
+        only = [found[0] if len(found) == 1 else None for found in forces]
+        led = near_targets(self.context, only, self.sigma(), self.targets(), pairs)
+        return start if led is None else led
 
     def _here(self) -> FloatArray:
         return np.array(self.context.getState(getPositions=True).getPositions(asNumpy=True)._value)
@@ -323,7 +337,9 @@ class ContextRows:
         """Energies of the Forces less the targets, and their gradients times v."""
         rows = self.rows
         allowed = np.array(rows.scales) * max(START_TOLERANCE, 10 * rows.tolerance)
-        miss = Miss.worst("positions", self.sigma(), allowed, self._name, rows.atoms.__getitem__)
+        off = self.sigma()
+        near = NEAR * self._lengths() if np.any(np.abs(off) > allowed) else 0.0
+        miss = Miss.worst("positions", off, allowed, self._name, rows.atoms.__getitem__, near)
         if miss is not None or not velocities:
             return miss
         gradients, v = self.gradients(), self.velocities
@@ -332,6 +348,12 @@ class ContextRows:
         rates = np.einsum("kai,ai->k", gradients, v) - demanded
         allowed = START_TOLERANCE * (size + np.abs(demanded))
         return Miss.worst("velocities", rates, allowed, self._name, rows.atoms.__getitem__)
+
+    def _lengths(self) -> FloatArray:
+        """What rows may be compared with: the target, one radian, or what moves an atom by a short bond."""
+        periods, targets = np.array(self.rows.periods), self.targets()
+        own = np.where(periods > 0, periods / (2 * np.pi), np.abs(targets))
+        return np.asarray(np.maximum(own, BOND * np.linalg.norm(self.gradients(), axis=(1, 2))))
 
     def _name(self, row: int) -> str:
         return f"{row} ({self.rows.names[row]})"

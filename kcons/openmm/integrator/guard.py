@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -26,8 +26,6 @@ from kcons.openmm.integrator.system_checks import (
 
 logger = logging.getLogger("kcons.openmm")
 
-#: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
-NEAR = 0.1
 #: With a note in the log, unless it is what a looser tolerance or single precision leaves.
 TIDY = 1e-4
 #: What rounding may add to a relative distance, near the origin.
@@ -169,7 +167,7 @@ class Guard:
             for part in integrator.parts:
                 if not self.started:
                     part.check(context)
-                elif not (getattr(part, "steered", False) and self._parameters != dict(context.getParameters())):
+                elif not self._steered_away(part):
                     self._refuse(part.worst_miss(context, velocities=not self._late))
             if not self.started:
                 integrator.ensemble.begin(integrator, context)
@@ -197,8 +195,9 @@ class Guard:
                 item="positions",
                 atoms=self.rows.pairs[row],
             )
-        misses = [part.worst_miss(context, velocities=False) for part in integrator.parts]
-        near = any(found is not None and found.near for found in misses)
+        asked = [part for part in integrator.parts if not self._steered_away(part)]
+        misses = [found for part in asked if (found := part.worst_miss(context, velocities=False)) is not None]
+        near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
         if not near and not np.any(miss > self.limit(x)):
             return
         if near:
@@ -210,8 +209,13 @@ class Guard:
         if near or miss[row] > TIDY:
             moved = float(np.sqrt(np.max(np.sum((now - x) ** 2, axis=1))))
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
-            worst = next((f"the {found}" for found in misses if found is not None), worst)
+            worst = f"the {misses[0]}" if misses else worst
             logger.warning("the start was put right: %s; particles were moved by up to %.3g nm", worst, moved)
+
+    def _steered_away(self, part: Part) -> bool:
+        """Whether a context parameter has moved the rows of a part since the last step, which is where they go then."""
+        steered = self.started and getattr(part, "steered", False)
+        return bool(steered and self._parameters != dict(self.context.getParameters()))
 
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:

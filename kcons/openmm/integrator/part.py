@@ -14,6 +14,11 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
 from kcons.openmm.integrator.program import Program
 
+#: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
+NEAR = 0.1
+#: What a row without a length of its own is off by is compared with this one (nm), a short bond.
+BOND = 0.1
+
 
 @dataclass(frozen=True)
 class Miss:
@@ -29,7 +34,7 @@ class Miss:
         sigma in the unit of the row, or A v less its target, per ps.
     atoms : sequence of int
     near : bool
-        Whether positions are off by less than a tenth of the length that is held.
+        Whether positions are off by less than a tenth of the length that is held: they are put right in a first step.
     """
 
     what: str

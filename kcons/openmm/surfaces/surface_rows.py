@@ -15,7 +15,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.part import BOND, NEAR, Miss
 from kcons.openmm.integrator.program import Program
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
@@ -162,7 +162,8 @@ class SurfaceRows(ABC):
 
     def _worst(self, x: FloatArray, v: FloatArray | None) -> Miss | None:
         allowed = START_TOLERANCE * np.maximum(1.0, np.abs(x[self.atoms]).max(axis=1))
-        miss = Miss.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of)
+        near = NEAR * np.concatenate([_length(item) for item in self.rows])
+        miss = Miss.worst("positions", self.distances(x), allowed, self.row_name, self._atoms_of, near)
         if miss is not None or v is None:
             return miss
         held = v[self.atoms]
@@ -236,6 +237,12 @@ class SurfaceRows(ABC):
         """A number of each row, from a variable of the program."""
         table = np.array([[v[0], v[1], v[2]] for v in integrator.getPerDofVariableByName(name)])
         return np.asarray(table[self.atoms, 0])
+
+
+def _length(item: Constraint) -> FloatArray:
+    """Of each row, the radius of its surface; that of a bond for planes and formulas, which have none."""
+    radius = np.zeros(item.n_rows) if item.family == "Plane" else item.scale(0.0)
+    return np.where(radius > 0, radius, BOND)
 
 
 def positions_and_velocities(context: openmm.Context) -> tuple[FloatArray, FloatArray]:

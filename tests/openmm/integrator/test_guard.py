@@ -18,8 +18,9 @@ from openmm_systems import (
     state_of,
 )
 
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
-from kcons.openmm import ProjectedIntegrator, RattleIntegrator
+from kcons.constraints import Dihedral, Plane, Sphere
+from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, RattleIntegrator, Row, surface_parts
 from kcons.openmm.integrator import guard
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -112,6 +113,73 @@ def test_small_misses_at_the_start_are_tidied_up():
     integrator.step(1)
     other.step(1)
     np.testing.assert_array_equal(state_of(context), state_of(reference))
+
+
+def unconstrained_alanine():
+    """For one step: its bonds are held by nothing."""
+    system, x, v = loose_alanine()
+    for k in reversed(range(system.getNumConstraints())):
+        system.removeConstraint(k)
+    return system, x + 0.0, v
+
+
+def distance_row():
+    system, x, v = unconstrained_alanine()
+    force = openmm.CustomBondForce("r")
+    force.addBond(4, 14)
+    return system, x, v, CollectiveRows(system, [Row(force, float(np.linalg.norm(x[4] - x[14])))])
+
+
+def dihedral_row():
+    system, x, v = unconstrained_alanine()
+    force = openmm.CustomTorsionForce("theta")
+    force.addTorsion(4, 6, 8, 14)
+    angle = Dihedral([4, 6, 8, 14]).measure(x[[4, 6, 8, 14]][None], 0.0)[0]
+    return system, x, v, CollectiveRows(system, [Row(force, float(angle), period=2 * np.pi)])
+
+
+def on_a_sphere():
+    system, x, v = unconstrained_alanine()
+    sphere = Sphere([3], center=(0.0, 0.0, 0.0), radius=float(np.linalg.norm(x[3])))
+    return system, x, v, *surface_parts([sphere], system=system)
+
+
+def on_a_plane():
+    system, x, v = unconstrained_alanine()
+    plane = Plane([3], normal=(0.0, 0.0, 1.0), offset=float(x[3, 2]))
+    return system, x, v, *surface_parts([plane], system=system)
+
+
+@pytest.mark.parametrize("make", [distance_row, dihedral_row, on_a_sphere, on_a_plane])
+@pytest.mark.parametrize(("off", "near"), [(0.006, True), (0.2, False)])
+def test_rows_that_are_near_are_put_right_in_the_first_step(make, off, near, caplog):
+    """As constraints of the System are: with a note in the log; farther ones are refused and nothing moves."""
+    system, x, v, part = make()
+    x[[3, 4]] += off * np.array([0.3, 0.5, 0.8])
+    integrator = ProjectedIntegrator(1e-3, parts=[part])
+    context = started(system, integrator, x, v)
+    if near:
+        assert part.worst_miss(context, velocities=False).near
+        with caplog.at_level("WARNING", logger="kcons.openmm"):
+            integrator.step(1)
+        assert "the start was put right: the positions are off row" in caplog.text
+        assert part.worst_miss(context) is None
+        assert np.abs(state_of(context)[0] - x).max() < 3 * off
+        return
+    with pytest.raises(KconsError, match=r"call restore|apply_positions"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), [x, v])
+
+
+def test_a_part_that_is_far_off_keeps_the_others_where_they_are():
+    system, x, v, near = on_a_plane()
+    x[3, 2] += 0.004
+    far = surface_parts([Plane([9], normal=(0.0, 0.0, 1.0), offset=float(x[9, 2]) + 0.5)], system=system)
+    integrator = ProjectedIntegrator(1e-3, parts=[near, *far])
+    context = started(system, integrator, x, v)
+    with pytest.raises(InputError, match="apply_positions"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), [x, v])
 
 
 def test_nan_at_the_start():
