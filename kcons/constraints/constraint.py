@@ -100,7 +100,7 @@ class Constraint(ABC):
                 raise InputError(f"{self.family}: {name} of row {row} is not finite", item=name, atoms=self.atoms[row])
             setattr(self, name, np.ascontiguousarray(array))
 
-    def _settle(self) -> None:  # noqa: B027 (optional hook)
+    def _settle(self) -> None:
         """Derive and check what follows from the per-row data; called once, when these were set."""
 
     @property
@@ -157,7 +157,7 @@ class Constraint(ABC):
         """Whether a row depends on where its atoms lie relative to each other, and so on their images."""
         return self.translation_invariant and self.width > 1
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:  # noqa: B027 (optional hook)
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
         """Raise a typed error if a row is undefined at `r` or its target is impossible.
 
         `first_row` is the number of this object's first row in its set, for messages.

@@ -6,17 +6,15 @@ import numpy as np
 
 from kcons.errors import ConvergenceError, InputError
 from kcons.openmm.integrator.guard import positions_of, velocities_of
-from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.part import Miss, Part
 
 
-class HeldCoordinates:
+class HeldCoordinates(Part):
     """Particles that stay at one value of one coordinate.
 
     `steepest` is the largest displacement that is accepted in one drift; beyond it the part fails.
     """
 
-    code = 0
-    meets_system = False
     solves_alone = True
 
     def __init__(self, particles, axis, value, n, *, evaluates=False, steepest=np.inf, groups=()):

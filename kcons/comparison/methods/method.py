@@ -110,7 +110,7 @@ class Run(ABC):
         """Go back to the start, forces known, while time and steps go on counting."""
         raise NotImplementedError
 
-    def settle(self) -> None:  # noqa: B027 - most have nothing to set up
+    def settle(self) -> None:
         """After `rewind`: whatever the first steps from there would set up lazily, at the price of being as many on."""
 
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
@@ -208,7 +208,7 @@ class Method(ABC):
         """Time steps or tolerances to run, the cheapest first."""
         return tuple(scene.tolerances if self.adaptive else scene.time_steps)
 
-    def warm_up(self, scene: Scene) -> None:  # noqa: B027 - most have nothing to compile
+    def warm_up(self, scene: Scene) -> None:
         """Compile or load what the first step would wait for."""
 
     @abstractmethod

@@ -53,7 +53,7 @@ class EntropyLaw(ABC):
     def excess_rate(self, elapsed: float | FloatArray, excess: FloatArray, excess0: FloatArray) -> FloatArray:
         """b = d(g - g_eq)/dt at a state whose excess is `excess`."""
 
-    def check(self, excess0: FloatArray, most: FloatArray) -> None:  # noqa: B027 (optional hook)
+    def check(self, excess0: FloatArray, most: FloatArray) -> None:
         """Refuse a law that the start cannot follow; `most` is the largest excess there is.
 
         Raises

@@ -39,7 +39,7 @@ from kcons.openmm.carried.requirements import (
     refuse_virtual_sites,
     with_massless_atoms,
 )
-from kcons.openmm.integrator.part import NEAR, Miss
+from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.topology import bonds_of
 from kcons.steppers.state import START_TOLERANCE
@@ -48,7 +48,7 @@ from kcons.steppers.state import START_TOLERANCE
 COARSE = 1e-11
 
 
-class CarriedConstraints:
+class CarriedConstraints(Part):
     """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
 
     Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
@@ -82,11 +82,6 @@ class CarriedConstraints:
     """
 
     evaluates = True
-    meets_system = False
-    solves_alone = False
-    lean = False
-    #: Whether the System had no constraints of its own when the forces were added.
-    alone = False
     _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
@@ -203,7 +198,6 @@ class CarriedConstraints:
         program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
 
     def begin_run(self) -> None:
-        """Called before steps are made."""
         self._engine.begin_run()
 
     def remember(self, program: Program) -> None:

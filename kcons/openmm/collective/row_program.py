@@ -5,10 +5,11 @@ from __future__ import annotations
 import openmm
 
 from kcons.openmm.collective.small_algebra import Block
+from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 
 
-class GroupRows:
+class GroupRows(Part):
     """Writes remember, land and project for K rows into the program of an integrator.
 
     What is counted is passes over the whole system, at 18 ns a degree of freedom each. A step with one drift needs,
@@ -25,9 +26,6 @@ class GroupRows:
     stays_finite = True
     solves_alone = True
     code = 1
-    lean = False
-    meets_system: bool
-    groups: frozenset[int]
     names: tuple[str, ...]
     atoms: tuple[tuple[int, ...], ...]
     scales: tuple[float, ...]

@@ -85,9 +85,9 @@ def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum:
             broken.append(np.eye(3))
             break
     for part in integrator.parts:
-        motion_of = getattr(part, "engine_at", None)
-        if motion_of is not None:
-            motion, places = motion_of(context)
+        engine = part.engine_at(context)
+        if engine is not None:
+            motion, places = engine
             open_ones = open_directions(motion, places)
             broken.append(np.eye(3) - open_ones.T @ open_ones)
     rows = [force for force in forces_of(system) if force.getForceGroup() in integrator.row_groups]

@@ -208,7 +208,7 @@ class Isokinetic(Value):
         """
         if integrator.parts and integrator.scheme is None:
             raise UnsupportedError("the isokinetic leapfrog holds constraints of the System only; use scheme='rattle'")
-        moving = [part for part in integrator.parts if getattr(part, "driven", False)]
+        moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
                 f"the isokinetic thermostat in OpenMM needs targets that rest, and those of {moving[0]!r} move; use "

@@ -214,8 +214,7 @@ class Guard:
 
     def _steered_away(self, part: Part) -> bool:
         """Whether a context parameter has moved the rows of a part since the last step, which is where they go then."""
-        steered = self.started and getattr(part, "steered", False)
-        return bool(steered and self._parameters != dict(self.context.getParameters()))
+        return self.started and part.steered and self._parameters != dict(self.context.getParameters())
 
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:
@@ -276,7 +275,7 @@ class Guard:
         """A call of `step` ends."""
         context = self.context
         self._left = context.getStepCount(), _box(context)
-        if any(getattr(part, "steered", False) for part in self.integrator.parts):
+        if any(part.steered for part in self.integrator.parts):
             self._parameters = dict(context.getParameters())
 
     def count(self, steps: int) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.step_variables import use
 from kcons.openmm.integrator.step_writer import StepWriter
 from kcons.steppers.rattle import Rattle
 
@@ -51,7 +52,7 @@ class LeanStepWriter(StepWriter):
         self.observed = 2 if self.lean else 1
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:
-            self.program.control("between", "1 if nobody looks at the velocities after this step")
+            use(self.program, "between")
         super().write()
 
     # -- the leapfrog without parts -------------------------------------------------------------
@@ -76,8 +77,7 @@ class LeanStepWriter(StepWriter):
 
     def _write_joined(self) -> None:
         p = self.program
-        p.number("behind", "1 where v lacks the half kick at the end of the last step")
-        p.number("kick", "length of the first kick as a fraction of the step")
+        use(p, "behind", "kick")
         p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
         self._kick("kick*dt", tangent=True)
         p.each("v", f"v+{self._drift('dt')}", "the constraint forces act on v as well")
@@ -97,8 +97,7 @@ class LeanStepWriter(StepWriter):
         if not self.filtered:
             return super()._drift(h)
         p = self.program
-        p.vector("x_start", "positions where the drift began")
-        p.vector("v_next", "velocities with all of (x-xu)/h")
+        use(p, "x_start", "v_next")
         p.each("x_start", "x", "where the drift begins")
         p.each("x", f"x+{h}*v", "move freely (drift)")
         p.each("xu", "x", "where that leads")
@@ -122,17 +121,8 @@ class LeanStepWriter(StepWriter):
         if not self.lean:
             return
         p = self.program
-        self.force = p.vector("force", "applied forces at x, where a call of step begins or ends")
-        p.vector("u", "velocities of the drift")
-        p.vector("raw", "v at the end of the last call, with half a kick and a projection to come")
-        p.number("moved", "how far others have moved x or v since the last call")
-        p.control("moving", "1 where barostats may move x between steps")
-        p.number("looked", "1 if somebody may have looked since the last step", 1.0)
-        p.control("lean", "1 where v may do without half a kick between steps")
-        p.number("behind", "1 where v, or else raw, does so now")
-        p.number("led", "the same when the last drift began")
-        p.number("dt_last", "length of the last step")
-        p.number("loose", "1 where v was taken back to a step at whose end nobody looked: it is not tangent")
+        self.force = use(p, "force")
+        use(p, "u", "raw", "moved", "moving", "looked", "lean", "behind", "led", "dt_last", "loose")
 
     def _write_guarded(self) -> None:
         if not self.lean:
@@ -153,13 +143,14 @@ class LeanStepWriter(StepWriter):
                     p.each("x_last", "x", "start here")
                     p.each("force", "f", "applied forces")
                 p.each("u", "v+select(behind, 1, kick_share(first_stage))*dt*force/m", "the applied forces act (kick)")
-                if any(hasattr(part, "begin") for part in self.parts):
-                    with p.when("moved+stale != 0", "others did"):
-                        self._each("begin")
+                with p.when("moved+stale != 0", "others did"):
+                    for part in self.parts:
+                        part.begin(p)
             with p.when("looked = 0", "in the middle of many steps"):
                 p.each("x_last", "x", "to come back to")
                 p.each("u", "v+dt*f/m", "the applied forces act (both half kicks)")
-                self._each("renew")
+                for part in self.parts:
+                    part.renew(p)
             p.let("stale", "0", "forces belong to x")
             p.let("led", "behind", "for multipliers")
             p.let("dt_last", "dt", "to see whether it is changed")
@@ -194,22 +185,17 @@ class LeanStepWriter(StepWriter):
         with p.when("looked = 0", "nobody does"):
             if not self.single:
                 p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
-            self._each("passed")
+            for part in self.parts:
+                part.passed(p)
         with p.when("looked != 0", "somebody does"):
             p.each("x_last", "x", "where forces were computed")
             p.each("v_last", "v", "to see whether others change it")
-
-    def _each(self, method: str) -> None:
-        """Call a method of the parts that have it."""
-        for part in self.parts:
-            if hasattr(part, method):
-                getattr(part, method)(self.program)
 
     def _drift_with(self, u: str, h: str) -> None:
         p = self.program
         for part in self.parts:
             part.remember(p)
         if self.single:
-            self.parts[0].land_alone(p, u, h)  # type: ignore[attr-defined]
+            self.parts[0].land_alone(p, u, h)
             return
         self._land(u, h)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import openmm
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
+from kcons.motion.motion import Motion
 from kcons.openmm.integrator.program import Program
 
 #: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
@@ -71,7 +73,7 @@ class Miss:
         return f"{self.what} are off row {self.name} by {abs(self.off):.3g}{rate}"
 
 
-class Part(Protocol):
+class Part(ABC):
     """Rows of one kind, and the computations that keep them.
 
     A program is written once and calls each method where its computations belong. The variables at hand are x, v,
@@ -83,24 +85,8 @@ class Part(Protocol):
     The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
     is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
 
-    Some things are optional.
-
-    - `driven`: whether rows demand velocities that are not 0.
-    - `steered`: whether context parameters move targets; positions need not be on the rows after one has changed.
-    - `engine_at(context)`: the engine for the rows and the positions it takes, by which thermostats see what the rows
-      do to total momentum.
-    - `begin_run()` is called before steps are made.
-    - `begin(program)`: what to compute where x is not where the last step ended, for parts that keep something from
-      step to step; written where the applied forces are computed anew.
-    - `begin_early(program)`: the same where velocities are projected before the first drift.
-    - `stays_finite = True`: after a failure x is still a place where forces can be computed; set-up is faster then.
-
     Steps at whose end nobody looks may end without `project` (see `lean_step_writer`): the next drift absorbs
     what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
-    The optional `renew(program)` is called before each drift that follows one, where v is free to be used, and
-    `passed(program)` at their ends. A part with `alone = True` knows that the System has no constraints; where there is
-    no other part, `land_alone(program, u, h)` is the whole drift with the velocity u, changes v by its impulse too, and
-    needs `remember` before.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
     `refuse_barostat` and `refuse_motion_remover` in `kcons.openmm.integrator.system_checks`.
@@ -122,51 +108,98 @@ class Part(Protocol):
         Force groups that carry rows, not forces.
     lean : bool
         Set by the integrator.
+    alone : bool
+        Whether it is known that the System has no constraints. Where there is no other part, `land_alone` is the
+        whole drift then.
+    stays_finite : bool
+        Whether x is still a place where forces can be computed after a failure; set-up is faster then.
     """
 
-    code: int
-    evaluates: bool
-    meets_system: bool
-    solves_alone: bool
-    groups: frozenset[int]
-    lean: bool
+    code: int = 0
+    evaluates: bool = False
+    meets_system: bool = False
+    solves_alone: bool = False
+    groups: frozenset[int] = frozenset()
+    lean: bool = False
+    alone: bool = False
+    stays_finite: bool = False
 
+    @property
+    def driven(self) -> bool:
+        """Whether rows demand velocities that are not 0."""
+        return False
+
+    @property
+    def steered(self) -> bool:
+        """Whether context parameters move targets; positions need not be on the rows after one has changed."""
+        return False
+
+    # -- the program ----------------------------------------------------------------------------
+
+    @abstractmethod
     def declare(self, program: Program) -> None:
         """Variables and tables."""
-        ...
 
+    @abstractmethod
     def remember(self, program: Program) -> None:
         """Before each drift, x on the constraints: keep the gradients at x."""
-        ...
 
+    @abstractmethod
     def land(self, program: Program, h: str) -> None:
         """After x = xu: bring x onto the rows along the gradients that were kept. `h` is the length of the drift."""
-        ...
 
+    @abstractmethod
     def project(self, program: Program) -> None:
         """Make v tangent to the rows at x."""
-        ...
 
+    def land_alone(self, program: Program, u: str, h: str) -> None:
+        """For parts that may be `alone`: the whole drift with velocity u, after `remember`; v gets its impulse, too."""
+        raise NotImplementedError
+
+    def begin_run(self) -> None:
+        """Called before steps are made."""
+
+    def begin(self, program: Program) -> None:
+        """What to compute where x is not where the last step ended, for parts that keep something between steps.
+
+        Written where the applied forces are computed anew.
+        """
+
+    def begin_early(self, program: Program) -> None:
+        """The same where velocities are projected before the first drift."""
+
+    def renew(self, program: Program) -> None:
+        """Before a drift that follows a step without `project`, where v is free to be used."""
+
+    def passed(self, program: Program) -> None:
+        """At the end of a step without `project`."""
+
+    # -- in a Context ---------------------------------------------------------------------------
+
+    @abstractmethod
     def check(self, context: openmm.Context) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
-        ...
 
+    @abstractmethod
     def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
         """What the rows themselves say of the state of the context, whatever solvers believe; None if all hold."""
-        ...
 
     def apply_positions(self, context: openmm.Context) -> Any:
         """Bring the positions of the context onto the rows; velocities stay as they are."""
-        ...
+        raise NotImplementedError
 
     def apply_velocities(self, context: openmm.Context) -> Any:
         """Make the velocities of the context tangent to the rows."""
-        ...
+        raise NotImplementedError
 
+    @abstractmethod
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         """The error for a step in which the part set `failed`."""
-        ...
 
+    @abstractmethod
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
-        ...
+
+    def engine_at(self, context: openmm.Context) -> tuple[Motion, FloatArray] | None:
+        """The engine for the rows and the positions it takes, for what rows do to total momentum; None without one."""
+        return None

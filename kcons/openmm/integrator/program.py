@@ -37,6 +37,8 @@ class Program:
         self.variables: list[str] = []
         self._lines: list[tuple[int, str, str]] = []
         self._depth = 0
+        #: Blocks in which nothing is written yet.
+        self._unopened: list[tuple[str, str, str, str]] = []
         self._known: set[str] = {"x", "v", "m", "f", "dt", "energy"}
         #: Kind, variable and expression of each computation, for `count_step`; 'loop', 'when' and 'end' make blocks.
         self.operations: list[tuple[str, str, str]] = []
@@ -137,65 +139,66 @@ class Program:
 
     def let(self, variable: str, expression: str, words: str) -> None:
         """variable = expression for one global variable."""
+        self._write("let", variable, expression, f"{variable} = {expression}", words)
         self.integrator.addComputeGlobal(variable, expression)
-        self.operations.append(("let", variable, expression))
-        self._line(f"{variable} = {expression}", words)
 
     def each(self, variable: str, expression: str, words: str) -> None:
         """variable = expression for each degree of freedom."""
+        self._write("each", variable, expression, f"{variable} = {expression}", words)
         self.integrator.addComputePerDof(variable, expression)
-        self.operations.append(("each", variable, expression))
-        self._line(f"{variable} = {expression}", words)
 
     def sum(self, variable: str, expression: str, words: str) -> None:
         """variable = sum of expression over all degrees of freedom."""
+        self._write("sum", variable, expression, f"{variable} = sum({expression})", words)
         self.integrator.addComputeSum(variable, expression)
-        self.operations.append(("sum", variable, expression))
-        self._line(f"{variable} = sum({expression})", words)
 
     def hold_positions(self, words: str) -> None:
+        self._write("hold", "x", "", "constrain positions", words)
         self.integrator.addConstrainPositions()
-        self.operations.append(("hold", "x", ""))
-        self._line("constrain positions", words)
 
     def hold_velocities(self, words: str) -> None:
+        self._write("hold", "v", "", "constrain velocities", words)
         self.integrator.addConstrainVelocities()
-        self.operations.append(("hold", "v", ""))
-        self._line("constrain velocities", words)
 
     def let_others_act(self) -> None:
         """Barostats, CMMotionRemover, Andersen thermostats change the state here."""
+        self._write("others", "", "", "update context state", "barostats and other outside agents may act")
         self.integrator.addUpdateContextState()
-        self.operations.append(("others", "", ""))
-        self._line("update context state", "barostats and other outside agents may act")
 
     @contextmanager
     def loop(self, condition: str, words: str) -> Iterator[None]:
         """Repeat what is written inside while `condition` holds."""
-        self.integrator.beginWhileBlock(condition)
-        self.operations.append(("loop", "", condition))
-        self._line(f"while {condition}:", words)
-        with self._inside():
+        with self._block("loop", condition, f"while {condition}:", words):
             yield
 
     @contextmanager
     def when(self, condition: str, words: str) -> Iterator[None]:
-        """Do what is written inside if `condition` holds."""
-        self.integrator.beginIfBlock(condition)
-        self.operations.append(("when", "", condition))
-        self._line(f"if {condition}:", words)
-        with self._inside():
+        """Do what is written inside if `condition` holds; without anything inside, there is no block."""
+        with self._block("when", condition, f"if {condition}:", words):
             yield
 
     @contextmanager
-    def _inside(self) -> Iterator[None]:
-        self._depth += 1
+    def _block(self, kind: str, condition: str, code: str, words: str) -> Iterator[None]:
+        outside = len(self._unopened)
+        self._unopened.append((kind, condition, code, words))
         yield
+        if len(self._unopened) > outside:
+            self._unopened.pop()
+            return
         self._depth -= 1
         self.integrator.endBlock()
         self.operations.append(("end", "", ""))
 
-    def _line(self, code: str, words: str) -> None:
+    def _write(self, kind: str, variable: str, expression: str, code: str, words: str) -> None:
+        """Note a computation, after the blocks that begin with it have been opened."""
+        pending, self._unopened = self._unopened, []
+        for block, condition, opening, why in pending:
+            begin = self.integrator.beginWhileBlock if block == "loop" else self.integrator.beginIfBlock
+            begin(condition)
+            self.operations.append((block, "", condition))
+            self._lines.append((self._depth, opening, why))
+            self._depth += 1
+        self.operations.append((kind, variable, expression))
         self._lines.append((self._depth, code, words))
 
     # -- listing --------------------------------------------------------------------------------

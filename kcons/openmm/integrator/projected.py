@@ -224,9 +224,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
         before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
         for part in self.parts:
-            begin_run = getattr(part, "begin_run", None)
-            if begin_run is not None:
-                begin_run()
+            part.begin_run()
         try:
             super().step(steps)
         except openmm.OpenMMException as error:

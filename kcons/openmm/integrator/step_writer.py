@@ -8,6 +8,7 @@ from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import stages_of
+from kcons.openmm.integrator.step_variables import use
 from kcons.steppers.splitting import Splitting
 
 
@@ -33,13 +34,13 @@ class StepWriter:
 
     def write(self) -> None:
         p = self.program
-        self.force = p.vector("force", "applied forces at x") if self.kept else "f"
-        p.vector("xu", "positions before constraints act on them")
+        self.force = use(p, "force") if self.kept else "f"
+        use(p, "xu")
         if self.scheme is None:
             # v belongs to half a step before x. As in VerletIntegrator the kinetic energy is that at x: half the
             # impulse of the forces at x is added, and half that of the constraints in the drift to x.
             p.integrator.setKineticEnergyExpression("m*u*u/2; u=v+0.5*dt*f/m+0.5*impulse")
-            p.vector("impulse", "change of v by the constraints in the last drift")
+            use(p, "impulse")
         self.ensemble.declare(p)
         if self.parts:
             self._declare_guards()
@@ -68,8 +69,7 @@ class StepWriter:
         else:
             p.table("drift_share", drifts, "length of drift k as a fraction of the step")
             p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
-            p.number("stage", "number of the drift")
-            p.number("h", "length of the drift")
+            use(p, "stage", "h")
             p.let("stage", "0", "first drift")
             # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
             with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
@@ -85,21 +85,16 @@ class StepWriter:
 
     def _declare_guards(self) -> None:
         p, n = self.program, len(self.drifts)
-        p.control("failed", "number of the part whose solve failed, 0 for none")
-        p.number("good_steps", "steps done since the integrator was made")
-        p.control("first_stage", f"0; {self.alone} to apply the constraints alone")
-        p.setting("end_stage", "where the stages end", n)
-        p.number("stage", "number of the drift")
-        p.number("h", "length of the drift")
+        use(p, "failed", "good_steps", "first_stage")
+        use(p, "end_stage", value=n)
+        use(p, "stage", "h")
         if self._last_drift_apart:
-            p.number("per_h", "1/h after the drift")
+            use(p, "per_h")
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
-        p.vector("x_last", "positions to come back to")
-        p.vector("v_last", "velocities to come back to")
-        p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
+        use(p, "x_last", "v_last", "stale")
         if self.kept:
-            p.number("moved", "how far others have moved x since the last step")
+            use(p, "moved")
 
     def _write_guarded(self) -> None:
         """The same program brings positions, or velocities alone, onto the constraints.
@@ -116,10 +111,9 @@ class StepWriter:
                     p.each("x_last", "x", "start here")
                     p.each("force", "f", "applied forces")
                     for part in self.parts:
-                        for name in ("begin", "begin_early") if self.ensemble.stays_tangent else ("begin",):
-                            begin = getattr(part, name, None)
-                            if begin is not None:
-                                begin(p)
+                        part.begin(p)
+                        if self.ensemble.stays_tangent:
+                            part.begin_early(p)
             else:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
@@ -175,12 +169,12 @@ class StepWriter:
             if self.single:
                 # From (x-xu)/h, the shortest of many drifts would have most of the digits of v.
                 self.parts[0].remember(p)
-                self.parts[0].land_alone(p, "v", "h")  # type: ignore[attr-defined]
+                self.parts[0].land_alone(p, "v", "h")
             else:
                 p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
             p.let("stage", "stage+1", "what follows")
             # Without the block set-up is faster, but forces are then computed after a failure as well.
-            if all(self.kicks[1:]) and all(getattr(part, "stays_finite", False) for part in self.parts):
+            if all(self.kicks[1:]) and all(part.stays_finite for part in self.parts):
                 self._kick_after()
             else:
                 with p.when("kick_share(stage)*step(0.5-failed) != 0", "a kick follows"):
@@ -191,7 +185,7 @@ class StepWriter:
     @property
     def single(self) -> bool:
         """Whether there is one part, whose rows are all there is."""
-        return len(self.parts) == 1 and getattr(self.parts[0], "alone", False)
+        return len(self.parts) == 1 and self.parts[0].alone
 
     @property
     def _last_drift_apart(self) -> bool:

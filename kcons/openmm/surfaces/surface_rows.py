@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +15,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError, UnsupportedError
 from kcons.motion.motion import Motion
-from kcons.openmm.integrator.part import BOND, NEAR, Miss
+from kcons.openmm.integrator.part import BOND, NEAR, Miss, Part
 from kcons.openmm.integrator.program import Program
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
@@ -23,7 +23,7 @@ START_TOLERANCE = 1e-6
 CARRIER = "hold them with kcons' constraint objects instead, by the carrier (kcons.openmm.hold)"
 
 
-class SurfaceRows(ABC):
+class SurfaceRows(Part):
     """Atoms that are each on one surface, as a `Part` of an integrator.
 
     Parameters
@@ -39,12 +39,7 @@ class SurfaceRows(ABC):
         Whether the System may have constraints of its own, on other particles.
     """
 
-    code = 0
-    evaluates = False
-    meets_system = False
     solves_alone = True
-    lean = False
-    groups: frozenset[int] = frozenset()
     bonded = True
     #: Whether `fly_alone` moves x before it needs the velocity of the drift for the last time.
     moves = False
@@ -75,18 +70,6 @@ class SurfaceRows(ABC):
     # -- the program ----------------------------------------------------------------------------
 
     @abstractmethod
-    def declare(self, program: Program) -> None: ...
-
-    @abstractmethod
-    def remember(self, program: Program) -> None: ...
-
-    @abstractmethod
-    def land(self, program: Program, h: str) -> None: ...
-
-    @abstractmethod
-    def project(self, program: Program) -> None: ...
-
-    @abstractmethod
     def fly(self, p: Program, u: str, h: str) -> None:
         """Find the landing of a drift of length `h` with velocity `u` from x, on the surface; x and v stay."""
 
@@ -99,9 +82,6 @@ class SurfaceRows(ABC):
         self.fly(p, u, h)
         p.each("v", f"select(failed, v, {u}+{self.impulse(h)})", "impulse of the surface")
         p.each("x", f"select(failed, x, x+{h}*v)", "fly onto the surface")
-
-    @abstractmethod
-    def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError: ...
 
     # -- running --------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
+from kcons.openmm.integrator.step_variables import use
 from kcons.openmm.surfaces.quadrics import QuadricRows
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 from kcons.steppers.rattle import Rattle
@@ -43,12 +44,12 @@ class SurfaceStepWriter(LeanStepWriter):
             self.drifts, self.kicks = _without_flight(self.drifts, self.kicks, len(self.scheme.flight))
             self.alone = len(self.drifts) + 1
         self.circles = circles
-        self.force = p.vector("force", "applied forces at x") if self.kept else "f"
+        self.force = use(p, "force") if self.kept else "f"
         #: x and v stay as they are until the only landing of the step is known: nothing to come back to.
         self.untouched = isinstance(self.scheme, Rattle) and not self.kept and circles is None
         self._declare_run()
         if self.bonded:
-            p.vector("xu", "positions before the constraints of the System act on them")
+            use(p, "xu")
         for part in self.surfaces:
             part.declare(p)
         self._write_surfaces()
@@ -65,26 +66,20 @@ class SurfaceStepWriter(LeanStepWriter):
 
     def _declare_run(self) -> None:
         p, n = self.program, len(self.drifts)
-        p.control("failed", "number of the part whose solve failed, 0 for none")
-        p.number("good_steps", "steps done since the integrator was made")
-        p.control("first_stage", f"0; {self.alone} to apply the constraints alone")
-        p.setting("end_stage", "where the stages end", n)
-        p.number("stage", "number of the drift")
-        p.control("between", "1 if nobody looks at the velocities after this step")
-        p.number("stale", "1 at a fresh start, and when forces must be computed anew", 1.0)
+        use(p, "failed", "good_steps", "first_stage")
+        use(p, "end_stage", value=n)
+        use(p, "stage", "between", "stale")
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
         if self.untouched:
-            p.number("behind", "1 where v lacks the half kick at the end of the last step")
-            p.number("kick", "length of the last kick as a fraction of the step")
+            use(p, "behind", "kick")
             if any(part.moves for part in self.surfaces):
-                p.vector("u", "velocities of the drift")
+                use(p, "u")
             return
-        p.number("h", "length of the drift")
+        use(p, "h")
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
-        p.vector("x_last", "positions to come back to")
-        p.vector("v_last", "velocities to come back to")
+        use(p, "x_last", "v_last")
         if self.kept:
-            p.number("moved", "how far others have moved x since the last step")
+            use(p, "moved")
 
     def _write_surfaces(self) -> None:
         """As for other parts: `first_stage` makes the program bring positions, or velocities alone, onto surfaces."""

@@ -73,3 +73,21 @@ def test_listing_is_complete():
                 assert "#" in line
                 assert variable in line
                 assert expression in line
+
+
+def test_a_block_in_which_nothing_is_written_is_none():
+    program = Program(integrator := openmm.CustomIntegrator(1e-3))
+    program.number("a", "a number")
+    with program.when("a = 0", "nothing"), program.loop("a = 1", "nothing within"):
+        pass
+    assert program.operations == []
+    with program.when("a = 0", "outer"):
+        with program.when("a = 1", "empty"):
+            pass
+        with program.when("a = 2", "inner"):
+            program.let("a", "3", "something")
+        program.let("a", "4", "more")
+    assert [o[0] for o in program.operations] == ["when", "when", "let", "end", "let", "end"]
+    assert integrator.getNumComputations() == 6
+    lines = program.listing().split("each step\n")[1].splitlines()
+    assert [len(line) - len(line.lstrip()) for line in lines] == [2, 6, 10, 6]
