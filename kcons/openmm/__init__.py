@@ -19,6 +19,7 @@ from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
@@ -33,6 +34,7 @@ __all__ = [
     "ExpressionSurface",
     "Isokinetic",
     "Langevin",
+    "Precision",
     "ProjectedIntegrator",
     "RattleIntegrator",
     "Row",

@@ -16,6 +16,7 @@ from kcons.openmm import ProjectedIntegrator
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold
 from kcons.openmm.carried.requirements import refuse_single_precision
+from kcons.openmm.integrator.precision import Precision
 
 # -- failure --------------------------------------------------------------------------------------
 
@@ -130,24 +131,11 @@ def test_wrong_positions_are_refused():
 
 @pytest.mark.parametrize("precision", ["single", "mixed", "double"])
 def test_gpus_carry_positions_in_double_precision_only(precision):
-    class Context:
-        def getPlatform(self):
-            return self
-
-        def getPropertyNames(self):
-            return ("DeviceIndex", "Precision")
-
-        def getPropertyValue(self, context, name):
-            return precision
-
-        def getName(self):
-            return "CUDA"
-
     if precision == "double":
-        refuse_single_precision(Context())
+        refuse_single_precision(Precision("CUDA", precision))
         return
-    with pytest.raises(UnsupportedError, match=f"CUDA platform carries positions in {precision} precision"):
-        refuse_single_precision(Context())
+    with pytest.raises(UnsupportedError, match=rf"CUDA, {precision} precision hands .* or hold the rows by Coll"):
+        refuse_single_precision(Precision("CUDA", precision))
 
 
 def test_no_free_groups():

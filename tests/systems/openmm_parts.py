@@ -45,7 +45,7 @@ class HeldCoordinates(Part):
     def project(self, program):
         program.each("v", "v*(1-held)", "at rest across")
 
-    def check(self, context):
+    def check(self, context, velocities=True):
         miss = np.abs(positions_of(context)[self.particles, self.axis] - self.value).max(initial=0.0)
         if miss > 1e-9:
             raise InputError(f"off the level by {miss:.3g}", item="positions")

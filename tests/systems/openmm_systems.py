@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import openmm
+import pytest
 from openmm import app, unit
 from openmm_parts import HeldCoordinates
 
@@ -21,9 +22,22 @@ PLATFORMS = ("Reference", "CPU")
 PROPERTIES = {"CPU": {"Threads": "1", "DeterministicForces": "true"}}
 
 
+#: Platforms that compute as GPUs do, in each of their precisions: 'OpenCL mixed'. Debian's pocl-opencl-icd makes an
+#: OpenCL platform of any processor.
+_PRESENT = [openmm.Platform.getPlatform(k).getName() for k in range(openmm.Platform.getNumPlatforms())]
+GPUS = [
+    pytest.param(f"{name} {precision}", id=f"{name}-{precision}")
+    for name in _PRESENT
+    if name in ("CUDA", "HIP", "OpenCL")
+    for precision in ("single", "mixed", "double")
+] or [pytest.param("", id="none", marks=pytest.mark.skip(reason="no CUDA, HIP or OpenCL platform (pocl-opencl-icd)"))]
+
+
 def context_of(system, integrator, platform="Reference"):
-    place = openmm.Platform.getPlatformByName(platform)
-    return openmm.Context(system, integrator, place, PROPERTIES.get(platform, {}))
+    name, _, precision = platform.partition(" ")
+    place = openmm.Platform.getPlatformByName(name)
+    properties = {"Precision": precision} if precision else PROPERTIES.get(name, {})
+    return openmm.Context(system, integrator, place, properties)
 
 
 def started(system, integrator, x, v=None, platform="Reference"):

@@ -40,6 +40,7 @@ from kcons.openmm.carried.requirements import (
     with_massless_atoms,
 )
 from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.topology import bonds_of
 from kcons.steppers.state import START_TOLERANCE
@@ -189,6 +190,10 @@ class CarriedConstraints(Part):
         #: Where a step may end without a projection, the solve for positions must tell of failures itself.
         self._early = self.lean or getattr(program.integrator, "scheme", None) is None
 
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Refuse platforms that do not carry doubles."""
+        refuse_single_precision(precision)
+
     def begin_early(self, program: Program) -> None:
         """Where x is not where the last step ended, and velocities are projected before the first drift."""
         self.remember(program)
@@ -245,7 +250,7 @@ class CarriedConstraints(Part):
 
     # -- in a context ---------------------------------------------------------------------------
 
-    def check(self, context: openmm.Context) -> None:
+    def check(self, context: openmm.Context, velocities: bool = True) -> None:
         """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
 
         Raises
@@ -256,7 +261,7 @@ class CarriedConstraints(Part):
             Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
         """
         system = context.getSystem()
-        refuse_single_precision(context)
+        refuse_single_precision(Precision.of(context))
         self._check_system(system)
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
@@ -268,6 +273,8 @@ class CarriedConstraints(Part):
                 item="positions",
                 atoms=miss.atoms,
             )
+        if not velocities:
+            return
         tangent = self.motion.project_velocities(x, v, time=time)
         away = np.abs(tangent - v)
         if away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):

@@ -15,6 +15,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.precision import Precision
 
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
@@ -63,16 +64,12 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
             raise UnsupportedError(f"atom {atom} is a virtual site; hold the atoms that it is placed by")
 
 
-def refuse_single_precision(context: openmm.Context) -> None:
+def refuse_single_precision(precision: Precision) -> None:
     """GPUs hand positions to PythonForces as they keep them: exact in double precision only."""
-    platform = context.getPlatform()
-    if "Precision" not in platform.getPropertyNames():
-        return
-    precision = platform.getPropertyValue(context, "Precision")
-    if precision != "double":
+    if precision.name != "double":
         raise UnsupportedError(
-            f"the {platform.getName()} platform carries positions in {precision} precision, too coarse for rows; make "
-            "the Context with {'Precision': 'double'}"
+            f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
+            "Context with {'Precision': 'double'}, or hold the rows by CollectiveRows, which the platform computes"
         )
 
 

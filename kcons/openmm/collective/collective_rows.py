@@ -34,13 +34,19 @@ from kcons.openmm.collective.row_forces import (
     unit_of,
 )
 from kcons.openmm.collective.row_program import GroupRows
-from kcons.openmm.collective.small_algebra import blocks
+from kcons.openmm.collective.small_algebra import PIVOT, blocks
 from kcons.openmm.integrator.part import Miss
+from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.program import Program
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
+
+
+#: Of sigma, in double precision.
+TOLERANCE = 1e-13
 
 
 class CollectiveRows(GroupRows):
@@ -66,8 +72,9 @@ class CollectiveRows(GroupRows):
         In nm if without unit. Needed where a target is to be found.
     box : sequence of three vectors, optional
         Periodic box at these positions, unless it is the System's default.
-    tolerance : float
-        Of sigma, relative to the scale of each row: the root of the sum of squares over the rows.
+    tolerance : float, optional
+        Of sigma, relative to the scale of each row: the root of the sum of squares over the rows. Left open, 1e-13,
+        or 5e-7 where the platform computes forces in single precision (CUDA, HIP and OpenCL, mixed too).
     max_iterations : int
         Bound of the quasi-Newton iteration.
     meets_system : bool, optional
@@ -95,13 +102,15 @@ class CollectiveRows(GroupRows):
         *,
         positions: object | None = None,
         box: Sequence | None = None,
-        tolerance: float = 1e-13,
+        tolerance: float | None = None,
         max_iterations: int = 20,
         meets_system: bool | None = None,
     ) -> None:
         given = [row if isinstance(row, Row) else Row(row) for row in rows]
         if not given:
             raise InputError("no rows to hold", item="rows")
+        self.asked_tolerance = tolerance
+        tolerance = TOLERANCE if tolerance is None else tolerance
         if not tolerance > 0 or max_iterations < 1:
             raise InputError(
                 f"tolerance {tolerance} and max_iterations {max_iterations} must be positive", item="tolerance"
@@ -209,6 +218,13 @@ class CollectiveRows(GroupRows):
     def rates(self, context: openmm.Context) -> FloatArray:
         """A v less the rate of the targets, shape (n_rows,), per ps."""
         return self.at(context).slopes()
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Tolerances that were left open become what Forces of the platform can tell."""
+        if self.asked_tolerance is None:
+            self.tolerance = max(TOLERANCE, precision.forces)
+            program.set(f"tolerance{self.code}", self.tolerance)
+        program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
 
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
@@ -348,7 +364,7 @@ class CollectiveRows(GroupRows):
                 f"after restoring, the {miss}", row=miss.row, residual=abs(miss.off), atoms=miss.atoms
             )
 
-    def check(self, context: openmm.Context) -> None:
+    def check(self, context: openmm.Context, velocities: bool = True) -> None:
         """Raise unless the state of the context is on the rows.
 
         Raises
@@ -362,7 +378,7 @@ class CollectiveRows(GroupRows):
         ConstraintError
             Positions or velocities are not on the rows; `restore` brings them there.
         """
-        self.at(context).check()
+        self.at(context).check(velocities)
 
     def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:
         """sigma and A v from the Forces themselves, at the state of the context."""
@@ -398,7 +414,7 @@ class CollectiveRows(GroupRows):
         iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
         return ConvergenceError(
             f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
-            f"{iterations} iterations (tolerance {self.tolerance:.3g}); time step too large "
+            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator)}; time step too large "
             f"(dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
             residual=float(residual),
             tolerance=self.tolerance,
@@ -406,6 +422,13 @@ class CollectiveRows(GroupRows):
             row=row,
             step=step,
         )
+
+    def _digits(self, integrator: openmm.CustomIntegrator) -> str:
+        """What to do where the tolerance asks for more digits than Forces have."""
+        precision = Precision.of(integrator.context)
+        if self.tolerance >= precision.forces:
+            return ""
+        return f", but Forces have {precision.forces:.0e} in {precision}: leave the tolerance open"
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"

@@ -16,6 +16,7 @@ from kcons.errors import ConstraintError, ConvergenceError, InputError, Singular
 from kcons.openmm.collective.plain_rows import near_targets
 from kcons.openmm.collective.row_forces import energy, forces_in
 from kcons.openmm.integrator.part import BOND, NEAR, Miss
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
 from kcons.openmm.topology import bonds_of
@@ -28,7 +29,7 @@ DEPENDENT = 1e-5
 #: Off the rows by more than this (relative to the scale of a row, or to its rate): not on them.
 START_TOLERANCE = 1e-9
 _MAX_NEWTON = 60
-#: Tolerance of the System's constraints where differences are taken.
+#: Tolerance of the System's constraints where differences are taken, in double precision.
 _TIGHT = 1e-13
 
 
@@ -130,19 +131,19 @@ class ContextRows:
         """A v less the rates of the targets, shape (n_rows,)."""
         return np.einsum("kai,ai->k", self.gradients(), self.velocities) - self.target_rates()
 
-    def directions(self, gradients: FloatArray, tolerance: float = _TIGHT) -> FloatArray:
+    def directions(self, gradients: FloatArray) -> FloatArray:
         """M_par^+ A^T, M_par^+ that of the System's constraints, shape (n_rows, n_particles, 3)."""
         pushed = gradients * self._inverse_masses
         if self.rows.meets_system:
             with self._kept(positions=False):
                 for k in self._numbers:
-                    pushed[k] = self._tangent(pushed[k], tolerance)
+                    pushed[k] = self._tangent(pushed[k])
         return pushed
 
-    def _tangent(self, v: FloatArray, tolerance: float) -> FloatArray:
+    def _tangent(self, v: FloatArray) -> FloatArray:
         """v along the System's constraints at the context's positions; its velocities are overwritten."""
         self.context.setVelocities(v)
-        self.context.applyVelocityConstraints(tolerance)
+        self.context.applyVelocityConstraints(self._tight)
         return np.array(self.context.getState(getVelocities=True).getVelocities(asNumpy=True)._value)
 
     @contextmanager
@@ -189,7 +190,7 @@ class ContextRows:
             left = scaled[k, k]
             if k:
                 left -= scaled[k, :k] @ np.linalg.lstsq(scaled[:k, :k], scaled[:k, k], rcond=None)[0]
-            if not left > DEPENDENT**2:
+            if not left > self._small:
                 return k
         return None
 
@@ -199,7 +200,22 @@ class ContextRows:
         gram = np.einsum("jai,kai->jk", gradients, self.directions(gradients))
         own = np.einsum("kai,kai->k", gradients**2, np.broadcast_to(self._inverse_masses, gradients.shape))
         size = np.sqrt(np.where(own > 0, own, 1.0))
-        return int(np.sum(np.linalg.eigvalsh(0.5 * (gram + gram.T) / (size[:, None] * size)) > DEPENDENT**2))
+        return int(np.sum(np.linalg.eigvalsh(0.5 * (gram + gram.T) / (size[:, None] * size)) > self._small))
+
+    @cached_property
+    def precision(self) -> Precision:
+        """That of the platform."""
+        return Precision.of(self.context)
+
+    @property
+    def _small(self) -> float:
+        """Squares of parts beside other rows that are rounding."""
+        return max(DEPENDENT**2, 10 * self.precision.forces)
+
+    @property
+    def _tight(self) -> float:
+        """Tolerance of the System's constraints where differences are taken."""
+        return max(_TIGHT, self.precision.solvers) if self.precision.name != "double" else _TIGHT
 
     # -- projections ----------------------------------------------------------------------------
 
@@ -304,14 +320,14 @@ class ContextRows:
             self.context.setPositions(self.positions + side * h * self.velocities)
             v = self.velocities
             if self.rows.meets_system:
-                self.context.applyConstraints(_TIGHT)
-                v = self._tangent(self.velocities, _TIGHT)
+                self.context.applyConstraints(self._tight)
+                v = self._tangent(self.velocities)
             change += side * np.einsum("kai,ai->k", self.gradients(), v) / (2 * h)
         return change
 
     # -- checks ---------------------------------------------------------------------------------
 
-    def check(self) -> None:
+    def check(self, velocities: bool = True) -> None:
         """See `CollectiveRows.check`."""
         rows, system = self.rows, self.context.getSystem()
         present = {force.getForceGroup() for force in system.getForces()}
@@ -326,17 +342,16 @@ class ContextRows:
         gradients, _, _ = self.gram()
         # A row that knows where the origin is gives momentum to the whole.
         sizes = np.linalg.norm(gradients, axis=(1, 2))
-        if np.any(np.linalg.norm(gradients.sum(axis=1), axis=1) > 1e-9 * sizes):
+        if np.any(np.linalg.norm(gradients.sum(axis=1), axis=1) > max(1e-9, 10 * self.precision.forces) * sizes):
             refuse_motion_remover(system, "a collective row")
-        late = getattr(rows, "_leapfrog", False) and owner(rows, self.context) is not None
-        miss = self.worst_miss(velocities=not late)  # those of the leapfrog are of half a step before
+        miss = self.worst_miss(velocities)
         if miss is not None:
             raise ConstraintError(f"the {miss}; call restore(context)", rows=[miss.row], atoms=miss.atoms)
 
     def worst_miss(self, velocities: bool = True) -> Miss | None:
         """Energies of the Forces less the targets, and their gradients times v."""
         rows = self.rows
-        allowed = np.array(rows.scales) * max(START_TOLERANCE, 10 * rows.tolerance)
+        allowed = np.array(rows.scales) * max(START_TOLERANCE, 10 * rows.tolerance, 2 * self.precision.forces)
         off = self.sigma()
         near = NEAR * self._lengths() if np.any(np.abs(off) > allowed) else 0.0
         miss = Miss.worst("positions", off, allowed, self._name, rows.atoms.__getitem__, near)
@@ -346,7 +361,7 @@ class ContextRows:
         demanded = self.target_rates()
         size = np.linalg.norm(gradients, axis=(1, 2)) * float(np.linalg.norm(v, axis=1).max(initial=0.0))
         rates = np.einsum("kai,ai->k", gradients, v) - demanded
-        allowed = START_TOLERANCE * (size + np.abs(demanded))
+        allowed = max(START_TOLERANCE, 2 * self.precision.forces) * (size + np.abs(demanded))
         return Miss.worst("velocities", rates, allowed, self._name, rows.atoms.__getitem__)
 
     def _lengths(self) -> FloatArray:

@@ -88,6 +88,7 @@ class GroupRows(Part):
         p.number(f"known{c}", "whether the last velocity projection was at the start of this step")
         p.number(f"singular{c}", "1 + number of the first row that vanishes or depends on others")
         p.number(f"residual{c}", "size of sigma relative to the scales")
+        p.setting(f"tolerance{c}", "what it may be", self.tolerance)
         p.number(f"iterations{c}", "quasi-Newton iterations of the last drift")
         p.number(f"state{c}", "of the iteration: 1 iterate, 2 give up, 0 done")
         p.number(f"held{c}", "whether the rows hold")
@@ -253,7 +254,7 @@ class GroupRows(Part):
         c, rows = self.code, range(self.n_rows)
         squares = "+".join(f"({self._of('sigma', k)}/{self.scales[k]!r})^2" for k in rows)
         p.let(f"residual{c}", f"sqrt({squares})", "size of sigma; not a number if one is none")
-        p.let(f"held{c}", f"held{c}*step({self.tolerance!r}-residual{c})", "do the rows hold?")
+        p.let(f"held{c}", f"held{c}*step(tolerance{c}-residual{c})", "do the rows hold?")
         for block in () if first else self._blocks:
             block.update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from kcons.openmm.integrator.program import Program
 
-#: A pivot below this fraction of the row's own norm means that the row depends on others.
+#: A pivot below this fraction of the row's own norm means that the row depends on others, in double precision.
 PIVOT = 1e-10
 
 
@@ -38,6 +38,7 @@ class Block:
 
     def declare(self, p: Program) -> None:
         c = self.code
+        p.setting(f"small{c}", "a pivot below this fraction of the row's own norm means dependence", PIVOT)
         for i in self.rows:
             for j in self.rows:
                 if j <= i:
@@ -87,7 +88,7 @@ class Block:
 
     def _test(self, p: Program, singular: str, i: int, pivot: str) -> None:
         # step(NaN) is 0: a row that is not a number is singular too.
-        good = f"step({pivot}-{PIVOT!r}*{self.of('own', i)})*step({pivot}-1e-200)"
+        good = f"step({pivot}-small{self.code}*{self.of('own', i)})*step({pivot}-1e-200)"
         # After a failure x may be anywhere; the row that failed is to be named, not this one.
         p.let(singular, f"select({singular}+failed, {singular}, select({good}, 0, {i + 1}))", f"does row {i} vanish?")
 

@@ -16,6 +16,7 @@ from kcons.errors import CertificateError, ConvergenceError, InputError, NonFini
 from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -28,8 +29,8 @@ logger = logging.getLogger("kcons.openmm")
 
 #: With a note in the log, unless it is what a looser tolerance or single precision leaves.
 TIDY = 1e-4
-#: What rounding may add to a relative distance, near the origin.
-_ROUNDING = 1e-12
+#: How often OpenMM's solver is asked for positions: that of OpenCL may need a second call from starts that are off.
+_CALLS = 4
 _REMEDY = "let kcons hold these constraints: take them out of the System and hand them over as constraint objects"
 
 
@@ -83,7 +84,9 @@ class Guard:
         self.system = context.getSystem()
         check_system(self.system, leapfrog=integrator.scheme is None)
         refuse_forgotten_parts(self.system, integrator.row_groups)
-        self.rows = SystemRows.of(self.system)
+        self.precision = Precision.of(context)
+        integrator.take_precision(self.precision)
+        self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
         #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
@@ -121,24 +124,36 @@ class Guard:
 
     # -- constraints of the System --------------------------------------------------------------
 
-    def limit(self, x: FloatArray) -> FloatArray:
-        """What each relative residual may be, given the tolerance and the size of the coordinates."""
+    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
+        """What each relative residual may be, given the tolerance and the size of the coordinates.
+
+        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
+        positions to single numbers then, until the next step.
+        """
+        coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
+        place = 2.0**-24 if coarse else self.precision.place
         reach = np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0) / self.rows.lengths
-        # The tolerance is that of the solver; OpenMM checks the squares of the distances.
-        return np.asarray(2 * self.integrator.getConstraintTolerance() + _ROUNDING + 4e-16 * reach)
+        # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
+        # particles are rounded.
+        rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
+        return np.asarray(2 * self.integrator.getConstraintTolerance() + rounding + self.rows.slack)
 
     def check_rows(self, x: FloatArray, step: int | None) -> None:
         """Raise if a constraint of the System is not fulfilled at positions x."""
         if not self.rows.n_rows:
             return
         miss = np.abs(self.rows.stretches(x))
-        excess = miss / self.limit(x)
+        limit = self.limit(x)
+        if np.median(miss / limit) <= 1:  # few molecules cross the faces of the box at a time
+            limit = self.limit(x, wrapped=True)
+        excess = miss / limit
         row = int(np.argmax(excess))
         if not excess[row] <= 1:  # also NaN
             tolerance = self.integrator.getConstraintTolerance()
             raise ConvergenceError(
-                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g}: the "
-                f"solvers of OpenMM did not converge and do not tell. Take a smaller time step, or {_REMEDY}",
+                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
+                f"({self.precision}, which holds {limit[row]:.2g}): the solvers of OpenMM did not converge and "
+                f"do not tell. Take a smaller time step, or {_REMEDY}",
                 residual=float(miss[row]),
                 tolerance=tolerance,
                 row=int(self.rows.numbers[row]),
@@ -166,9 +181,9 @@ class Guard:
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
                 if not self.started:
-                    part.check(context)
+                    part.check(context, velocities=not self.late)
                 elif not self._steered_away(part):
-                    self._refuse(part.worst_miss(context, velocities=not self._late))
+                    self._refuse(part.worst_miss(context, velocities=not self.late))
             if not self.started:
                 integrator.ensemble.begin(integrator, context)
         except Exception:
@@ -179,7 +194,7 @@ class Guard:
         self._remember(context.getState(positions=True, velocities=True))
 
     @property
-    def _late(self) -> bool:
+    def late(self) -> bool:
         """Whether velocities are those of half a step before, and on no constraints at x."""
         return self.integrator.scheme is None
 
@@ -203,7 +218,7 @@ class Guard:
         if near:
             integrator.applyConstraints(context)
         else:
-            context.applyConstraints(integrator.getConstraintTolerance())
+            self.hold_positions(integrator.getConstraintTolerance())
         now = positions_of(context)
         self.check_rows(now, None)
         if near or miss[row] > TIDY:
@@ -215,6 +230,14 @@ class Guard:
     def _steered_away(self, part: Part) -> bool:
         """Whether a context parameter has moved the rows of a part since the last step, which is where they go then."""
         return self.started and part.steered and self._parameters != dict(self.context.getParameters())
+
+    def hold_positions(self, tolerance: float) -> None:
+        """Bring the positions of the Context onto the constraints of the System."""
+        for _ in range(_CALLS):
+            self.context.applyConstraints(tolerance)
+            x = positions_of(self.context)
+            if not self.rows.n_rows or np.all(np.abs(self.rows.stretches(x)) <= self.limit(x)):
+                return
 
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:
@@ -229,7 +252,7 @@ class Guard:
     def _make_tangent(self, v: FloatArray) -> None:
         """Project velocities that were set from outside; those of a run that is continued stay bit for bit."""
         integrator, context = self.integrator, self.context
-        if self._late:
+        if self.late:
             # What is taken away here the first drift would take away: the leapfrog's way is the same, but the first
             # impulse, which enters the kinetic energy, is that of a smooth motion.
             off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
@@ -245,7 +268,8 @@ class Guard:
         rows, tolerance = self.rows, self.integrator.getConstraintTolerance()
         if not rows.n_rows:
             return None
-        allowed = (10 * tolerance + _ROUNDING) * rows.speeds_of_one(v) + self.limit(x) * np.sqrt(np.mean(v * v))
+        allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
+        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
         return Miss.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
 
     # -- between and after steps ----------------------------------------------------------------
@@ -314,8 +338,8 @@ class Guard:
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
             _check_finite(x, v, step, self.rows.n_rows > 0)
             self.check_rows(x, step)
-            misses = [] if self._late else [self._speed_miss(x, v)]
-            misses += [part.worst_miss(context, velocities=not self._late) for part in integrator.parts]
+            misses = [] if self.late else [self._speed_miss(x, v)]
+            misses += [part.worst_miss(context, velocities=not self.late) for part in integrator.parts]
             for miss in misses:
                 self.certify(miss, f"at step {step} ")
         except (CertificateError, ConvergenceError, NonFiniteError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import openmm
 
 from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.steppers.splitting import Splitting
 
@@ -32,3 +33,7 @@ class Integrator(openmm.CustomIntegrator):
     program: Program
     row_groups: frozenset[int]
     spare: bool
+
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known: tolerances that were left open become those of its platform."""
+        raise NotImplementedError

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 
 #: Starts that are off by less (relative) are put right, as integrators of OpenMM do in their first step.
@@ -156,6 +157,9 @@ class Part(ABC):
         """For parts that may be `alone`: the whole drift with velocity u, after `remember`; v gets its impulse, too."""
         raise NotImplementedError
 
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """The Context is known, and with it what can be held."""
+
     def begin_run(self) -> None:
         """Called before steps are made."""
 
@@ -177,8 +181,11 @@ class Part(ABC):
     # -- in a Context ---------------------------------------------------------------------------
 
     @abstractmethod
-    def check(self, context: openmm.Context) -> None:
-        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up."""
+    def check(self, context: openmm.Context, velocities: bool = True) -> None:
+        """Raise unless the state of the context is on the rows; also whatever is wrong with the set-up.
+
+        `velocities` is False for the leapfrog, whose velocities belong to half a step before.
+        """
 
     @abstractmethod
     def worst_miss(self, context: openmm.Context, velocities: bool = True) -> Miss | None:

@@ -15,6 +15,7 @@ from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.part import Part
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
 from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
@@ -48,8 +49,9 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         openmm.VerletIntegrator, for Systems with virtual sites.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
-    tolerance : float
-        Relative tolerance of the System's constraints.
+    tolerance : float, optional
+        Relative tolerance of the System's constraints. Left open, what the platform of the Context can hold: 1e-10 in
+        double, 1e-8 in mixed and 1e-5 in single precision.
     check_every : int, optional
         Steps between two checks; 0 for none but the first. Left open, 100, and later, up to 10,000, where checks would
         take more than a hundredth of the time.
@@ -79,12 +81,14 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         scheme: str | Splitting = "rattle",
         *,
         parts: Sequence[Part] = (),
-        tolerance: float = 1e-10,
+        tolerance: float | None = None,
         check_every: int | None = None,
         ensemble: Ensemble | None = None,
     ) -> None:
         super().__init__(picoseconds(timestep))
-        self.setConstraintTolerance(tolerance)
+        openmm.CustomIntegrator.setConstraintTolerance(self, Precision("", "double").tolerance)
+        if tolerance is not None:
+            self.setConstraintTolerance(tolerance)
         if check_every is not None:
             self.check_every = check_every
         #: None for the leapfrog.
@@ -115,8 +119,14 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         return f"{self!r}\n{self.listing()}"
 
     def listing(self) -> str:
-        """The steps of the integrator, in words."""
-        return self.program.listing()
+        """What is held and how closely, the variables, and the steps of the integrator, in words."""
+        held = f"constraints of the System to {self.getConstraintTolerance():g} (relative)"
+        guard = self._guard
+        if guard is not None:
+            held += f", {guard.precision}"
+        elif self.asked_tolerance is None:
+            held += ", or what the precision of the Context allows"
+        return f"{held}\n{self.program.listing()}"
 
     def counts(self, *, seen: bool = True, iterations: int = 2) -> StepCounts:
         """What a step makes OpenMM do, where all goes well.
@@ -277,10 +287,10 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
             if code:
                 raise self._failure(code, int(self.getGlobalVariableByName("good_steps")) + 1)
         for part in self.parts if guard.disturbed else ():
-            part.check(guard.context)
+            part.check(guard.context, velocities=not guard.late)
         guard.check()
         for part in self.parts:
-            part.check(guard.context)
+            part.check(guard.context, velocities=not guard.late)
 
     # -- constraints outside of steps -----------------------------------------------------------
 
@@ -297,7 +307,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         start, velocities = positions_of(context), velocities_of(context)
         tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
         try:
-            context.applyConstraints(tolerance)
+            guard.hold_positions(tolerance)
             if not all(part.solves_alone for part in self.parts):
                 for part in self.parts:
                     part.apply_positions(context)
@@ -443,7 +453,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
     def _making(self) -> tuple[Any, ...]:
         scheme = LEAPFROG if self.scheme is None else self.scheme
         every = None if self.spare else self.check_every
-        return self._dt, scheme, self.parts, self.getConstraintTolerance(), every, self.ensemble
+        return self._dt, scheme, self.parts, self.asked_tolerance, every, self.ensemble
 
     def __reduce__(self) -> tuple[Any, ...]:
         return remade, (type(self), self._making(), settings_of(self))

@@ -71,8 +71,8 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     ----------
     timestep : Quantity or float
         In ps if a float; more than 0.
-    tolerance : float
-        Relative tolerance of the System's constraints.
+    tolerance : float, optional
+        Relative tolerance of the System's constraints; see `ProjectedIntegrator`.
     check_every : int, optional
         Steps between two checks that OpenMM's solvers did converge; 0 for none but the first. Left open, 1000, and
         later where checks would take more than a hundredth of the time. One that is due shortly before the end of a
@@ -94,12 +94,12 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     """
 
     def __init__(
-        self, timestep: unit.Quantity | float, *, tolerance: float = 1e-10, check_every: int | None = None
+        self, timestep: unit.Quantity | float, *, tolerance: float | None = None, check_every: int | None = None
     ) -> None:
         super().__init__()
         self._ends = Ends(timestep, "rattle", tolerance=tolerance, check_every=check_every)
         self._verlet = openmm.VerletIntegrator(self._ends.getStepSize())
-        self._verlet.setConstraintTolerance(tolerance)
+        self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())
         # The first is the one that answers what OpenMM asks: its velocities belong to x.
         super().addIntegrator(self._ends)
         super().addIntegrator(self._verlet)
@@ -127,7 +127,9 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         self._ends.context = context
 
     def _watch(self, context: openmm.Context | None = None) -> Guard:
-        return self._ends._watch(context)
+        guard = self._ends._watch(context)
+        self._verlet.setConstraintTolerance(self._ends.getConstraintTolerance())  # the Context may have decided
+        return guard
 
     def step(self, steps: int) -> None:
         """Make `steps` steps.
@@ -140,7 +142,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
             At the first step: the System cannot be propagated, or the start is not on the constraints.
         """
         ends = self._ends
-        guard = ends._watch()
+        guard = self._watch()
         if guard.disturbed:
             guard.begin()
         guard.meet_others()
@@ -273,7 +275,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     def _making(self) -> tuple[Any, ...]:
         every = None if self._ends.spare else self.check_every
-        return self._dt, self.getConstraintTolerance(), every, settings_of(self._ends)
+        return self._dt, self._ends.asked_tolerance, every, settings_of(self._ends)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()
@@ -286,7 +288,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         return self.__copy__()
 
 
-def _remade(dt: float, tolerance: float, check_every: int | None, settings: dict[str, Any]) -> RattleIntegrator:
+def _remade(dt: float, tolerance: float | None, check_every: int | None, settings: dict[str, Any]) -> RattleIntegrator:
     made = RattleIntegrator(dt, tolerance=tolerance, check_every=check_every)
     made.setIntegrationForceGroups(settings["groups"])
     return made

@@ -49,6 +49,11 @@ class SystemRows:
         Which constraint of the System each row is. OpenMM ignores those between massless particles.
     settled : ndarray of bool, shape (n_rows,)
         Rows that SETTLE holds.
+    others : ndarray, shape (n_rows,)
+        What a GPU's SHAKE holds instead where it is responsible, which stores squares of lengths in single precision.
+    slack : ndarray, shape (n_rows,)
+        By how much a relative distance may differ from `lengths` although it is held exactly: what a GPU's SETTLE
+        makes of its distances in single precision.
     """
 
     masses: FloatArray
@@ -56,9 +61,12 @@ class SystemRows:
     lengths: FloatArray
     numbers: IntArray
     settled: NDArray[np.bool_]
+    others: FloatArray
+    slack: FloatArray
 
     @classmethod
-    def of(cls, system: openmm.System) -> SystemRows:
+    def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
+        """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`."""
         n = system.getNumParticles()
         masses = np.array([system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(n)])
         pairs, lengths, numbers = [], [], []
@@ -72,16 +80,20 @@ class SystemRows:
         given = np.array(lengths, dtype=float)
         settled = _settled(table, given, n)
         held = np.where(settled, given.astype(np.float32).astype(float), given)
-        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled)
+        shaken = np.sqrt((given**2).astype(np.float32).astype(float)) if rounded else held
+        slack = np.where(settled & rounded, 2.0**-23, 0.0)
+        return cls(masses, table, held, np.array(numbers, dtype=np.int64), settled, shaken, slack)
 
     @property
     def n_rows(self) -> int:
         return len(self.pairs)
 
     def stretches(self, x: FloatArray) -> FloatArray:
-        """(d - d0)/d0 of each row at positions x, shape (n_rows,)."""
+        """(d - d0)/d0 of each row at positions x, shape (n_rows,), d0 being the nearer of what may be held."""
         r = x[self.pairs[:, 0]] - x[self.pairs[:, 1]]
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", r, r)) / self.lengths - 1)
+        d = np.sqrt(np.einsum("ij,ij->i", r, r))
+        first, second = d / self.lengths - 1, d / self.others - 1
+        return np.where(np.abs(second) < np.abs(first), second, first)
 
     def speeds(self, x: FloatArray, v: FloatArray) -> FloatArray:
         """A v of each row, the rate of its distance, shape (n_rows,)."""

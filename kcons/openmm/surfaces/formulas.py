@@ -17,6 +17,7 @@ from kcons.constraints import ImplicitSurface
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SURFACE_NAME
 from kcons.openmm.surfaces.compiled_quadrics import free_groups
@@ -162,11 +163,19 @@ class ImplicitRows(SurfaceRows):
     def declare(self, program: Program) -> None:
         p = program
         self._parameter(p, "i_on", "1 for particles on a surface given by a formula", np.ones(len(self.atoms)))
+        p.setting("i_solved", "Newton steps of less than this (nm) are the last", _SOLVED)
+        p.setting("i_missed", "farther from the surface than this (nm) is no solution", _MISSED)
         p.vector("i_gradient", "minus gradient where the drift began")
         p.vector("i_slope", "f1, minus gradient of the formula")
         p.vector("i_step", "f2, then the Newton step")
         p.number("i_count", "Newton steps done")
         p.number("i_miss", "sum of squares of the last Newton steps, in nm^2")
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        """Formulas are Forces, whose gradients are of the size of 1 kJ/mol/nm."""
+        missed = max(_MISSED, precision.forces, 10 * precision.force_step)
+        program.set("i_missed", missed)
+        program.set("i_solved", max(_SOLVED, 100 * missed))
 
     def _look(self, p: Program) -> None:
         one, two = self._pair
@@ -207,7 +216,7 @@ class ImplicitRows(SurfaceRows):
         """Newton's method, x moving."""
         p.let("i_count", "0", "no Newton step yet")
         p.let("i_miss", "1", "not yet on the surfaces")
-        with p.loop(f"select(step({NEWTON_STEPS}-1-i_count), i_miss, 0) > {_SOLVED**2!r}", "Newton's method"):
+        with p.loop(f"select(step({NEWTON_STEPS}-1-i_count), i_miss, 0) > i_solved^2", "Newton's method"):
             self._look(p)
             p.each("x", "x-select(step(1-abs(i_step)), i_step, 0)", "nearer to the surface, never far away")
             p.each("i_push", "i_push-i_step", "the way so far")
@@ -216,7 +225,7 @@ class ImplicitRows(SurfaceRows):
         self._look(p)
         self._fail(
             p,
-            f"step({_MISSED}*(1+abs(x))-abs(i_step))*step({_FAR}-abs(i_push))",
+            f"step(i_missed*(1+abs(x))-abs(i_step))*step({_FAR}-abs(i_push))",
             "the next Newton step moves no particle",
         )
 

@@ -191,7 +191,7 @@ class QuadricRows(SurfaceRows):
         p.each("s_dv", "dot(s_d, v)", "velocity across the sphere")
         p.each("v", f"v-{on}s_d*s_dv/(s_dd{safe})", "along the sphere")
         p.each("s_w", f"1e-150+{on}sqrt(dot(v, v)/({self._k}{safe}))", "w = |v|/R")
-        self._fail(p, "step(s_w)*step(1e100-s_w)", "velocities are finite")
+        self._fail(p, "step(s_w)*step(1e30-s_w)", "velocities are finite")
         # d is brought to the length R on the way, so that rounding does not add up.
         size = "select(s_other, 1, sqrt(s_k/(s_dd+s_other)))" if self._others else f"sqrt({self._k}/s_dd)"
         p.each("x", f"select(failed, x, s_c+s_d*{size}*cos(s_w*{h})+v*sin(s_w*{h})/s_w)", "turn the position")
@@ -202,7 +202,7 @@ class QuadricRows(SurfaceRows):
     def failure(self, integrator: openmm.CustomIntegrator, step: int) -> KconsError:
         if self.circles:
             w = self._values(integrator, "s_w")
-            return self._error(np.where(w < 1e100, w, np.nan), step, w)
+            return self._error(np.where(w < 1e30, w, np.nan), step, w)
         b, s = self._values(integrator, "s_b"), self._values(integrator, "s_s")
         a = self.levels if self._a == self._k else self._values(integrator, "s_a")
         return self._error((b * b - a * s) / (np.abs(a * self.levels) + np.finfo(float).tiny), step, s)

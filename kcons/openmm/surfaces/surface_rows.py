@@ -107,7 +107,7 @@ class SurfaceRows(Part):
         slopes = np.concatenate([item.gradient(x[item.atoms], 0.0)[:, 0] for item in self.rows])
         return np.asarray(slopes / np.sqrt(np.einsum("ij,ij->i", slopes, slopes))[:, None])
 
-    def check(self, context: openmm.Context) -> None:
+    def check(self, context: openmm.Context, velocities: bool = True) -> None:
         """Raise `InputError` unless all atoms are on their surfaces with velocities along them.
 
         And `UnsupportedError` for a System that surfaces do not go with.
@@ -118,7 +118,7 @@ class SurfaceRows(Part):
         for item in self.rows:
             item.check(x[item.atoms], 0.0, first)
             first += item.n_rows
-        miss = self._worst(x, v)
+        miss = self._worst(x, v if velocities else None)
         if miss is not None and miss.what == "positions":
             raise InputError(
                 f"particle {miss.atoms[0]} is {abs(miss.off):.3g} nm from its surface, {miss.name}; move it there "

@@ -18,6 +18,7 @@ import openmm
 from kcons.constraints import Torus
 from kcons.constraints.constraint import Constraint
 from kcons.errors import KconsError
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 
@@ -45,6 +46,7 @@ class TorusRows(SurfaceRows):
         self._parameter(p, "t_major", "radius R of its core", self._major)
         self._parameter(p, "t_minor", "radius r of its tube", self._minor)
         self._parameter(p, "t_on", "1 for particles on a torus", np.ones(len(self.atoms)))
+        p.setting("t_solved", "relative residual that counts as solved", _SOLVED)
         p.vector("t_u", "z and U, height over the plane")
         p.vector("t_d", "D, square of the distance from the centre")
         p.vector("t_z", "Z, height over the plane where the particle flew")
@@ -52,6 +54,9 @@ class TorusRows(SurfaceRows):
         p.vector("t_l", "l, way back along the kept gradient")
         p.vector("t_off", "relative residual")
         p.vector("t_gradient", "half the gradient of F where the drift began")
+
+    def take_precision(self, program: Program, precision: Precision) -> None:
+        program.set("t_solved", max(_SOLVED, 10 * precision.solvers) if precision.name == "single" else _SOLVED)
 
     def remember(self, program: Program) -> None:
         p = program
@@ -83,7 +88,7 @@ class TorusRows(SurfaceRows):
             p.each("t_l", f"t_l-t_on*F/(slope+1-t_on); {_VALUE}", f"Newton step {k}")
         # F relative to r (R + r); beyond the tube, where the surface looks the other way, there is no landing.
         residual = "t_on*select(step(slope), abs(F)/(t_minor*(t_major+t_minor)+1-t_on), 1)"
-        p.each("t_off", f"select(step(1e100-t_d), {residual}, t_d); {_VALUE}", "residual; NaN where t_d is NaN")
+        p.each("t_off", f"select(step(1e30-t_d), {residual}, t_d); {_VALUE}", "residual; NaN where t_d is NaN")
         self._fail(p, _SOLVED_EXPRESSION, "F = 0 was reached")
 
     def project(self, program: Program) -> None:
@@ -103,4 +108,4 @@ _VALUE = (
     " F=(rho-t_major)^2+z*z-t_minor*t_minor;"
     " rho=sqrt(max(0, t_d+2*t_t*t_l+(t_minor*t_l)^2-z*z)); z=t_z+t_u*t_l"
 )
-_SOLVED_EXPRESSION = f"step({_SOLVED}-t_off)"
+_SOLVED_EXPRESSION = "step(t_solved-t_off)"

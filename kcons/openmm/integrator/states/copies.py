@@ -12,27 +12,11 @@ from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.schemes import LEAPFROG, SCHEMES
+from kcons.openmm.integrator.step_variables import VARIABLES
 from kcons.steppers.splitting import Splitting
 
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
-RUN_STATE = frozenset(
-    [
-        "good_steps",
-        "stale",
-        "moved",
-        "stage",
-        "h",
-        "per_h",
-        "looked",
-        "behind",
-        "led",
-        "loose",
-        "dt_last",
-        "kick",
-        "growth",
-        "lost",
-    ]
-)
+RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"growth", "lost"}
 
 
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:

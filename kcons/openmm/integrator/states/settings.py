@@ -14,6 +14,7 @@ from kcons.openmm.ensembles.langevin_ensemble import Langevin
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.states.states_on_constraints import value_in
 from kcons.steppers.splitting import Splitting
@@ -34,6 +35,8 @@ class Settings(Integrator):
 
     program: Program
     scheme: Splitting | None
+    #: Of the System's constraints; None where the platform decides.
+    asked_tolerance: float | None = None
     _ensemble: Ensemble
     _guard: Guard | None
 
@@ -138,7 +141,15 @@ class Settings(Integrator):
         """
         if not 0 < tol < 1:
             raise InputError(f"the tolerance is {tol}; give a positive number, such as 1e-10", item="tolerance")
+        self.asked_tolerance = float(tol)
         super().setConstraintTolerance(tol)
+
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known: tolerances that were left open become those of its platform."""
+        if self.asked_tolerance is None:
+            openmm.CustomIntegrator.setConstraintTolerance(self, precision.tolerance)
+        for part in self.parts:
+            part.take_precision(self.program, precision)
 
     def setGlobalVariableByName(self, name: str, value: float) -> None:
         """Set a variable of the program.
