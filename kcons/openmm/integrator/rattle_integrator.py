@@ -1,8 +1,9 @@
 """RATTLE at the speed of OpenMM's own Verlet: compiled leapfrog steps, with velocities at the positions on both ends.
 
-n steps of velocity Verlet are half a kick back, n leapfrog steps, and half a kick forward, which ends with velocities
+n steps of velocity Verlet are half a kick and a drift, n - 1 leapfrog steps, and half a kick, which ends with velocities
 tangent to the constraints. OpenMM interprets the steps of a CustomIntegrator and has compiled those of its
-VerletIntegrator; so the ends are a CustomIntegrator here, and what lies between is OpenMM's own.
+VerletIntegrator; so the ends are a CustomIntegrator here, and what lies between is OpenMM's own. The forces of the last
+half kick are those of the first of the next call: n steps cost n evaluations, in however many calls.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstra
 
 #: What one execution of the program of `Ends` does.
 _STEP, _BEGIN, _END = 0.0, 1.0, 2.0
-#: Shorter calls are made by the program itself: the ends cost two force evaluations, and a step has one.
-FEW = 3
+#: Shorter calls are made by the program itself.
+FEW = 2
 _CLOSED = "a RattleIntegrator has its integrators; make a CompoundIntegrator with a ProjectedIntegrator in it"
 
 
@@ -35,7 +36,12 @@ class EndWriter(LeanStepWriter):
         with p.when("end = 0", "a step"):
             super().write()
         with p.when("end = 1", "leapfrog steps follow"):
-            p.each("v", "v-0.5*dt*f/m", "half a kick back")
+            p.let_others_act()
+            p.each("v", "v+0.5*dt*f/m", "the applied forces act (half a kick)")
+            p.each("x", "x+dt*v", "move freely (drift)")
+            p.each("xu", "x", "where that leads")
+            p.hold_positions("back onto the constraints of the System")
+            p.each("v", "v+(x-xu)/dt", "the constraint forces act on v as well")
         with p.when("end = 2", "leapfrog steps were made"):
             p.each("x", "x", "tells OpenMM that forces are old")
             p.each("v", "v+0.5*dt*f/m", "the applied forces act (half a kick)")
@@ -62,8 +68,8 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     The motion is that of ``ProjectedIntegrator(timestep, "rattle")``, up to rounding and the tolerance: positions and
     velocities belong to the same time, velocities are tangent, all is checked. Within a call of `step` there are
-    leapfrog steps that OpenMM has compiled. Call it with many steps: each call of three or more costs one force
-    evaluation more than it has steps, and a shorter one runs as slowly as ProjectedIntegrator.
+    leapfrog steps that OpenMM has compiled; a call costs as many force evaluations as it has steps. Call it with many
+    steps all the same: what begins and ends a call runs as slowly as ProjectedIntegrator.
 
     For parts, thermostats and orders 4 and 6 take `ProjectedIntegrator`.
 
@@ -85,8 +91,8 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
 
     Notes
     -----
-    K_{h/2} D_h (K_h D_h)^{n-1} K_{h/2} = K_{-h/2} (K_h D_h)^n K_{h/2}, where the leapfrog step K_h D_h is a kick and a
-    drift along the constraints (Andersen, J. Comput. Phys. 52, 24 (1983)). What the projection at the end takes out of
+    K_{h/2} D_h (K_h D_h)^{n-1} K_{h/2}, where the leapfrog step K_h D_h is a kick and a drift along the constraints
+    (Andersen, J. Comput. Phys. 52, 24 (1983)). What the projection at the end takes out of
     v lies along gradients at x, where the next drift absorbs it: into how many calls steps are divided does not change
     the motion, up to rounding.
 
@@ -163,7 +169,7 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
         time, first = context.getTime()._value, context.getStepCount()
         try:
             self._ends.execute(_BEGIN)
-            self._verlet.step(steps)
+            self._verlet.step(steps - 1)
             self._ends.execute(_END)
         except BaseException as error:
             # In the middle v is that of half a step before.
