@@ -44,7 +44,7 @@ class Langevin(ConstantEnergy):
     """
 
     halves = True
-    adds_up = False
+    adds_up = True
     temperature: float
     friction: float
 

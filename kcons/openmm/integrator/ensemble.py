@@ -26,7 +26,8 @@ class Ensemble(Protocol):
     halves : bool
         Whether `middle` does something, between two halves of the only drift.
     adds_up : bool
-        Whether two kicks at the same place, which are one of the sum of their times, are better made as one.
+        Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
+        divided into calls then changes the rounding of the motion.
     """
 
     stays_tangent: bool

@@ -25,7 +25,7 @@ SHORT_DRIFT = 1 / 30
 class LeanStepWriter(StepWriter):
     """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, leave out what nobody looks at.
 
-    Velocity Verlet without parts does so where a kick costs much: two of half a step are made as one.
+    With an ensemble, velocity Verlet without parts does so, too: two kicks of half a step are made as one.
 
     Attributes
     ----------
@@ -73,17 +73,23 @@ class LeanStepWriter(StepWriter):
             p.each("impulse", "(x-xu)/dt", "what the constraint forces do to v")
         p.each("v", "v+(x-xu)/dt", "the constraint forces act on v as well")
 
-    # -- velocity Verlet whose kicks are dear ---------------------------------------------------
+    # -- velocity Verlet whose kicks or projections are dear ------------------------------------
 
     def _write_joined(self) -> None:
-        p = self.program
+        p, ensemble = self.program, self.ensemble
         use(p, "behind", "kick")
         p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
         self._kick("kick*dt", tangent=True)
-        p.each("v", f"v+{self._drift('dt')}", "the constraint forces act on v as well")
-        self._project()
+        h = "(0.5*dt)" if ensemble.halves else "dt"
+        if ensemble.halves:
+            ensemble.middle(p, self._drift(h), self._project)
+        p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
+        if ensemble.stays_tangent:
+            self._project()
         with p.when("between = 0", "somebody looks at the velocities"):
             self._kick("0.5*dt", tangent=True)
+            if not ensemble.stays_tangent:  # otherwise the next drift absorbs what v has across
+                self._project()
         p.let("behind", "between", "the next step makes up for it")
 
     # -- impulses without rounding --------------------------------------------------------------
