@@ -35,16 +35,8 @@ MASSES: dict[str, float] = {
 _LONG = ("CL", "BR", "SE", "SI", "FE", "ZN", "MG", "MN", "LI", "AL")
 #: Ions whose name is no symbol.
 _IONS = {
-    "SOD": "Na",
-    "POT": "K",
-    "CLA": "Cl",
-    "CAL": "Ca",
-    "CES": "Cs",
-    "LIT": "Li",
-    "RUB": "Rb",
-    "BAR": "Ba",
-    "CIO": "Cs",
-}
+    "SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb", "BAR": "Ba", "CIO": "Cs",
+}  # fmt: skip
 #: Names of massless sites.
 _SITES = ("MW", "EP", "LP", "M", "OM", "VS", "XX", "X", "DUM")
 #: How far a mass may be from that of its element.
@@ -408,12 +400,3 @@ def selected_numbers(select: Any, n: int) -> IntArray:
     if given.min() < 0 or given.max() >= n:
         raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
     return given.astype(np.int64)
-
-
-def selected_atoms(select: Any, n: int) -> BoolArray | None:
-    """Which of n atoms `selected_numbers` names, shape (n,); None for 'all'."""
-    if isinstance(select, str) and select == "all":
-        return None
-    mask = np.zeros(n, dtype=bool)
-    mask[selected_numbers(select, n)] = True
-    return mask

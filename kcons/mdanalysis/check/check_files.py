@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from kcons.mdanalysis.check.memory import give_back
 from kcons.mdanalysis.check.result import CheckResult
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of
+from kcons.topology.holding import Options
 
 
 def check_trajectory(
@@ -24,10 +24,6 @@ def check_trajectory(
     topology: str | Path,
     constrain: str | None = "hbonds",
     *,
-    select: str = "all",
-    rigid_water: bool = True,
-    rigid_residues: Sequence[str] = (),
-    rigid_bodies: Iterable[Any] = (),
     targets: str | Path = "first",
     frames: str | None = None,
     workers: int = 1,
@@ -40,7 +36,7 @@ def check_trajectory(
     ----------
     trajectory, topology : path
         Files that MDAnalysis reads.
-    constrain, select, rigid_water, rigid_residues, rigid_bodies
+    constrain
         What is held; see `kcons.mdanalysis.constraints_of`.
     targets : {'first', 'mean', 'topology'} or path
         'topology': the coordinates in the topology's file; else as for `ConstraintCheck`.
@@ -51,7 +47,8 @@ def check_trajectory(
     backend : {'threads', 'multiprocessing', 'dask'}, optional
         Where there are several workers; by default threads for DCD files and rows that are all lengths, else processes.
     **options
-        For `ConstraintCheck`.
+        What is held besides, such as select, rigid_water and rigid_residues, for `kcons.mdanalysis.constraints_of`;
+        all others for `ConstraintCheck`.
 
     Raises
     ------
@@ -66,12 +63,7 @@ def check_trajectory(
     # Complain about the parameter file before anything long.
     file = None if str(targets) in ("first", "mean", "topology") else TargetFile(targets)
     names = (str(trajectory), str(topology))
-    held: dict[str, Any] = {
-        "select": select,
-        "rigid_water": rigid_water,
-        "rigid_residues": rigid_residues,
-        "rigid_bodies": tuple(rigid_bodies),
-    }
+    held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
     text = None
     if str(targets) == "topology":
         universe = open_universe(topology)
