@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.images import find_images, image_error, minimum_image
+from kcons.constraints.images import find_images, image_error
 from kcons.constraints.in_cell import InCell, contiguous, whole_bodies
+from kcons.constraints.one_piece import minimum_image
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 

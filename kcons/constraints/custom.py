@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.differences import first_derivative, first_derivative_4, second_derivative
-from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
 from kcons.constraints.vectors import first_true
 from kcons.errors import InputError, SingularGeometryError
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.images import Images, image_error, minimum_image
+from kcons.constraints.images import Images, image_error
+from kcons.constraints.one_piece import lattice_of, lined_up, make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -59,16 +59,9 @@ class InCell:
             matrix = np.diag(matrix)
         if matrix.shape != (3, 3):
             raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
-        periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
         if not np.all(np.isfinite(matrix)):
             raise InputError("cell has a NaN or infinity", item="cell")
-        if not periodic.any():
-            return
-        # Directions without periodicity need any independent vector for the inverse to exist.
-        full = completed(matrix, periodic)
-        inverse = np.linalg.inv(full)
-        inverse[:, ~periodic] = 0.0
-        self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
+        self.lattice = lattice_of(matrix, pbc)
 
     def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
         """Change the cell in place (barostats); targets are unchanged.
@@ -154,13 +147,10 @@ class InCell:
         if self.lattice is None or not item.relative:
             return r
         if item.whole is None:
-            steps = minimum_image(np.diff(r, axis=1), self.lattice)
-            r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
-            return r
+            return lined_up(r, self.lattice)
         plain = ~item.whole
         if plain.any():
-            steps = minimum_image(np.diff(r[plain], axis=1), self.lattice)
-            r[plain, 1:] = r[plain, :1] + np.cumsum(steps, axis=1)
+            r[plain] = lined_up(r[plain], self.lattice)
         if item.windings is not None:
             r[item.whole] += item.windings[item.whole] @ self.lattice[0]
         return r
@@ -178,17 +168,6 @@ class InCell:
 
 def contiguous(values: ArrayLike, item: str) -> FloatArray:
     return np.ascontiguousarray(numbers(values, item))
-
-
-def completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
-    """Cell whose non-periodic vectors are replaced by unit vectors normal to the periodic ones."""
-    full = matrix.copy()
-    basis = matrix[periodic]
-    _, singular, vh = np.linalg.svd(basis)
-    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
-        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
-    full[~periodic] = vh[len(basis) :]
-    return full
 
 
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
@@ -210,20 +189,5 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     links = np.concatenate(pairs)
     if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
         return x
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
-
-    n = len(x)
-    graph = sp.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    roots = np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
-    # One more node, from which all pieces hang.
-    ends = np.concatenate([links, np.stack([np.full(len(roots), n), roots], axis=1)])
-    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n + 1, n + 1))
-    parent = breadth_first_order(tree, n, directed=False)[1].astype(np.int64)
-    parent[n] = n
-    parent[roots] = roots
-    cells = np.zeros((n + 1, 3))
-    cells[:n] = -np.round((x - x[parent[:n]]) @ lattice[1])
-    while np.any(parent != parent[parent]):
-        cells += cells[parent]
-        parent = parent[parent]
-    return x + cells[:n] @ lattice[0]
+    atoms, parents, _ = spanning_tree(links, len(x))
+    return make_whole(x, atoms, parents, lattice)

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.differences import first_derivative_4
-from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.target import FloatArray, Target, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
 from kcons.errors import InputError, SingularGeometryError
 

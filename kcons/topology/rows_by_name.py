@@ -17,6 +17,7 @@ import numpy as np
 from kcons.constraints import Angle, Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.one_piece import minimum_image
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.holding import CONSTRAIN, GroupOptions, Holding, RowMaker
@@ -31,7 +32,6 @@ from kcons.topology.rigid_groups import (
 )
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 from kcons.topology.virtual_sites import VirtualSites
-from kcons.topology.whole_molecules import minimum_image
 
 #: Beyond this an angle is held by a linear row, in degrees.
 STRAIGHT = 179.0
@@ -295,8 +295,8 @@ def _internal(
     triples = triples[~inside_bodies(topology.n_atoms, triples, rigid)]
     if angles == "distances":
         return [*rows, Distance(np.sort(triples[:, [0, 2]], axis=1))]
-    u = minimum_image(snapshot, snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]])
-    w = minimum_image(snapshot, snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]])
+    u = minimum_image(snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
+    w = minimum_image(snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
     value = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))
     straight = value > np.radians(STRAIGHT)
     rows.append(Angle(triples[~straight]))
@@ -323,7 +323,7 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
 
 
 def _refuse_torn(snapshot: Snapshot, bonds: IntArray) -> None:
-    d = minimum_image(snapshot, snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]])
+    d = minimum_image(snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]], snapshot.lattice)
     long = np.linalg.norm(d, axis=1) / snapshot.angstrom
     if len(long) and long.max() > TORN:
         i, j = (int(a) for a in bonds[int(np.argmax(long))])

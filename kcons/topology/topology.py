@@ -9,17 +9,18 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.one_piece import BoolArray, lattice_of, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 StrArray = NDArray[np.str_]
-BoolArray = NDArray[np.bool_]
 
 #: Standard atomic masses in dalton, for recognising elements.
 MASSES: dict[str, float] = {
@@ -175,6 +176,11 @@ class Snapshot:
                 item="positions",
             )
 
+    @cached_property
+    def lattice(self) -> FloatArray | None:
+        """The periodic cell and its inverse, as `ConstraintSet.lattice`."""
+        return lattice_of(self.cell, self.pbc)
+
     def in_unit(self, angstrom: float) -> Snapshot:
         """The same with another unit of length."""
         factor = angstrom / self.angstrom
@@ -224,14 +230,12 @@ def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
 
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
-    both = np.concatenate([bonds, bonds[:, ::-1]])
-    both = both[np.lexsort((both[:, 1], both[:, 0]))]
-    degree = np.bincount(both[:, 0], minlength=n_atoms)
-    starts = np.cumsum(degree) - degree
+    starts, ends, _ = neighbour_lists(bonds, n_atoms)
+    degree = np.diff(starts)
     found = []
     for d in np.unique(degree[degree > 1]).tolist():
         vertex = np.flatnonzero(degree == d)
-        neighbours = both[starts[vertex][:, None] + np.arange(d), 1]
+        neighbours = ends[starts[vertex][:, None] + np.arange(d)]
         a, b = np.triu_indices(d, 1)
         centre = np.repeat(vertex, len(a))
         found.append(np.stack([neighbours[:, a].ravel(), centre, neighbours[:, b].ravel()], axis=1))

@@ -542,7 +542,7 @@ MUTANTS = [
     ),
     (
         "topology/guessed_bonds.py",
-        "wrapped = y if cell is None else wrapped_into(y, cell, pbc)[1]",
+        "wrapped = y if lattice is None else wrapped_into(y, lattice)[1]",
         "wrapped = y",
         "tests/motion/restoring/test_moved_groups.py::test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
     ),
