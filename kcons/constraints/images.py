@@ -28,7 +28,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
-from kcons.constraints.one_piece import BoolArray, make_whole, minimum_image, spanning_tree
+from kcons.constraints.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import ImageError, InputError
 
@@ -61,7 +61,9 @@ class Images:
 
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
         """Copy of `x`, shape (n_atoms, 3), with `atoms` in the images of the tree."""
-        return make_whole(x, self.atoms, self.parents, lattice)
+        y = x.copy()
+        follow_parents(y, self.atoms, self.parents, lattice)
+        return y
 
     def follow(self, x: FloatArray, x_ref: FloatArray, y_ref: FloatArray, lattice: FloatArray) -> FloatArray:
         """Shifts, shape (k, 3), that bring `atoms` in `x` next to where they are in `y_ref`, by whole cells.
@@ -387,14 +389,15 @@ def _tree(
         if item.width == 1:
             firm[item.atoms.ravel()] = True
     roots = np.concatenate([np.flatnonzero(firm), np.flatnonzero(~firm)])
-    atoms, parents, through = spanning_tree(pair[link], n_atoms, roots)
-    loose = np.where(held[link], -1, row[link])
-    linked = np.zeros(n_atoms, bool)
-    linked[pair[link]] = True
-    tied = linked[atoms]
+    atoms, parents = spanning_tree(pair[link], n_atoms, roots)
+    parent_of, loose = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
+    parent_of[atoms] = parents
+    i, j = pair[link].T
+    loose[np.where(parent_of[j] == i, j, i)] = np.where(held[link], -1, row[link])
+    tied = np.isin(atoms, pair[link])
+    atoms, parents = atoms[tied], parents[tied]
     ties = float(np.max(length[link][held[link]], initial=0.0))
-    marks = np.where(through < 0, -1, np.append(loose, -1)[through])
-    return Images(atoms[tied], parents[tied], marks[tied], ties), longest, component
+    return Images(atoms, parents, loose[atoms], ties), longest, component
 
 
 def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:

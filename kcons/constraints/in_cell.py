@@ -189,5 +189,4 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     links = np.concatenate(pairs)
     if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
         return x
-    atoms, parents, _ = spanning_tree(links, len(x))
-    return make_whole(x, atoms, parents, lattice)
+    return make_whole(x, *spanning_tree(links, len(x)), lattice)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numba as nb
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from kcons.constraints.arguments import FloatArray, IntArray
@@ -55,66 +56,58 @@ def lined_up(r: FloatArray, lattice: FloatArray | None) -> FloatArray:
     return r
 
 
-def neighbour_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Where the neighbours of each atom begin, shape (n_atoms + 1,); these, ascending; the pair each comes from."""
+def neighbour_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray]:
+    """Where the neighbours of each atom begin, shape (n_atoms + 1,), and all of them, those of one atom ascending."""
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=n_atoms))])
-    return start, ends[order, 1], order % max(len(pairs), 1)
+    return start, ends[order, 1]
 
 
-def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray, IntArray]:
-    """All atoms breadth first along pairs, their parents, and the pair between the two, -1 for roots.
+def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:
+    """All atoms breadth first along pairs, and their parents, which come before them.
 
     Parameters
     ----------
     roots : ndarray of int, optional
-        In which order atoms are taken as roots, if nothing before reached them. A root is its own parent.
+        All atoms; the first of a piece is its root, which is its own parent. By default the one of lowest number.
     """
-    start, neighbours, through = neighbour_lists(pairs, n_atoms)
-    return _breadth_first(np.arange(n_atoms) if roots is None else roots, start, neighbours, through, n_atoms)
+    if not len(pairs):
+        return np.arange(n_atoms), np.arange(n_atoms)
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
+
+    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    label = connected_components(graph, directed=False)[1]
+    order = np.arange(n_atoms) if roots is None else roots
+    first = order[np.unique(label[order], return_index=True)[1]]
+    # One more node, from which all pieces hang.
+    ends = np.concatenate([pairs, np.stack([np.full(len(first), n_atoms), first], axis=1)])
+    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n_atoms + 1, n_atoms + 1))
+    found, parent_of = breadth_first_order(tree, n_atoms, directed=False)
+    atoms = found[1:].astype(np.int64)
+    parents = parent_of[atoms].astype(np.int64)
+    return atoms, np.where(parents == n_atoms, atoms, parents)
 
 
 def make_whole(x: FloatArray, atoms: IntArray, parents: IntArray, lattice: FloatArray | None) -> FloatArray:
-    """Copy of `x`, shape (n_atoms, 3), with `atoms` moved by whole cells next to their parents, which come before them.
+    """Copy of `x`, shape (n_atoms, 3), with `atoms` moved by whole cells next to their parents, which are among them.
 
-    Each atom is rounded once, wherever it is stored.
+    Each atom is rounded once, wherever it is stored. Nothing is compiled for what is done once; see `follow_parents`.
     """
-    y = x.copy()
-    if lattice is not None:
-        _make_whole(y, atoms, parents, lattice)
-    return y
+    if lattice is None:
+        return x.copy()
+    parent = np.arange(len(x))
+    parent[atoms] = parents
+    cells = -np.round((x - x[parent]) @ lattice[1])
+    while np.any(parent != parent[parent]):
+        cells += cells[parent]
+        parent = parent[parent]
+    return x + cells @ lattice[0]
 
 
 @nb.njit(cache=True)
-def _breadth_first(roots, start, neighbours, through, n_atoms):  # type: ignore[no-untyped-def]
-    """Atoms in breadth-first order from `roots`, their parents, and the pair by which they were reached."""
-    seen = np.zeros(n_atoms, np.bool_)
-    atoms, parents = np.empty(n_atoms, np.int64), np.empty(n_atoms, np.int64)
-    by = np.full(n_atoms, -1, np.int64)
-    used = 0
-    for root in roots:
-        if seen[root]:
-            continue
-        seen[root] = True
-        atoms[used] = parents[used] = root
-        head = used
-        used += 1
-        while head < used:
-            a = atoms[head]
-            head += 1
-            for p in range(start[a], start[a + 1]):
-                b = neighbours[p]
-                if not seen[b]:
-                    seen[b] = True
-                    atoms[used], parents[used], by[used] = b, a, through[p]
-                    used += 1
-    return atoms, parents, by
-
-
-@nb.njit(cache=True)
-def _make_whole(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
-    """Move atoms by whole cells next to their parents, in place."""
+def follow_parents(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
+    """`make_whole` for what is done again and again: moves atoms in place, parents before their children."""
     cell, inverse = lattice[0], lattice[1]
     for k in range(len(atoms)):
         a, b = atoms[k], parents[k]

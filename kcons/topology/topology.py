@@ -230,7 +230,7 @@ def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
 
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
-    starts, ends, _ = neighbour_lists(bonds, n_atoms)
+    starts, ends = neighbour_lists(bonds, n_atoms)
     degree = np.diff(starts)
     found = []
     for d in np.unique(degree[degree > 1]).tolist():

@@ -25,7 +25,8 @@ def whole_molecules(snapshot: Snapshot, links: IntArray | None = None) -> Snapsh
     links : ndarray of int, shape (n, 2), optional
         What counts as bonded; by default the bonds of the topology.
     """
-    pairs = snapshot.topology.bonds if links is None else links
-    atoms, parents, _ = spanning_tree(pairs, snapshot.topology.n_atoms)
-    x = make_whole(snapshot.positions, atoms, parents, snapshot.lattice)
+    if snapshot.lattice is None:
+        return snapshot
+    tree = spanning_tree(snapshot.topology.bonds if links is None else links, snapshot.topology.n_atoms)
+    x = make_whole(snapshot.positions, *tree, snapshot.lattice)
     return snapshot if np.array_equal(x, snapshot.positions) else replace(snapshot, positions=x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,6 @@ from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis.check.constraint_check import ConstraintCheck
 from kcons.mdanalysis.check.files.file_precision import precision_of
 from kcons.mdanalysis.check.files.target_file import TargetFile
-from kcons.mdanalysis.check.memory import give_back
 from kcons.mdanalysis.check.result import CheckResult
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of
@@ -85,9 +86,9 @@ def check_trajectory(
         given = str(targets)
     check = ConstraintCheck(universe, constraints, targets=file or given, names=names, **options)
     if text is not None:
-        check.target_text = text
+        check.asked.target_text = text
     if guessed:
-        check.remarks.append(
+        check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
             "topology with bonds, such as PSF, PRMTOP or TPR"
         )
@@ -127,3 +128,14 @@ def _slice(frames: str | None) -> dict[str, int | None]:
     if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
         raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
     return dict(zip(("start", "stop", "step"), numbers, strict=False))
+
+
+def give_back() -> None:
+    """Let the C library return freed pages; parsing a large topology and setting up leave tens of megabytes of them.
+
+    Does nothing where the library is not glibc, whose heap shrinks by itself only at its end.
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

@@ -44,7 +44,7 @@ class Pieces:
         kept = np.zeros(n_atoms, dtype=bool)
         kept[np.isin(label, label[atoms])] = True
         self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
-        self._starts, self._ends, _ = neighbour_lists(self.bonds, n_atoms)
+        self._starts, self._ends = neighbour_lists(self.bonds, n_atoms)
         self.label = label
         self._walk(np.flatnonzero(kept))
 
