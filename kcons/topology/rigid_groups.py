@@ -77,15 +77,18 @@ class Waters:
         return Waters(self.triples[held], sites)
 
     def rows(self, geometry: tuple[float, float] | None, angstrom: float) -> list[Constraint]:
-        """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""
-        if not len(self.triples):
-            return []
-        pairs = self.triples[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
-        if geometry is None:
-            return [Distance(pairs)]
-        length, angle = geometry
-        lengths = np.array([length, length, 2 * length * np.sin(np.radians(angle) / 2)]) * angstrom
-        return [Distance(pairs, np.tile(lengths, len(self.triples)))]
+        """See `water_rows`."""
+        return [water_rows(self.triples, geometry, angstrom)] if len(self.triples) else []
+
+
+def water_rows(triples: IntArray, geometry: tuple[float, float] | None, angstrom: float = 1.0) -> Distance:
+    """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""
+    pairs = triples[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
+    if geometry is None:
+        return Distance(pairs)
+    length, angle = geometry
+    lengths = np.array([length, length, 2 * length * np.sin(np.radians(angle) / 2)]) * angstrom
+    return Distance(pairs, np.tile(lengths, len(triples)))
 
 
 def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: float = 0.0) -> Waters:
