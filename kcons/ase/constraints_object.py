@@ -16,7 +16,7 @@ from kcons.ase.binding import Binding, applied_forces, bind, check_company, touc
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
-from kcons.ase.virial import VOIGT, constraint_virial
+from kcons.ase.virial import VOIGT, virial_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
@@ -72,16 +72,7 @@ class Constraints(FixConstraint):
         degenerate: Literal["convert", "raise"] = "convert",
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
-        if isinstance(constraints, Constraint):
-            constraints = (constraints,)
-        self.constraints: tuple[Constraint, ...] = tuple(
-            families.from_dict(item) if isinstance(item, Mapping) else item for item in constraints
-        )
-        for item in self.constraints:
-            if not isinstance(item, Constraint):
-                raise InputError(
-                    f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE", item="constraints"
-                )
+        self.constraints = _listed(constraints)
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         self.degenerate = degenerate
@@ -119,13 +110,7 @@ class Constraints(FixConstraint):
 
     def _bind(self, atoms: Atoms) -> Binding:
         given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
-        for item in given:
-            if item.moving or not item.holonomic:
-                what = "moves with time" if item.holonomic else "constrains velocities"
-                raise UnsupportedError(
-                    f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
-                    "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
-                )
+        _refuse_moving(given)
         bound = bind(given, atoms, self.degenerate)
         self.constraints = bound.given
         self._repeated = None
@@ -215,13 +200,8 @@ class Constraints(FixConstraint):
         derivative of the energy under a strain after which the constraints are restored. Rows with a place
         in space count as external forces and have no part.
         """
-        motion = self._bound(atoms).motion
-        x = atoms.arrays["positions"]
-        masses = atoms.get_masses()[:, None]
-        v = np.zeros_like(x)
-        if "momenta" in atoms.arrays:
-            np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
-        stress -= constraint_virial(motion, x, v, applied_forces(atoms))[VOIGT] / atoms.get_volume()
+        virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
+        stress -= virial[VOIGT] / atoms.get_volume()
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
@@ -350,6 +330,30 @@ class Constraints(FixConstraint):
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
         velocities = atoms.get_velocities() if "momenta" in atoms.arrays else None
         return self.engine(atoms).report(atoms.arrays["positions"], velocities)
+
+
+def _listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
+    """Constraints, those that are given as plain data made anew."""
+    if isinstance(constraints, Constraint):
+        return (constraints,)
+    result = tuple(families.from_dict(item) if isinstance(item, Mapping) else item for item in constraints)
+    for item in result:
+        if not isinstance(item, Constraint):
+            raise InputError(
+                f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE", item="constraints"
+            )
+    return result
+
+
+def _refuse_moving(given: Iterable[Constraint]) -> None:
+    """Raise `UnsupportedError` for what needs the time, or the time step."""
+    for item in given:
+        if item.moving or not item.holonomic:
+            what = "moves with time" if item.holonomic else "constrains velocities"
+            raise UnsupportedError(
+                f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
+                "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
+            )
 
 
 def _in_place(project: Callable[..., FloatArray], values: FloatArray, *arguments: FloatArray) -> None:

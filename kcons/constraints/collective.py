@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import COMPILED_WIDTH
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import dot, first_true, norm
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.vectors import dot, norm
+from kcons.errors import InputError
 
 
 class MassWeighted(Constraint):
@@ -30,19 +30,6 @@ class MassWeighted(Constraint):
                 item="masses",
             )
         return self.masses
-
-    def _refuse_nonpositive(self, time: float, first_row: int) -> None:
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        k = first_true(~(target > 0))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is not positive; "
-                "give a length greater than zero, or None to hold the present one",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
 
 
 class CenterOfMass(MassWeighted):
@@ -167,15 +154,12 @@ class CenterDistance(MassWeighted):
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         if self.n_rows == 0:
             return
-        k = first_true(self.measure(r, time) == 0)
-        if k is not None:
-            raise SingularGeometryError(
-                f"the two centres of row {first_row + k}, {self.row_name(k)}, coincide: gradient undefined; "
-                "move the groups apart",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
-        self._refuse_nonpositive(time, first_row)
+        self.refuse_singular(
+            self.measure(r, time) == 0,
+            first_row,
+            lambda k, row: f"the two centres of {row}, coincide: gradient undefined; move the groups apart",
+        )
+        self.refuse_nonpositive(time, first_row)
 
 
 class RadiusOfGyration(MassWeighted):
@@ -231,14 +215,12 @@ class RadiusOfGyration(MassWeighted):
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         if self.n_rows == 0:
             return
-        k = first_true(self.measure(r, time) == 0)
-        if k is not None:
-            raise SingularGeometryError(
-                f"all atoms of row {first_row + k}, {self.row_name(k)}, coincide: gradient undefined; move them apart",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
-        self._refuse_nonpositive(time, first_row)
+        self.refuse_singular(
+            self.measure(r, time) == 0,
+            first_row,
+            lambda k, row: f"all atoms of {row}, coincide: gradient undefined; move them apart",
+        )
+        self.refuse_nonpositive(time, first_row)
 
 
 def _about_center(w: FloatArray, r: FloatArray) -> FloatArray:
