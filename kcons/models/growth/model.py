@@ -79,6 +79,24 @@ def positive_populations(x: ArrayLike) -> FloatArray:
     return array
 
 
+def starting_logarithms(x0: ArrayLike | None, log_x0: ArrayLike | None) -> FloatArray:
+    """ln x of a start that is given as populations or as their logarithms.
+
+    Raises
+    ------
+    InputError
+        Both or none; populations that are negative, zero or not finite; logarithms that are not finite.
+    """
+    if (x0 is None) == (log_x0 is None):
+        raise InputError("give the start either as x0 or as log_x0", item="x0")
+    if x0 is not None:
+        return np.log(positive_populations(x0))
+    start = numbers(log_x0, "log_x0").copy()
+    if not np.all(np.isfinite(start)):
+        raise InputError("log_x0 is not finite", item="log_x0")
+    return start
+
+
 class GrowthModel:
     """Relative rates phi(t, x) and sources Psi(t, x).
 
@@ -129,6 +147,13 @@ class GrowthModel:
                 item="sources",
             )
         return psi
+
+    def not_finite(self, p: Populations) -> tuple[str, int] | None:
+        """'rate' or 'source', and the first species of which it is not finite; None if all are."""
+        for what, values in (("rate", self.rates(p)), ("source", self.sources(p))):
+            if values is not None and not np.all(np.isfinite(values)):
+                return what, int(np.argwhere(~np.isfinite(values))[0][0])
+        return None
 
     def drift(self, p: Populations) -> FloatArray:
         """Psi + G phi: dx/dt without constraints (notes eq. 124)."""
