@@ -10,6 +10,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.holding import Holding, Options, with_options
