@@ -24,6 +24,7 @@ from kcons.topology.topology import (
     selected_numbers,
     sorted_pairs,
     split_residues,
+    whole_numbers,
 )
 
 __all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "snapshot_of"]
@@ -165,7 +166,7 @@ def atoms_of(snapshot: Snapshot) -> Atoms:
     atoms.new_array("atomtypes", topology.names)
     if topology.residues_known:
         atoms.new_array("residuenames", topology.residue_names[topology.residues])
-        atoms.new_array("residuenumbers", _as_integers(topology.residue_ids)[topology.residues])
+        atoms.new_array("residuenumbers", whole_numbers(topology.residue_ids)[topology.residues])
         atoms.new_array("chainids", topology.chains[topology.residues])
     if topology.charges is not None:
         atoms.set_initial_charges(topology.charges)
@@ -206,8 +207,3 @@ def _mended(
         masses = masses.copy()
         masses[wrong] = [standard[s] for s in by_name[wrong].tolist()]
     return elements, masses
-
-
-def _as_integers(ids: NDArray[np.str_]) -> IntArray:
-    digits = [("".join(c for c in text if c.isdigit() or c == "-") or "0") for text in ids.tolist()]
-    return np.array([int(d) for d in digits] or [], dtype=np.int64)

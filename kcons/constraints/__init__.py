@@ -54,30 +54,12 @@ __all__ = [
     "from_dict",
 ]
 
-_CLASSES: tuple[type[Constraint], ...] = (
-    Angle,
-    CenterDistance,
-    CenterOfMass,
-    Custom,
-    CustomVelocity,
-    Cylinder,
-    Dihedral,
-    Distance,
-    Ellipsoid,
-    FixedAtoms,
-    ImplicitSurface,
-    KnifeEdge,
-    Line,
-    LinearCombination,
-    LinearRelation,
-    LinearVelocity,
-    Plane,
-    RadiusOfGyration,
-    Rolling,
-    Sphere,
-    Torus,
-)
-FAMILIES: dict[str, type[Constraint]] = {each.family: each for each in _CLASSES}
+_PUBLIC = [globals()[name] for name in __all__ if name in globals()]
+FAMILIES: dict[str, type[Constraint]] = {
+    each.family: each
+    for each in _PUBLIC
+    if isinstance(each, type) and issubclass(each, Constraint) and each is not Constraint
+}
 
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:

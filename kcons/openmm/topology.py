@@ -15,7 +15,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
-from kcons.topology.topology import Snapshot, Topology, selected_numbers, sorted_pairs
+from kcons.topology.topology import Snapshot, Topology, require_standard_form, selected_numbers, sorted_pairs
 
 __all__ = ["bonds_of", "constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -175,13 +175,7 @@ def reduced(cell: FloatArray) -> FloatArray:
     InputError
         A cell that would have to be turned, which would turn the positions too.
     """
-    size = float(np.abs(cell).max())
-    if np.abs(np.triu(cell, 1)).max() > 1e-6 * size or np.diag(cell).min() <= 0:
-        raise InputError(
-            "OpenMM wants the first cell vector along x, the second in the xy plane; turn cell and positions "
-            "(ase: atoms.cell.standard_form()) before",
-            item="cell",
-        )
+    require_standard_form(cell, "OpenMM", positive=True)
     a, b, c = np.tril(cell)
     c = c - b * np.round(c[1] / b[1])
     c = c - a * np.round(c[0] / a[0])

@@ -367,6 +367,28 @@ def _formula(symbols: StrArray, counts: IntArray) -> str:
     return "".join(f"{s}{present[s] if present[s] > 1 else ''}" for s in order)
 
 
+def whole_numbers(ids: StrArray) -> IntArray:
+    """Numbers of residues whose ids may have letters; 0 where there are no digits."""
+    digits = ["".join(c for c in text if c.isdigit() or c == "-") or "0" for text in ids.tolist()]
+    return np.array([int(d) for d in digits], dtype=np.int64)
+
+
+def require_standard_form(cell: FloatArray, engine: str, positive: bool = False) -> None:
+    """Refuse a cell that would have to be turned, and the positions with it; if `positive`, also one turned inside out.
+
+    Raises
+    ------
+    InputError
+    """
+    turned = np.abs(np.triu(cell, 1)).max() > 1e-6 * np.abs(cell).max()
+    if turned or (positive and np.diag(cell).min() <= 0):
+        raise InputError(
+            f"{engine} wants the first cell vector along x, the second in the xy plane; turn cell and positions "
+            "(ase: atoms.cell.standard_form()) before",
+            item="cell",
+        )
+
+
 # -- messages -------------------------------------------------------------------------------------
 
 

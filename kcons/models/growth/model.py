@@ -9,8 +9,9 @@ For this reason every function here is handed `Populations`, which hold both x a
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError, NonFiniteError
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
 
@@ -169,6 +171,16 @@ class GrowthModel:
     def take(self, lanes: NDArray[np.intp]) -> GrowthModel:
         """The model of some of N systems side by side; itself where parameters are common to all."""
         return self
+
+
+def taken(item: T, lanes: NDArray[np.intp], *names: str) -> T:
+    """A copy of which arrays of one entry a system, in their last axis, hold some of the systems only."""
+    part = copy.copy(item)
+    for name in names:
+        values = getattr(item, name)
+        if np.ndim(values):
+            setattr(part, name, np.asarray(values)[..., lanes])
+    return part
 
 
 def evaluate(function: OfState, p: Populations, n: int, vectorized: bool, what: str) -> FloatArray:
