@@ -48,16 +48,6 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     ----------
     atoms : ase.Atoms
     **options
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        As `kcons.topology.held_rows`.
     """
     numbers = partial(selected_numbers, n=len(atoms))
     return rows_of(snapshot_of(atoms), Holding(constrain, **options), numbers, _REMEDY)

@@ -22,6 +22,19 @@ class MassWeighted(Constraint):
     """Rows that need the masses of their atoms."""
 
     uses_masses = True
+    #: What is at one point where a length vanishes and has no gradient, and what to do; not for components.
+    singular_where: ClassVar[tuple[str, str] | None] = None
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0 or self.singular_where is None:
+            return
+        what, remedy = self.singular_where
+        self.refuse_singular(
+            self.measure(r, time) == 0,
+            first_row,
+            lambda k, row: f"{what} of {row}, coincide: gradient undefined; {remedy}",
+        )
+        self.refuse_nonpositive(time, first_row)
 
     def _mass_table(self) -> FloatArray:
         if self.masses is None:
@@ -108,6 +121,7 @@ class CenterDistance(MassWeighted):
     """
 
     family = "CenterDistance"
+    singular_where = ("the two centres", "move the groups apart")
     translation_invariant = True
     shared = ("split",)
     split: int
@@ -151,16 +165,6 @@ class CenterDistance(MassWeighted):
         across = np.cross(d / q[:, None], w)
         return dot(across, across) / q
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        self.refuse_singular(
-            self.measure(r, time) == 0,
-            first_row,
-            lambda k, row: f"the two centres of {row}, coincide: gradient undefined; move the groups apart",
-        )
-        self.refuse_nonpositive(time, first_row)
-
 
 class RadiusOfGyration(MassWeighted):
     """Radius of gyration of a group about its centre C, q = sqrt(sum_i w_i |r_i - C|^2), sum w_i = 1.
@@ -183,6 +187,7 @@ class RadiusOfGyration(MassWeighted):
     """
 
     family = "RadiusOfGyration"
+    singular_where = ("all atoms", "move them apart")
     translation_invariant = True
     shared = ("mass_weighted",)
 
@@ -211,16 +216,6 @@ class RadiusOfGyration(MassWeighted):
         q = np.sqrt(np.einsum("ka,kai,kai->k", w, s, s))
         rate = np.einsum("ka,kai,kai->k", w, s, u) / q
         return np.asarray((np.einsum("ka,kai,kai->k", w, u, u) - rate**2) / q)
-
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        self.refuse_singular(
-            self.measure(r, time) == 0,
-            first_row,
-            lambda k, row: f"all atoms of {row}, coincide: gradient undefined; move them apart",
-        )
-        self.refuse_nonpositive(time, first_row)
 
 
 def _about_center(w: FloatArray, r: FloatArray) -> FloatArray:

@@ -185,19 +185,28 @@ class Constraint(ABC):
             name = f"row {row}, {self.row_name(k)}"
             raise SingularGeometryError(say(k, name), rows=[row], atoms=self.atoms[k].tolist())
 
+    def refuse_input(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int], str], item: str) -> None:
+        """Raise `InputError` for the first row that is marked, with what `say` says of it; `item` is at fault."""
+        k = first_true(bad)
+        if k is not None:
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
+            )
+
     def refuse_nonpositive(self, time: float, first_row: int, what: str = "target") -> None:
         """Raise `InputError` where a length held is not positive; `what` it is called by."""
         if self.target is None:
             return
         length = self.target_at(time)
-        k = first_true(~(length > 0))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: {what} {length[k]:g} is not positive; "
-                "give a length greater than zero, or None to hold the present one",
-                item=what,
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_input(
+            ~(length > 0),
+            first_row,
+            lambda k: (
+                f"{what} {length[k]:g} is not positive; give a length greater than zero, or None to hold the present "
+                "one"
+            ),
+            what,
+        )
 
     def with_masses(self, masses: FloatArray) -> Constraint:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""

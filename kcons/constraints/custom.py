@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
-from kcons.constraints.vectors import first_true
 from kcons.errors import InputError
 
 #: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
@@ -146,15 +145,15 @@ class FunctionRows(Constraint):
             )
 
     def _compare(self, name: str, given: FloatArray, found: FloatArray, size: FloatArray, first_row: int) -> None:
-        k = first_true(~(np.abs(given - found) <= _WRONG * size))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: {name} gives {given[k]:.6g} along a test direction, but "
-                f"differences of the function give {found[k]:.6g}; correct it, or give the length over which the "
-                "function varies (length=...)",
-                item=name,
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_input(
+            ~(np.abs(given - found) <= _WRONG * size),
+            first_row,
+            lambda k: (
+                f"{name} gives {given[k]:.6g} along a test direction, but differences of the function give "
+                f"{found[k]:.6g}; correct it, or give the length over which the function varies (length=...)"
+            ),
+            name,
+        )
 
 
 class ImplicitSurface(FunctionRows):

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import cross, dot, first_true, norm
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.vectors import cross, dot, norm
+from kcons.errors import SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
@@ -142,14 +142,12 @@ class Angle(Constraint):
         if self.target is None:
             return
         target = self.target_at(time)
-        k = first_true((target < -COLLINEAR) | (target > np.pi + COLLINEAR))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is no angle between 0 and pi; "
-                "targets are in radian",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_input(
+            (target < -COLLINEAR) | (target > np.pi + COLLINEAR),
+            first_row,
+            lambda k: f"target {target[k]:g} is no angle between 0 and pi; targets are in radian",
+            "target",
+        )
         self._refuse_straight(target, "has the target", first_row)
 
     def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:

@@ -314,14 +314,13 @@ class Ellipsoid(Constraint):
         )
         if self.target is None:
             return
-        k = first_true(~(self.target_at(time) > -self._size))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {self.target_at(time)[k]:g} lies beyond the "
-                "centre of the ellipsoid; use 0 for its surface",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        target = self.target_at(time)
+        self.refuse_input(
+            ~(target > -self._size),
+            first_row,
+            lambda k: f"target {target[k]:g} lies beyond the centre of the ellipsoid; use 0 for its surface",
+            "target",
+        )
 
 
 class Plane(LinearRows):

@@ -29,16 +29,6 @@ def constraints_of(universe: Any, constrain: str | None = "hbonds", **options: U
     universe : Universe or AtomGroup
         Atoms of a group are counted within the group; those of a Universe as it counts them.
     **options
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        Selections that match nothing, unknown names, no coordinates, masses, elements or bonds.
     """
     group = universe.atoms
     local = not isinstance(universe, MDAnalysis.Universe)

@@ -43,16 +43,6 @@ def constraints_of(
     system : openmm.System, optional
         Where the masses are taken from; otherwise they are those of the elements.
     **options
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        As `kcons.topology.held_rows`.
     """
     snapshot = snapshot_of(topology, positions, system=system)
     numbers = partial(selected_numbers, n=snapshot.topology.n_atoms)

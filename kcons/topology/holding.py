@@ -153,10 +153,29 @@ class Holding:
         return (length, angle), 0.0
 
 
-def with_options(function: F) -> F:
-    """Write the options of `Holding` into the documentation and the signature of a function that takes them.
+#: What functions with these options give and refuse.
+_RETURNS = """
 
-    They take the place of ``**options``, which comes last among the parameters in the docstring.
+Returns
+-------
+HeldRows
+    A list of constraints; ``.constraint_set`` has them as a set.
+
+Raises
+------
+InputError
+    Selections that match nothing, unknown names, no coordinates, masses, elements or bonds.
+
+Warns
+-----
+UserWarning
+    If bonds were guessed without being asked for."""
+
+
+def with_options(function: F) -> F:
+    """Write the options of `Holding`, and what comes back, into documentation and signature of a function.
+
+    They take the place of ``**options``, which ends the docstring of the function.
     """
     signature = inspect.signature(function)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
@@ -164,6 +183,6 @@ def with_options(function: F) -> F:
     more = [p.replace(kind=p.KEYWORD_ONLY) for p in options if p.name not in signature.parameters]
     function.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
     if function.__doc__ and Holding.__doc__:  # python -OO has none
-        described = inspect.cleandoc(Holding.__doc__).partition("----------\n")[2].replace("\n", "\n    ")
-        function.__doc__ = function.__doc__.replace("**options", described, 1)
+        described = inspect.cleandoc(Holding.__doc__).partition("----------\n")[2] + _RETURNS
+        function.__doc__ = inspect.cleandoc(function.__doc__).replace("**options", described, 1)
     return function
