@@ -5,7 +5,7 @@ whole set and solves it as one. Units are ASE's; targets are in angstrom and rad
 the object with ASE, which makes files that contain it readable.
 
 - `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
-- `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
+- `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `virial`: the stress of the constraint forces
 - `calculator`: forces along the constraints, for optimisers
 - `dynamics`, `thermostat_dynamics`: dynamics with any stepper

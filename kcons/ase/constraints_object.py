@@ -13,13 +13,13 @@ from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
+from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
-from kcons.ase.virial import VOIGT, constraint_virial
+from kcons.ase.virial import VOIGT, virial_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, KconsError, UnsupportedError
 from kcons.motion.certificate import CHECK_EVERY
@@ -30,9 +30,6 @@ __all__ = ["Constraints", "constrain"]
 
 #: Name in ASE's registry and in files.
 REGISTERED_NAME = "KconsConstraints"
-
-#: Families whose target is an absolute position: replicas take theirs from where they are.
-_PLACED = ("FixedAtoms", "LinearCombination", "LinearRelation", "CenterOfMass", "Plane", "Line")
 
 
 class Constraints(FixConstraint):
@@ -75,16 +72,7 @@ class Constraints(FixConstraint):
         degenerate: Literal["convert", "raise"] = "convert",
         repeated: tuple[Sequence[int], int] | None = None,
     ) -> None:
-        if isinstance(constraints, Constraint):
-            constraints = (constraints,)
-        self.constraints: tuple[Constraint, ...] = tuple(
-            families.from_dict(item) if isinstance(item, Mapping) else item for item in constraints
-        )
-        for item in self.constraints:
-            if not isinstance(item, Constraint):
-                raise InputError(
-                    f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE", item="constraints"
-                )
+        self.constraints = _listed(constraints)
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
         self.degenerate = degenerate
@@ -121,14 +109,8 @@ class Constraints(FixConstraint):
         return bound
 
     def _bind(self, atoms: Atoms) -> Binding:
-        given = self._repaired(atoms) if self._repeated is not None else self.constraints
-        for item in given:
-            if item.moving or not item.holonomic:
-                what = "moves with time" if item.holonomic else "constrains velocities"
-                raise UnsupportedError(
-                    f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
-                    "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
-                )
+        given = self.constraints if self._repeated is None else led_across(self.constraints, atoms, *self._repeated)
+        _refuse_moving(given)
         bound = bind(given, atoms, self.degenerate)
         self.constraints = bound.given
         self._repeated = None
@@ -155,10 +137,7 @@ class Constraints(FixConstraint):
             self._on_surface = True
         asked = self._watch.ask(new)
         try:
-            if new.flags.c_contiguous and new.dtype == np.float64:
-                bound.motion.project_positions(new, old, out=new)
-            else:
-                new[...] = bound.motion.project_positions(new, old)
+            _in_place(bound.motion.project_positions, new, new, old)
             if self._positions_due <= 0:
                 self._certify_positions(bound.motion, new, asked)
             self._positions_due -= 1
@@ -221,13 +200,8 @@ class Constraints(FixConstraint):
         derivative of the energy under a strain after which the constraints are restored. Rows with a place
         in space count as external forces and have no part.
         """
-        motion = self._bound(atoms).motion
-        x = atoms.arrays["positions"]
-        masses = atoms.get_masses()[:, None]
-        v = np.zeros_like(x)
-        if "momenta" in atoms.arrays:
-            np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
-        stress -= constraint_virial(motion, x, v, applied_forces(atoms))[VOIGT] / atoms.get_volume()
+        virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
+        stress -= virial[VOIGT] / atoms.get_volume()
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:
         """Refuse a cell in which a row would be longer than half the box, before ASE takes it; changes nothing."""
@@ -243,10 +217,7 @@ class Constraints(FixConstraint):
     def _project_covector(self, atoms: Atoms, values: FloatArray) -> None:
         motion = self._bound(atoms).motion
         x = atoms.arrays["positions"]
-        if values.flags.c_contiguous and values.dtype == np.float64:
-            motion.project_forces(x, values, out=values)
-        else:
-            values[...] = motion.project_forces(x, values)
+        _in_place(motion.project_forces, values, x, values)
 
     def get_removed_dof(self, atoms: Atoms) -> int:
         """The rank of the rows, which may be less than their number."""
@@ -266,18 +237,10 @@ class Constraints(FixConstraint):
         """
         if self._repeated is not None:
             self._bind(atoms)
-        n = len(atoms)
-        old = np.arange(n)[ind]
-        new_index = np.full(n, -1, dtype=np.int64)
-        new_index[old] = np.arange(len(old))
-        kept = []
-        for item in self.constraints:
-            inside = np.flatnonzero((new_index[item.atoms] >= 0).all(axis=1))
-            if len(inside):
-                kept.append((item if len(inside) == item.n_rows else item.select(inside)).renumbered(new_index))
+        kept = within(self.constraints, np.arange(len(atoms))[ind], len(atoms))
         if not kept:
             raise IndexError("no constraint lies within the slice")
-        self.constraints = tuple(kept)
+        self.constraints = kept
         self._binding = None
 
     def repeat(self, m: int | Sequence[int], n: int) -> Constraints:
@@ -294,46 +257,10 @@ class Constraints(FixConstraint):
         times = (m, m, m) if isinstance(m, int | np.integer) else (int(m[0]), int(m[1]), int(m[2]))
         if self._repeated is not None:
             raise UnsupportedError("repeated twice before the first use; repeat once, by the product of the numbers")
-        copies = times[0] * times[1] * times[2]
-        result = []
-        for item in self.constraints:
-            if not item.translation_invariant and item.family not in _PLACED:
-                raise UnsupportedError(
-                    f"{item!r} has a place in space and cannot be repeated; remove it with atoms.set_constraint() "
-                    "and add one for each replica afterwards"
-                )
-            tiled = item.select(np.tile(np.arange(item.n_rows), copies))
-            tiled.atoms = tiled.atoms + n * np.repeat(np.arange(copies), item.n_rows)[:, None]
-            result.append(tiled if item.translation_invariant else tiled.with_target(None))
-        self.constraints = tuple(result)
+        self.constraints = tiled(self.constraints, times, n)
         self._repeated = (times, int(n))
         self._binding = None
         return self
-
-    def _repaired(self, atoms: Atoms) -> tuple[Constraint, ...]:
-        """Rows of a repeated cell, those across its old boundary led to the neighbouring replica."""
-        assert self._repeated is not None
-        times, n = self._repeated
-        if not atoms.pbc.any() or len(atoms) < n * times[0] * times[1] * times[2]:
-            return self.constraints
-        x = atoms.arrays["positions"]
-        cell = atoms.cell.array / np.array(times)[:, None]
-        copies = int(np.prod(times))
-        first = [item.select(np.arange(item.n_rows // copies)) for item in self.constraints]
-        one = ConstraintSet(first, x[:n], atoms.get_masses()[:n], cell=cell, pbc=atoms.pbc)
-        assert one.lattice is not None
-        result = []
-        for item, bound in zip(self.constraints, one.constraints, strict=True):
-            if item.relative:
-                replica, base = np.divmod(item.atoms, n)
-                place = np.stack(np.unravel_index(replica, times), axis=-1)
-                apart = one.gather(bound, x[:n]) - x[bound.atoms]
-                cells = np.round((apart - apart[:, :1]) @ one.lattice[1]).astype(np.int64)
-                place = (place + np.tile(cells, (copies, 1, 1))) % np.array(times)
-                item = item.with_target(item.target)
-                item.atoms = np.ravel_multi_index(tuple(np.moveaxis(place, -1, 0)), times) * n + base
-            result.append(item)
-        return tuple(result)
 
     # -- copies and files -----------------------------------------------------------------------
 
@@ -403,6 +330,38 @@ class Constraints(FixConstraint):
         """Rows, rank, degrees of freedom, residuals and solvers at the present positions and velocities."""
         velocities = atoms.get_velocities() if "momenta" in atoms.arrays else None
         return self.engine(atoms).report(atoms.arrays["positions"], velocities)
+
+
+def _listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
+    """Constraints, those that are given as plain data made anew."""
+    if isinstance(constraints, Constraint):
+        return (constraints,)
+    result = tuple(families.from_dict(item) if isinstance(item, Mapping) else item for item in constraints)
+    for item in result:
+        if not isinstance(item, Constraint):
+            raise InputError(
+                f"{item!r} is no kcons constraint; from_ase_constraints translates those of ASE", item="constraints"
+            )
+    return result
+
+
+def _refuse_moving(given: Iterable[Constraint]) -> None:
+    """Raise `UnsupportedError` for what needs the time, or the time step."""
+    for item in given:
+        if item.moving or not item.holonomic:
+            what = "moves with time" if item.holonomic else "constrains velocities"
+            raise UnsupportedError(
+                f"{item!r} {what}; ASE's own dynamics give constraints neither time nor time step. Give it to "
+                "kcons.ase.ConstrainedDynamics(atoms, timestep, constraints=[...]), or use kcons.steppers"
+            )
+
+
+def _in_place(project: Callable[..., FloatArray], values: FloatArray, *arguments: FloatArray) -> None:
+    """Write what `project` gives into `values`, by its own way where it can."""
+    if values.flags.c_contiguous and values.dtype == np.float64:
+        project(*arguments, out=values)
+    else:
+        values[...] = project(*arguments)
 
 
 def constrain(

@@ -187,16 +187,8 @@ class ConstrainedDynamics(MolecularDynamics):
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
         self.time = after.time
-        self._state = State(
-            after.positions,
-            v,
-            after.time,
-            after.forces,
-            after.step,
-            after.remainder,
-            after.time_remainder,
-            after.thermostat,
-        )
+        carried = after.remainder, after.time_remainder, after.thermostat
+        self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
 
     def _name_step(self, error: BaseException, number: int) -> None:
         if getattr(error, "step", None) is None:
@@ -236,7 +228,7 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        cell = atoms.cell.array.tobytes() + atoms.pbc.tobytes()
+        cell = _cell_of(atoms)
         same = unmoved = last is not None and cell == self._cell
         if last is not None and same:
             if _plain(x) and _plain(p):
@@ -280,7 +272,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._momenta, _ = self._put(x, v)
         self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-        self._cell = self.atoms.cell.array.tobytes() + self.atoms.pbc.tobytes()
+        self._cell = _cell_of(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
@@ -332,6 +324,10 @@ class ConstrainedDynamics(MolecularDynamics):
             return applied_forces(self.atoms)
         forces: ArrayLike = self.atoms.get_forces(apply_constraint=False)
         return forces
+
+
+def _cell_of(atoms: Atoms) -> bytes:
+    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes())
 
 
 def _plain(values: Any) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
+from kcons.topology.rigid_groups import water_rows
 
 #: O-H length in Angstrom and H-O-H angle in degrees. Jorgensen et al., J. Chem. Phys. 79, 926 (1983).
 TIP3P = (0.9572, 104.52)
@@ -57,14 +58,8 @@ def rigid_water(
             f"(within {reach:g} Angstrom); reorder the atoms, or hold them with Distance",
             item="atoms",
         )
-    o, h1, h2 = oxygen, oxygen + 1, oxygen + 2
-    pairs = np.stack([np.stack([o, h1], 1), np.stack([o, h2], 1), np.stack([h1, h2], 1)], axis=1).reshape(-1, 2)
-    if geometry is None:
-        return Distance(pairs)
     if isinstance(geometry, str):
         if geometry.lower() != "tip3p":
             raise InputError(f"unknown water geometry {geometry!r}; give 'tip3p' or (length, angle)", item="geometry")
         geometry = TIP3P
-    length, angle = geometry
-    lengths = [length, length, 2 * length * np.sin(np.radians(angle) / 2)]
-    return Distance(pairs, np.tile(lengths, len(oxygen)))
+    return water_rows(oxygen[:, None] + np.arange(3), geometry)

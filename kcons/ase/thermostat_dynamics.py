@@ -23,7 +23,21 @@ from kcons.thermostats.isokinetic.isokinetic import Convention
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
-    """What the thermostats share: `save` and `restart`, and the temperature by the degrees of freedom they act on."""
+    """What the thermostats share: `save` and `restart`, and the temperature by the degrees of freedom they act on.
+
+    Parameters
+    ----------
+    atoms, timestep
+        As for `ConstrainedDynamics`.
+    stepper : Isokinetic, Langevin or NoseHooverChain
+    restart : path, optional
+        File written by `save`.
+    **kwargs
+        As for `ConstrainedDynamics`.
+    """
+
+    #: Of the thermostat, beside the temperature.
+    _options: dict[str, Any]
 
     def __init__(
         self,
@@ -70,6 +84,9 @@ class ThermostattedDynamics(ConstrainedDynamics):
         with another seed, a Nose-Hoover chain from rest.
         """
         self.state.save(file)
+
+    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
+        return None if last is None else last.thermostat
 
     @property
     def thermostat_degrees_of_freedom(self) -> int:
@@ -119,10 +136,8 @@ class IsokineticDynamics(ThermostattedDynamics):
         Whether total momentum is conserved, and takes degrees of freedom. 'auto' asks the calculator for forces at
         one to three shifted places at the start; with forces that add up to nothing only roughly (plane waves, particle
         mesh), say which.
-    restart : path, optional
-        File written by `save`.
     **kwargs
-        As for `ConstrainedDynamics`.
+        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -144,16 +159,10 @@ class IsokineticDynamics(ThermostattedDynamics):
         convention: Convention = "exact",
         indices: ArrayLike | None = None,
         momentum: Momentum = "auto",
-        restart: str | PathLike[str] | None = None,
         **kwargs: Any,
     ) -> None:
-        self._options: dict[str, Any] = {
-            "order": order,
-            "convention": convention,
-            "atoms": indices,
-            "momentum": momentum,
-        }
-        super().__init__(atoms, timestep, self._stepper(temperature_K), restart=restart, **kwargs)
+        self._options = {"order": order, "convention": convention, "atoms": indices, "momentum": momentum}
+        super().__init__(atoms, timestep, self._stepper(temperature_K), **kwargs)
 
     def _stepper(self, temperature_K: float | None) -> Isokinetic:
         thermal = None if temperature_K is None else units.kB * positive(temperature_K, "temperature_K")
@@ -164,6 +173,9 @@ class IsokineticDynamics(ThermostattedDynamics):
         self.stepper = self._stepper(positive(temperature_K, "temperature_K"))
         self._state = replace(self._start(self._systems()), thermostat=None)
         self._begin()
+
+    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
+        return None
 
     def get_temperature(self) -> float:
         """Temperature in K of the configurations, 2K/((g - 1) k)."""
@@ -196,10 +208,8 @@ class ConstrainedLangevin(ThermostattedDynamics):
         Friction and noise leave total momentum alone, which then takes degrees of freedom.
     substeps : int
         Flights along the constraints in each half of the step; more for fast rotations and large steps.
-    restart : path, optional
-        File written by `save`.
     **kwargs
-        As for `ConstrainedDynamics`.
+        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -217,14 +227,13 @@ class ConstrainedLangevin(ThermostattedDynamics):
         rng: int | np.random.Generator | None = None,
         fixcm: bool = False,
         substeps: int = 3,
-        restart: str | PathLike[str] | None = None,
         **kwargs: Any,
     ) -> None:
         #: Seed of the noise.
         self.seed = int(rng) if isinstance(rng, int | np.integer) else int(np.random.default_rng(rng).integers(2**63))
-        self._options: dict[str, Any] = {"substeps": substeps, "conserve_momentum": fixcm}
+        self._options = {"substeps": substeps, "conserve_momentum": fixcm}
         stepper = self._stepper(temperature_K, friction)
-        super().__init__(atoms, timestep, stepper, restart=restart, **kwargs)
+        super().__init__(atoms, timestep, stepper, **kwargs)
 
     def _stepper(self, temperature_K: float, friction: float) -> Langevin:
         return Langevin(units.kB * positive(temperature_K, "temperature_K"), friction, self.seed, **self._options)
@@ -239,9 +248,6 @@ class ConstrainedLangevin(ThermostattedDynamics):
         if self._options["conserve_momentum"]:
             count -= len(open_directions(self._systems().motion, self.atoms.positions, self.time))
         return count
-
-    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        return None if last is None else last.thermostat
 
 
 class ConstrainedNoseHoover(ThermostattedDynamics):
@@ -263,10 +269,8 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         Links of the chain.
     momentum : {'auto', 'conserved', 'free'}
         As for `IsokineticDynamics`.
-    restart : path, optional
-        File written by `save`.
     **kwargs
-        As for `ConstrainedDynamics`.
+        As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
     Raises
     ------
@@ -285,15 +289,10 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
         *,
         tchain: int = 3,
         momentum: Momentum = "auto",
-        restart: str | PathLike[str] | None = None,
         **kwargs: Any,
     ) -> None:
-        self._options: dict[str, Any] = {
-            "period": 2 * math.pi * positive(tdamp, "tdamp"),
-            "length": tchain,
-            "momentum": momentum,
-        }
-        super().__init__(atoms, timestep, self._stepper(temperature_K), restart=restart, **kwargs)
+        self._options = {"period": 2 * math.pi * positive(tdamp, "tdamp"), "length": tchain, "momentum": momentum}
+        super().__init__(atoms, timestep, self._stepper(temperature_K), **kwargs)
 
     def _stepper(self, temperature_K: float) -> NoseHooverChain:
         return NoseHooverChain(units.kB * positive(temperature_K, "temperature_K"), **self._options)
@@ -301,9 +300,6 @@ class ConstrainedNoseHoover(ThermostattedDynamics):
     def set_temperature(self, temperature_K: float) -> None:
         """Use another temperature from now on; the chain goes on."""
         self.stepper = self._stepper(temperature_K)
-
-    def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
-        return None if last is None else last.thermostat
 
 
 def draw_velocities(

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from functools import partial
+from typing import Unpack
 
 import numpy as np
 from ase import Atoms, units
 from ase.data import atomic_masses, atomic_numbers, chemical_symbols
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds
-from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology.holding import Holding, Options, with_options
+from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import (
     MASSES,
     Snapshot,
     Topology,
     elements_of,
-    selected_atoms,
     selected_numbers,
     sorted_pairs,
     split_residues,
+    whole_numbers,
 )
 
 __all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "snapshot_of"]
@@ -35,20 +36,8 @@ PS = 1000 * units.fs
 _REMEDY = "put pairs of atoms into atoms.info['bonds']"
 
 
-def constraints_of(
-    atoms: Atoms,
-    constrain: str | None = "hbonds",
-    *,
-    rigid_water: bool = True,
-    water_names: Iterable[str] = (),
-    water_geometry: str | tuple[float, float] | None = None,
-    rigid_residues: Iterable[str] = (),
-    rigid_bodies: Iterable[Sequence[int] | IntArray] = (),
-    on: Mapping[Any, RowMaker] | None = None,
-    select: ArrayLike | str = "all",
-    angles: Literal["angles", "distances"] = "angles",
-    guess_bonds: bool | Literal["missing"] = "missing",
-) -> HeldRows:
+@with_options
+def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Unpack[Options]) -> HeldRows:
     """Rows by name for ASE `Atoms`, in angstrom; give them to `kcons.ase.constrain`.
 
     Residues are those of ``atoms.arrays['residuenames']`` and ``['residuenumbers']``, as ASE reads them from PDB files;
@@ -58,38 +47,10 @@ def constraints_of(
     Parameters
     ----------
     atoms : ase.Atoms
-    constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
-        See `kcons.topology.rows_by_name.held_rows`.
-    on : mapping, optional
-        Tuples of atoms -> callable that makes a row of them.
-    select : 'all', mask or atoms
-        Rows are kept if all of their atoms are among these.
-    guess_bonds : bool or 'missing'
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        As `held_rows`.
+    **options
     """
-    return held_rows(
-        snapshot_of(atoms),
-        constrain,
-        rigid_water=rigid_water,
-        water_names=water_names,
-        water_geometry=water_geometry,
-        rigid_residues=rigid_residues,
-        rigid_bodies=rigid_bodies,
-        on=as_makers(on, lambda key: selected_numbers(key, len(atoms))),
-        selected=selected_atoms(select, len(atoms)),
-        angles=angles,
-        guess=guess_bonds,
-        remedy=_REMEDY,
-    )
+    numbers = partial(selected_numbers, n=len(atoms))
+    return rows_of(snapshot_of(atoms), Holding(constrain, **options), numbers, _REMEDY)
 
 
 def snapshot_of(atoms: Atoms) -> Snapshot:
@@ -195,7 +156,7 @@ def atoms_of(snapshot: Snapshot) -> Atoms:
     atoms.new_array("atomtypes", topology.names)
     if topology.residues_known:
         atoms.new_array("residuenames", topology.residue_names[topology.residues])
-        atoms.new_array("residuenumbers", _as_integers(topology.residue_ids)[topology.residues])
+        atoms.new_array("residuenumbers", whole_numbers(topology.residue_ids)[topology.residues])
         atoms.new_array("chainids", topology.chains[topology.residues])
     if topology.charges is not None:
         atoms.set_initial_charges(topology.charges)
@@ -236,8 +197,3 @@ def _mended(
         masses = masses.copy()
         masses[wrong] = [standard[s] for s in by_name[wrong].tolist()]
     return elements, masses
-
-
-def _as_integers(ids: NDArray[np.str_]) -> IntArray:
-    digits = [("".join(c for c in text if c.isdigit() or c == "-") or "0") for text in ids.tolist()]
-    return np.array([int(d) for d in digits] or [], dtype=np.int64)

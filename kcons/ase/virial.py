@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from ase import Atoms
 
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import Motion
@@ -33,3 +34,12 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
         push = lam[start : start + item.n_rows, None, None] * item.gradient(r, 0.0)
         virial += np.einsum("kai,kaj->ij", r - r[:, :1], push)
     return 0.5 * (virial + virial.T)
+
+
+def virial_of(motion: Motion, atoms: Atoms, forces: FloatArray) -> FloatArray:
+    """`constraint_virial` at the present positions and momenta, which are zero where there are none."""
+    x, masses = atoms.arrays["positions"], atoms.get_masses()[:, None]
+    v = np.zeros_like(x)
+    if "momenta" in atoms.arrays:
+        np.divide(atoms.arrays["momenta"], masses, out=v, where=masses > 0)
+    return constraint_virial(motion, x, v, forces)

@@ -1,13 +1,13 @@
 """What can be held: one kind of constraint a module.
 
-- `arguments`, `target`, `vectors`, `differences`: arrays from outside, targets, arithmetic
+- `arguments`, `target`, `vectors`: arrays from outside, targets and their derivatives, arithmetic
 - `constraint`: the contract of a family
 - `internal`: distances, angles, dihedrals
 - `linear`: fixed atoms, linear relations
 - `surface`, `collective`, `custom`: surfaces, groups, functions of one's own
 - `velocity`: rows linear in the velocities
 - `contradictions`: targets that exclude each other
-- `images`, `in_cell`: which periodic images rows mean, and the cell
+- `one_piece`, `images`, `in_cell`: which periodic images rows mean, and the cell
 - `constraint_set`: many constraints as one sigma, A and b
 """
 
@@ -54,30 +54,12 @@ __all__ = [
     "from_dict",
 ]
 
-_CLASSES: tuple[type[Constraint], ...] = (
-    Angle,
-    CenterDistance,
-    CenterOfMass,
-    Custom,
-    CustomVelocity,
-    Cylinder,
-    Dihedral,
-    Distance,
-    Ellipsoid,
-    FixedAtoms,
-    ImplicitSurface,
-    KnifeEdge,
-    Line,
-    LinearCombination,
-    LinearRelation,
-    LinearVelocity,
-    Plane,
-    RadiusOfGyration,
-    Rolling,
-    Sphere,
-    Torus,
-)
-FAMILIES: dict[str, type[Constraint]] = {each.family: each for each in _CLASSES}
+_PUBLIC = [globals()[name] for name in __all__ if name in globals()]
+FAMILIES: dict[str, type[Constraint]] = {
+    each.family: each
+    for each in _PUBLIC
+    if isinstance(each, type) and issubclass(each, Constraint) and each is not Constraint
+}
 
 
 def from_dict(data: Mapping[str, Any]) -> Constraint:

@@ -14,14 +14,27 @@ from numpy.typing import ArrayLike
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import COMPILED_WIDTH
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import dot, first_true, norm
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.vectors import dot, norm
+from kcons.errors import InputError
 
 
 class MassWeighted(Constraint):
     """Rows that need the masses of their atoms."""
 
     uses_masses = True
+    #: What is at one point where a length vanishes and has no gradient, and what to do; not for components.
+    singular_where: ClassVar[tuple[str, str] | None] = None
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0 or self.singular_where is None:
+            return
+        what, remedy = self.singular_where
+        self.refuse_singular(
+            self.measure(r, time) == 0,
+            first_row,
+            lambda k, row: f"{what} of {row}, coincide: gradient undefined; {remedy}",
+        )
+        self.refuse_nonpositive(time, first_row)
 
     def _mass_table(self) -> FloatArray:
         if self.masses is None:
@@ -30,19 +43,6 @@ class MassWeighted(Constraint):
                 item="masses",
             )
         return self.masses
-
-    def _refuse_nonpositive(self, time: float, first_row: int) -> None:
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        k = first_true(~(target > 0))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is not positive; "
-                "give a length greater than zero, or None to hold the present one",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
 
 
 class CenterOfMass(MassWeighted):
@@ -121,6 +121,7 @@ class CenterDistance(MassWeighted):
     """
 
     family = "CenterDistance"
+    singular_where = ("the two centres", "move the groups apart")
     translation_invariant = True
     shared = ("split",)
     split: int
@@ -164,19 +165,6 @@ class CenterDistance(MassWeighted):
         across = np.cross(d / q[:, None], w)
         return dot(across, across) / q
 
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        k = first_true(self.measure(r, time) == 0)
-        if k is not None:
-            raise SingularGeometryError(
-                f"the two centres of row {first_row + k}, {self.row_name(k)}, coincide: gradient undefined; "
-                "move the groups apart",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
-        self._refuse_nonpositive(time, first_row)
-
 
 class RadiusOfGyration(MassWeighted):
     """Radius of gyration of a group about its centre C, q = sqrt(sum_i w_i |r_i - C|^2), sum w_i = 1.
@@ -199,6 +187,7 @@ class RadiusOfGyration(MassWeighted):
     """
 
     family = "RadiusOfGyration"
+    singular_where = ("all atoms", "move them apart")
     translation_invariant = True
     shared = ("mass_weighted",)
 
@@ -227,18 +216,6 @@ class RadiusOfGyration(MassWeighted):
         q = np.sqrt(np.einsum("ka,kai,kai->k", w, s, s))
         rate = np.einsum("ka,kai,kai->k", w, s, u) / q
         return np.asarray((np.einsum("ka,kai,kai->k", w, u, u) - rate**2) / q)
-
-    def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        if self.n_rows == 0:
-            return
-        k = first_true(self.measure(r, time) == 0)
-        if k is not None:
-            raise SingularGeometryError(
-                f"all atoms of row {first_row + k}, {self.row_name(k)}, coincide: gradient undefined; move them apart",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
-        self._refuse_nonpositive(time, first_row)
 
 
 def _about_center(w: FloatArray, r: FloatArray) -> FloatArray:

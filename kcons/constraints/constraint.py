@@ -15,7 +15,7 @@ Both are differentiated to A a = b (notes eqs. 81-92): A_k is `gradient`, and
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
-from kcons.errors import ConstraintError, InputError
+from kcons.constraints.vectors import first_true
+from kcons.errors import ConstraintError, InputError, SingularGeometryError
 
 IntArray = NDArray[np.int64]
 
@@ -162,6 +163,50 @@ class Constraint(ABC):
 
         `first_row` is the number of this object's first row in its set, for messages.
         """
+
+    def refuse_singular(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int, str], str]) -> None:
+        """Raise where rows are undefined.
+
+        Parameters
+        ----------
+        bad : ndarray of bool, shape (n_rows,)
+        first_row : int
+            As for `check`.
+        say : callable
+            Gets the first bad row and what to call it, gives the message.
+
+        Raises
+        ------
+        SingularGeometryError
+        """
+        k = first_true(bad)
+        if k is not None:
+            row = first_row + k
+            name = f"row {row}, {self.row_name(k)}"
+            raise SingularGeometryError(say(k, name), rows=[row], atoms=self.atoms[k].tolist())
+
+    def refuse_input(self, bad: NDArray[np.bool_], first_row: int, say: Callable[[int], str], item: str) -> None:
+        """Raise `InputError` for the first row that is marked, with what `say` says of it; `item` is at fault."""
+        k = first_true(bad)
+        if k is not None:
+            raise InputError(
+                f"row {first_row + k}, {self.row_name(k)}: {say(k)}", item=item, atoms=self.atoms[k].tolist()
+            )
+
+    def refuse_nonpositive(self, time: float, first_row: int, what: str = "target") -> None:
+        """Raise `InputError` where a length held is not positive; `what` it is called by."""
+        if self.target is None:
+            return
+        length = self.target_at(time)
+        self.refuse_input(
+            ~(length > 0),
+            first_row,
+            lambda k: (
+                f"{what} {length[k]:g} is not positive; give a length greater than zero, or None to hold the present "
+                "one"
+            ),
+            what,
+        )
 
     def with_masses(self, masses: FloatArray) -> Constraint:
         """Copy that knows the masses of its atoms, shape (n_rows, width); most families need none."""

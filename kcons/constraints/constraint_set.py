@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.images import find_images, image_error, minimum_image
-from kcons.constraints.in_cell import InCell, contiguous, whole_bodies
+from kcons.constraints.images import find_images
+from kcons.constraints.in_cell import InCell, contiguous, joined, whole_bodies
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 
@@ -98,7 +98,7 @@ class ConstraintSet(InCell):
         self.n_atoms = len(x)
         self.masses = m
         self._set_cell(cell, pbc)
-        self._check_atoms(given, x, m)
+        _check_atoms(given, x, m)
 
         self.constraints: tuple[Constraint, ...] = ()
         starts = np.concatenate([[0], np.cumsum([c.n_rows for c in given], dtype=np.int64)])
@@ -120,94 +120,6 @@ class ConstraintSet(InCell):
         self.constraints = tuple(found_as_given(bound, [item.target is None for item in marked], time))
         self._set_scale(x, time)
 
-    # -- construction ---------------------------------------------------------------------------
-
-    def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
-        """Check against half the box that images are unambiguous; without `positions`, of held distances only.
-
-        Parameters
-        ----------
-        positions : ndarray, shape (n_atoms, 3), optional
-        before : ndarray, shape (2, 3, 3), optional
-            The cell before it changed: atoms that nothing ties together must keep their images.
-
-        Raises
-        ------
-        InputError
-            A constant distance that was shorter than half the box is so no longer.
-        ImageError
-            Atoms that nothing ties together are half the box apart.
-        """
-        if self.lattice is None:
-            return
-        longest, row = self._longest_plain
-        if self.images is not None and self.images.longest >= self.half_width > longest:
-            raise InputError(
-                f"distances of {self.images.longest:g} tie the atoms of longer rows together, and are not shorter than "
-                f"half the box ({self.half_width:g}); use a larger cell, or make a new ConstraintSet in this one",
-                item="cell",
-            )
-        if longest >= self.half_width:
-            raise InputError(
-                f"row {self.row_name(row)}: target {longest:g} is not shorter than half the box "
-                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or make a new "
-                "ConstraintSet in this one",
-                item="target",
-                atoms=self.row_atoms(row),
-            )
-        if positions is None:
-            return
-        self.refuse_loose_links(self.whole(positions))
-        if before is not None:
-            self.refuse_other_images(positions, before, None)
-        for item, start in zip(self.constraints, self.starts, strict=False):
-            if not item.relative or item.family == "Distance" or item.n_rows == 0:
-                continue
-            length = np.linalg.norm(minimum_image(np.diff(positions[item.atoms], axis=1), self.lattice), axis=2)
-            if item.whole is not None:
-                length[item.whole] = 0.0
-            k, slot = (int(i) for i in np.unravel_index(int(np.argmax(length)), length.shape))
-            if length[k, slot] >= self.half_width:
-                raise InputError(
-                    f"row {start + k}, {item.row_name(k)}: neighbouring atoms are {length[k, slot]:g} apart, not less "
-                    f"than half the box ({self.half_width:g}), although a shorter distance is held between them; "
-                    "bring the positions onto the constraints first",
-                    item="positions",
-                    atoms=item.atoms[k, slot : slot + 2],
-                )
-
-    def refuse_other_images(
-        self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
-    ) -> None:
-        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before.
-
-        Positions may have been moved along with the cell or not: other images are right if with them the rows are
-        fulfilled, or much nearer to that. Where the time is not known (None), moving rows are not.
-        """
-        if self.images is None or self.lattice is None:
-            return
-        y = self.whole(x)
-        cells = np.round((self.images.make_whole(x, before) - x) @ before[1])
-        changed = np.any(cells != np.round((y - x) @ self.lattice[1]), axis=1)
-        if not changed.any():
-            return
-        as_before = x + cells @ self.lattice[0]
-
-        def miss(c: Constraint, whole: FloatArray) -> FloatArray:
-            if time is None and c.moving:
-                return np.ones(c.n_rows)
-            return np.abs(self._sigma(c, self._gather(c, x, whole), 0.0 if time is None else time))
-
-        here = self._rows(lambda c: miss(c, y)) / self.scale
-        there = self._rows(lambda c: miss(c, as_before)) / self.scale
-        other = np.concatenate([changed[c.atoms].any(axis=1) for c in self.constraints if c.n_rows])
-        bad = other & (here > np.maximum(1e-9, 0.5 * there))
-        if bad.any():
-            row = int(np.argmax(np.where(bad, here, -1.0)))
-            atoms = self.row_atoms(row)
-            pair = atoms[[0, int(np.argmax(changed[atoms]))]]
-            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
-
     def _set_scale(self, x: FloatArray, time: float) -> None:
         """Rows that hold no length take sum |dq/dx_i| |x_i|; at the origin, the size of the system; then 1."""
         scale = self._rows(lambda c: c.scale(time))
@@ -222,39 +134,6 @@ class ConstraintSet(InCell):
     def _reach(self, item: Constraint, x: FloatArray, whole: FloatArray, time: float) -> FloatArray:
         gradient = np.linalg.norm(item.gradient(self._gather(item, x, whole), time), axis=2)
         return np.sum(gradient * np.linalg.norm(x[item.atoms], axis=2), axis=1)
-
-    def _check_atoms(self, given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
-        start = 0
-        held = np.zeros(len(x), dtype=bool)
-        for item in given:
-            if item.family == "FixedAtoms":
-                held[item.atoms[item.atoms < len(x)]] = True
-        for item in given:
-            atoms = item.atoms
-            if atoms.size and atoms.max() >= self.n_atoms:
-                row, slot = np.argwhere(atoms >= self.n_atoms)[0]
-                raise InputError(
-                    f"row {start + row}, {item.row_name(int(row))}: there is no atom {atoms[row, slot]}; "
-                    f"the system has atoms 0 to {self.n_atoms - 1}",
-                    item="atoms",
-                    atoms=atoms[row],
-                )
-            used = atoms.ravel()
-            bad = ~np.isfinite(x[used]).all(axis=1)
-            if bad.any():
-                atom = int(used[np.argmax(bad)])
-                raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
-            # Fixed atoms move with infinite mass, whatever theirs is.
-            bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
-            if bad.any():
-                atom = int(used[np.argmax(bad)])
-                raise InputError(
-                    f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
-                    "(fix it with FixedAtoms, or make it a virtual site)",
-                    item="masses",
-                    atoms=[atom],
-                )
-            start += item.n_rows
 
     # -- rows -----------------------------------------------------------------------------------
 
@@ -304,24 +183,11 @@ class ConstraintSet(InCell):
 
     def measure(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Natural coordinates q(x), shape (n_rows,); 0 for velocity rows."""
-        x = self._positions(x)
-        y = self.whole(x)
-        return self._rows(lambda c: c.measure(self._gather(c, x, y), time) if c.holonomic else np.zeros(c.n_rows))
+        return self._of_rows(x, lambda c, r: c.measure(r, time) if c.holonomic else np.zeros(c.n_rows))
 
     def value(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """sigma(x, t) = q(x, t) - target(t), shape (n_rows,); 0 for velocity rows (notes eq. 81)."""
-        x = self._positions(x)
-        y = self.whole(x)
-
-        return self._rows(lambda c: self._sigma(c, self._gather(c, x, y), time))
-
-    def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
-        if not c.holonomic:
-            return np.zeros(c.n_rows)
-        difference = c.measure(r, time) - c.target_at(time)
-        if c.period is not None:
-            difference -= c.period * np.round(difference / c.period)
-        return difference
+        return self._of_rows(x, lambda c, r: self._sigma(c, r, time))
 
     def jacobian(self, x: ArrayLike, time: float = 0.0) -> sp.csr_array:
         """A, shape (n_rows, 3 n_atoms): d sigma/dx, or the coefficients of v (notes eq. 91)."""
@@ -356,25 +222,21 @@ class ConstraintSet(InCell):
 
     def acceleration_target(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
         """b with A a = b (notes eqs. 90-92, time terms included), shape (n_rows,)."""
-        x = self._positions(x)
-        v = self._positions(v, "velocities")
-        y = self.whole(x)
+        velocities = self._positions(v, "velocities")
 
-        def b_of(c: Constraint) -> FloatArray:
-            r = self._gather(c, x, y)
-            u = v[c.atoms]
+        def b_of(c: Constraint, r: FloatArray) -> FloatArray:
+            u = velocities[c.atoms]
             curvature = c.curvature(r, u, time)
             if not c.holonomic:
                 return _rate_at(c, time) - curvature
             second = c.target.acceleration_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else 0.0
             return second - curvature - (c.time_terms(r, u, time)[1] if c.moving else 0.0)
 
-        return self._rows(b_of)
+        return self._of_rows(x, b_of)
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
         x = self._positions(x)
-
         y = self.whole(x)
         floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
         return np.maximum(1e-14 * self.scale, floor)
@@ -395,10 +257,10 @@ class ConstraintSet(InCell):
                 wanted = self._rate(c, r, time)
                 rates.append(np.einsum("kai,kai->k", gradient, u) - wanted)
                 speeds.append(np.abs(wanted) + np.sum(size * np.linalg.norm(u, axis=2), axis=1))
-        allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * _joined(reach))
+        allowed = np.maximum(1e-10 * self.scale, 8 * np.finfo(float).eps * joined(reach))
         if v is None:
-            return Residuals(_joined(sigma), allowed, None, None, _joined(sizes))
-        return Residuals(_joined(sigma), allowed, _joined(rates), _joined(speeds), _joined(sizes))
+            return Residuals(joined(sigma), allowed, None, None, joined(sizes))
+        return Residuals(joined(sigma), allowed, joined(rates), joined(speeds), joined(sizes))
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -449,8 +311,11 @@ class ConstraintSet(InCell):
         other._set_scale(positions, time)
         return other
 
-    def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
-        return _joined([function(c) for c in self.constraints])
+    def _of_rows(self, x: ArrayLike, function: Callable[[Constraint, FloatArray], FloatArray]) -> FloatArray:
+        """A function of each constraint and the positions of its atoms, for all rows."""
+        positions = self._positions(x)
+        whole = self.whole(positions)
+        return self._rows(lambda c: function(c, self._gather(c, positions, whole)))
 
     def _positions(self, x: ArrayLike, item: str = "positions") -> FloatArray:
         array = numbers(x, item)
@@ -465,8 +330,39 @@ class ConstraintSet(InCell):
         return f"<ConstraintSet: {self.n_rows} rows on {self.n_atoms} atoms>"
 
 
-def _joined(pieces: Sequence[FloatArray]) -> FloatArray:
-    return np.concatenate(pieces) if pieces else np.zeros(0)
+def _check_atoms(given: Sequence[Constraint], x: FloatArray, m: FloatArray) -> None:
+    """Raise `InputError` where rows name atoms that do not exist, have no place, or no mass."""
+    start = 0
+    held = np.zeros(len(x), dtype=bool)
+    for item in given:
+        if item.family == "FixedAtoms":
+            held[item.atoms[item.atoms < len(x)]] = True
+    for item in given:
+        atoms = item.atoms
+        if atoms.size and atoms.max() >= len(x):
+            row, slot = np.argwhere(atoms >= len(x))[0]
+            raise InputError(
+                f"row {start + row}, {item.row_name(int(row))}: there is no atom {atoms[row, slot]}; "
+                f"the system has atoms 0 to {len(x) - 1}",
+                item="atoms",
+                atoms=atoms[row],
+            )
+        used = atoms.ravel()
+        bad = ~np.isfinite(x[used]).all(axis=1)
+        if bad.any():
+            atom = int(used[np.argmax(bad)])
+            raise InputError(f"position of atom {atom} is not finite: {x[atom]}", item="positions", atoms=[atom])
+        # Fixed atoms move with infinite mass, whatever theirs is.
+        bad = ~(np.isfinite(m[used]) & ((m[used] > 0) | (held[used] & (m[used] == 0))))
+        if bad.any():
+            atom = int(used[np.argmax(bad)])
+            raise InputError(
+                f"atom {atom} has mass {m[atom]:g}; constrained atoms need positive mass "
+                "(fix it with FixedAtoms, or make it a virtual site)",
+                item="masses",
+                atoms=[atom],
+            )
+        start += item.n_rows
 
 
 def _rate_at(c: Constraint, time: float) -> FloatArray:

@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.differences import first_derivative, first_derivative_4, second_derivative
-from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import first_true
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
+from kcons.errors import InputError
 
 #: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
 _WRONG = 1e-3
@@ -119,15 +117,15 @@ class FunctionRows(Constraint):
             return
         value, slope = self.measure(r, time), self.gradient(r, time)
         size = np.sqrt(_contract(slope, slope))
-        k = first_true(~(np.isfinite(value) & np.isfinite(size) & (size > 0)))
-        if k is not None:
-            raise SingularGeometryError(
-                f"row {first_row + k}, {self.row_name(k)}: value {value[k]:g} and norm of the gradient {size[k]:g} "
-                f"at atoms {self.atoms[k, :6].tolist()}; the gradient must be finite and not zero. Move the atoms, "
-                "or use another coordinate",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_singular(
+            ~(np.isfinite(value) & np.isfinite(size) & (size > 0)),
+            first_row,
+            lambda k, row: (
+                f"{row}: value {value[k]:g} and norm of the gradient {size[k]:g} at atoms "
+                f"{self.atoms[k, :6].tolist()}; the gradient must be finite and not zero. Move the atoms, or use "
+                "another coordinate"
+            ),
+        )
         # A wrong derivative would give wrong motion without any other sign.
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
@@ -147,15 +145,15 @@ class FunctionRows(Constraint):
             )
 
     def _compare(self, name: str, given: FloatArray, found: FloatArray, size: FloatArray, first_row: int) -> None:
-        k = first_true(~(np.abs(given - found) <= _WRONG * size))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: {name} gives {given[k]:.6g} along a test direction, but "
-                f"differences of the function give {found[k]:.6g}; correct it, or give the length over which the "
-                "function varies (length=...)",
-                item=name,
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_input(
+            ~(np.abs(given - found) <= _WRONG * size),
+            first_row,
+            lambda k: (
+                f"{name} gives {given[k]:.6g} along a test direction, but differences of the function give "
+                f"{found[k]:.6g}; correct it, or give the length over which the function varies (length=...)"
+            ),
+            name,
+        )
 
 
 class ImplicitSurface(FunctionRows):

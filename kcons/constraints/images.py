@@ -26,13 +26,11 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
+from kcons.constraints.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import ImageError, InputError
-
-BoolArray = NDArray[np.bool_]
 
 #: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbours in the list.
 ALL_PAIRS_WIDTH = 12
@@ -64,7 +62,7 @@ class Images:
     def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
         """Copy of `x`, shape (n_atoms, 3), with `atoms` in the images of the tree."""
         y = x.copy()
-        _make_whole(y, self.atoms, self.parents, lattice)
+        follow_parents(y, self.atoms, self.parents, lattice)
         return y
 
     def follow(self, x: FloatArray, x_ref: FloatArray, y_ref: FloatArray, lattice: FloatArray) -> FloatArray:
@@ -115,11 +113,6 @@ def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError
         "atoms together",
         atoms=atoms,
     )
-
-
-def minimum_image(d: FloatArray, lattice: FloatArray) -> FloatArray:
-    """Shortest periodic images of difference vectors, shape (..., 3)."""
-    return d - np.round(d @ lattice[1]) @ lattice[0]
 
 
 def find_images(
@@ -395,17 +388,16 @@ def _tree(
     for item in given:
         if item.width == 1:
             firm[item.atoms.ravel()] = True
-    ends = np.concatenate([pair[link], pair[link][:, ::-1]])
-    by_atom = np.argsort(ends[:, 0], kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=n_atoms))])
     roots = np.concatenate([np.flatnonzero(firm), np.flatnonzero(~firm)])
-    loose = np.where(held[link], -1, row[link])
-    atoms, parents, through = _breadth_first(
-        roots, start, ends[by_atom, 1], np.concatenate([loose, loose])[by_atom], n_atoms
-    )
-    tied = start[atoms + 1] > start[atoms]
+    atoms, parents = spanning_tree(pair[link], n_atoms, roots)
+    parent_of, loose = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
+    parent_of[atoms] = parents
+    i, j = pair[link].T
+    loose[np.where(parent_of[j] == i, j, i)] = np.where(held[link], -1, row[link])
+    tied = np.isin(atoms, pair[link])
+    atoms, parents = atoms[tied], parents[tied]
     ties = float(np.max(length[link][held[link]], initial=0.0))
-    return Images(atoms[tied], parents[tied], through[tied], ties), longest, component
+    return Images(atoms, parents, loose[atoms], ties), longest, component
 
 
 def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:
@@ -425,49 +417,6 @@ def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: 
         item="target" if item.family == "Distance" else "positions",
         atoms=atoms,
     )
-
-
-@nb.njit(cache=True)
-def _breadth_first(roots, start, neighbours, loose, n_atoms):  # type: ignore[no-untyped-def]
-    """Atoms in breadth-first order from `roots`, their parents, and what `loose` says of the link between."""
-    seen = np.zeros(n_atoms, np.bool_)
-    atoms, parents = np.empty(n_atoms, np.int64), np.empty(n_atoms, np.int64)
-    through = np.full(n_atoms, -1, np.int64)
-    used = 0
-    for root in roots:
-        if seen[root]:
-            continue
-        seen[root] = True
-        atoms[used] = parents[used] = root
-        head = used
-        used += 1
-        while head < used:
-            a = atoms[head]
-            head += 1
-            for p in range(start[a], start[a + 1]):
-                b = neighbours[p]
-                if not seen[b]:
-                    seen[b] = True
-                    atoms[used], parents[used], through[used] = b, a, loose[p]
-                    used += 1
-    return atoms, parents, through
-
-
-@nb.njit(cache=True)
-def _make_whole(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
-    """Move atoms by whole cells next to their parents, in place."""
-    cell, inverse = lattice[0], lattice[1]
-    for k in range(len(atoms)):
-        a, b = atoms[k], parents[k]
-        if a == b:
-            continue
-        dx, dy, dz = y[a, 0] - y[b, 0], y[a, 1] - y[b, 1], y[a, 2] - y[b, 2]
-        na = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
-        nb_ = np.rint(dx * inverse[0, 1] + dy * inverse[1, 1] + dz * inverse[2, 1])
-        nc = np.rint(dx * inverse[0, 2] + dy * inverse[1, 2] + dz * inverse[2, 2])
-        if na != 0.0 or nb_ != 0.0 or nc != 0.0:
-            for i in range(3):
-                y[a, i] -= na * cell[0, i] + nb_ * cell[1, i] + nc * cell[2, i]
 
 
 @nb.njit(cache=True)

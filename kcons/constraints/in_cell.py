@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.images import Images, image_error, minimum_image
+from kcons.constraints.images import Images, image_error
+from kcons.constraints.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -20,7 +20,7 @@ MOST_STRAIN = 0.1
 
 
 class InCell:
-    """What a set of constraints knows of its cell; `ConstraintSet` is what it holds.
+    """Rows of a set in its cell, and the images they mean; `ConstraintSet` is what it holds.
 
     Attributes
     ----------
@@ -34,6 +34,7 @@ class InCell:
     starts: IntArray
     lattice: FloatArray | None
     images: Images | None
+    scale: FloatArray
 
     def locate(self, row: int) -> tuple[Constraint, int]:
         """The constraint object that holds `row`, and the row's number within it."""
@@ -59,16 +60,9 @@ class InCell:
             matrix = np.diag(matrix)
         if matrix.shape != (3, 3):
             raise InputError(f"cell must have shape (3, 3) or (3,), not {matrix.shape}", item="cell")
-        periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
         if not np.all(np.isfinite(matrix)):
             raise InputError("cell has a NaN or infinity", item="cell")
-        if not periodic.any():
-            return
-        # Directions without periodicity need any independent vector for the inverse to exist.
-        full = completed(matrix, periodic)
-        inverse = np.linalg.inv(full)
-        inverse[:, ~periodic] = 0.0
-        self.lattice = np.ascontiguousarray(np.stack([full, inverse]))
+        self.lattice = lattice_of(matrix, pbc)
 
     def with_cell(self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True) -> None:
         """Change the cell in place (barostats); targets are unchanged.
@@ -123,6 +117,92 @@ class InCell:
             row = int(self.images.loose[link])
             raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
 
+    def check_half_box(self, positions: FloatArray | None = None, before: FloatArray | None = None) -> None:
+        """Check against half the box that images are unambiguous; without `positions`, of held distances only.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (n_atoms, 3), optional
+        before : ndarray, shape (2, 3, 3), optional
+            The cell before it changed: atoms that nothing ties together must keep their images.
+
+        Raises
+        ------
+        InputError
+            A constant distance that was shorter than half the box is so no longer.
+        ImageError
+            Atoms that nothing ties together are half the box apart.
+        """
+        if self.lattice is None:
+            return
+        longest, row = self._longest_plain
+        if self.images is not None and self.images.longest >= self.half_width > longest:
+            raise InputError(
+                f"distances of {self.images.longest:g} tie the atoms of longer rows together, and are not shorter than "
+                f"half the box ({self.half_width:g}); use a larger cell, or make a new ConstraintSet in this one",
+                item="cell",
+            )
+        if longest >= self.half_width:
+            raise InputError(
+                f"row {self.row_name(row)}: target {longest:g} is not shorter than half the box "
+                f"({self.half_width:g}); its minimum image is ambiguous. Use a larger cell, or make a new "
+                "ConstraintSet in this one",
+                item="target",
+                atoms=self.row_atoms(row),
+            )
+        if positions is None:
+            return
+        self.refuse_loose_links(self.whole(positions))
+        if before is not None:
+            self.refuse_other_images(positions, before, None)
+        for item, start in zip(self.constraints, self.starts, strict=False):
+            if not item.relative or item.family == "Distance" or item.n_rows == 0:
+                continue
+            length = np.linalg.norm(minimum_image(np.diff(positions[item.atoms], axis=1), self.lattice), axis=2)
+            if item.whole is not None:
+                length[item.whole] = 0.0
+            k, slot = (int(i) for i in np.unravel_index(int(np.argmax(length)), length.shape))
+            if length[k, slot] >= self.half_width:
+                raise InputError(
+                    f"row {start + k}, {item.row_name(k)}: neighbouring atoms are {length[k, slot]:g} apart, not less "
+                    f"than half the box ({self.half_width:g}), although a shorter distance is held between them; "
+                    "bring the positions onto the constraints first",
+                    item="positions",
+                    atoms=item.atoms[k, slot : slot + 2],
+                )
+
+    def refuse_other_images(
+        self, x: FloatArray, before: FloatArray, time: float | None, numbers: IntArray | None = None
+    ) -> None:
+        """Raise `ImageError` where a changed cell gives atoms that nothing ties together other images than before.
+
+        Positions may have been moved along with the cell or not: other images are right if with them the rows are
+        fulfilled, or much nearer to that. Where the time is not known (None), moving rows are not.
+        """
+        if self.images is None or self.lattice is None:
+            return
+        y = self.whole(x)
+        cells = np.round((self.images.make_whole(x, before) - x) @ before[1])
+        changed = np.any(cells != np.round((y - x) @ self.lattice[1]), axis=1)
+        if not changed.any():
+            return
+        as_before = x + cells @ self.lattice[0]
+
+        def miss(c: Constraint, whole: FloatArray) -> FloatArray:
+            if time is None and c.moving:
+                return np.ones(c.n_rows)
+            return np.abs(self._sigma(c, self._gather(c, x, whole), 0.0 if time is None else time))
+
+        here = self._rows(lambda c: miss(c, y)) / self.scale
+        there = self._rows(lambda c: miss(c, as_before)) / self.scale
+        other = np.concatenate([changed[c.atoms].any(axis=1) for c in self.constraints if c.n_rows])
+        bad = other & (here > np.maximum(1e-9, 0.5 * there))
+        if bad.any():
+            row = int(np.argmax(np.where(bad, here, -1.0)))
+            atoms = self.row_atoms(row)
+            pair = atoms[[0, int(np.argmax(changed[atoms]))]]
+            raise image_error(self.row_name(row), pair if numbers is None else numbers[pair], self.half_width)
+
     @cached_property
     def _longest_plain(self) -> tuple[float, int]:
         """Longest constant distance that was shorter than half the box at set-up, and its row."""
@@ -134,6 +214,17 @@ class InCell:
             if lengths.max() > longest:
                 longest, row = float(lengths.max()), int(start + np.argmax(lengths))
         return longest, row
+
+    def _sigma(self, c: Constraint, r: FloatArray, time: float) -> FloatArray:
+        if not c.holonomic:
+            return np.zeros(c.n_rows)
+        difference = c.measure(r, time) - c.target_at(time)
+        if c.period is not None:
+            difference -= c.period * np.round(difference / c.period)
+        return difference
+
+    def _rows(self, function: Callable[[Constraint], FloatArray]) -> FloatArray:
+        return joined([function(c) for c in self.constraints])
 
     def whole(self, x: FloatArray) -> FloatArray:
         """Positions in which atoms of whole rows stand in the images that these rows mean; see `constraints.images`.
@@ -154,13 +245,10 @@ class InCell:
         if self.lattice is None or not item.relative:
             return r
         if item.whole is None:
-            steps = minimum_image(np.diff(r, axis=1), self.lattice)
-            r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
-            return r
+            return lined_up(r, self.lattice)
         plain = ~item.whole
         if plain.any():
-            steps = minimum_image(np.diff(r[plain], axis=1), self.lattice)
-            r[plain, 1:] = r[plain, :1] + np.cumsum(steps, axis=1)
+            r[plain] = lined_up(r[plain], self.lattice)
         if item.windings is not None:
             r[item.whole] += item.windings[item.whole] @ self.lattice[0]
         return r
@@ -176,19 +264,12 @@ class InCell:
         return np.where(same[:, None, None], near, r)
 
 
+def joined(pieces: Sequence[FloatArray]) -> FloatArray:
+    return np.concatenate(pieces) if pieces else np.zeros(0)
+
+
 def contiguous(values: ArrayLike, item: str) -> FloatArray:
     return np.ascontiguousarray(numbers(values, item))
-
-
-def completed(matrix: FloatArray, periodic: NDArray[np.bool_]) -> FloatArray:
-    """Cell whose non-periodic vectors are replaced by unit vectors normal to the periodic ones."""
-    full = matrix.copy()
-    basis = matrix[periodic]
-    _, singular, vh = np.linalg.svd(basis)
-    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
-        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
-    full[~periodic] = vh[len(basis) :]
-    return full
 
 
 def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: FloatArray | None) -> FloatArray:
@@ -210,20 +291,4 @@ def whole_bodies(constraints: Sequence[Constraint], x: FloatArray, lattice: Floa
     links = np.concatenate(pairs)
     if not np.round((x[links[:, 1]] - x[links[:, 0]]) @ lattice[1]).any():
         return x
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
-
-    n = len(x)
-    graph = sp.coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    roots = np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
-    # One more node, from which all pieces hang.
-    ends = np.concatenate([links, np.stack([np.full(len(roots), n), roots], axis=1)])
-    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n + 1, n + 1))
-    parent = breadth_first_order(tree, n, directed=False)[1].astype(np.int64)
-    parent[n] = n
-    parent[roots] = roots
-    cells = np.zeros((n + 1, 3))
-    cells[:n] = -np.round((x - x[parent[:n]]) @ lattice[1])
-    while np.any(parent != parent[parent]):
-        cells += cells[parent]
-        parent = parent[parent]
-    return x + cells[:n] @ lattice[0]
+    return make_whole(x, *spanning_tree(links, len(x)), lattice)

@@ -5,13 +5,15 @@ All three depend on differences of positions alone, so minimum images apply in p
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
-from kcons.constraints.vectors import cross, dot, first_true, norm
-from kcons.errors import InputError, SingularGeometryError
+from kcons.constraints.vectors import cross, dot, norm
+from kcons.errors import SingularGeometryError
 
 #: Sine of an angle below which atoms count as collinear: the gradient has then lost nine digits.
 COLLINEAR = 1e-7
@@ -66,25 +68,15 @@ class Distance(Constraint):
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         if self.n_rows == 0:
             return
-        k = first_true(norm(r[:, 0] - r[:, 1]) == 0)
-        if k is not None:
-            i, j = self.atoms[k]
-            raise SingularGeometryError(
-                f"atoms {i} and {j} coincide: distance gradient undefined (row {first_row + k}); move them apart",
-                rows=[first_row + k],
-                atoms=[i, j],
-            )
-        if self.target is None:
-            return
-        target = self.target_at(time)
-        k = first_true(~(target > 0))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is not positive; "
-                "give a length greater than zero, or None to hold the present one",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_singular(
+            norm(r[:, 0] - r[:, 1]) == 0,
+            first_row,
+            lambda k, row: (
+                f"atoms {self.atoms[k, 0]} and {self.atoms[k, 1]} coincide: distance gradient undefined "
+                f"(row {first_row + k}); move them apart"
+            ),
+        )
+        self.refuse_nonpositive(time, first_row)
 
 
 class Angle(Constraint):
@@ -150,32 +142,25 @@ class Angle(Constraint):
         if self.target is None:
             return
         target = self.target_at(time)
-        k = first_true((target < -COLLINEAR) | (target > np.pi + COLLINEAR))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {target[k]:g} is no angle between 0 and pi; "
-                "targets are in radian",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_input(
+            (target < -COLLINEAR) | (target > np.pi + COLLINEAR),
+            first_row,
+            lambda k: f"target {target[k]:g} is no angle between 0 and pi; targets are in radian",
+            "target",
+        )
         self._refuse_straight(target, "has the target", first_row)
 
     def _refuse_straight(self, angle: FloatArray, verb: str, first_row: int) -> None:
-        k = first_true(np.sin(angle) < COLLINEAR)
-        if k is None:
-            return
-        degrees = 180 if angle[k] > 1 else 0
-        remedy = (
-            "use a linear constraint (LinearRelation with the end atoms as bases)"
-            if degrees == 180
-            else "use a linear constraint, or distances"
-        )
-        raise SingularGeometryError(
-            f"angle constraint singular at {degrees} deg, {remedy}: "
-            f"row {first_row + k}, {self.row_name(k)}, {verb} {np.degrees(angle[k]):.9g} deg",
-            rows=[first_row + k],
-            atoms=self.atoms[k].tolist(),
-        )
+        def said(k: int, row: str) -> str:
+            degrees = 180 if angle[k] > 1 else 0
+            remedy = (
+                "use a linear constraint (LinearRelation with the end atoms as bases)"
+                if degrees == 180
+                else "use a linear constraint, or distances"
+            )
+            return f"angle constraint singular at {degrees} deg, {remedy}: {row}, {verb} {np.degrees(angle[k]):.9g} deg"
+
+        self.refuse_singular(np.sin(angle) < COLLINEAR, first_row, said)
 
 
 class Dihedral(Constraint):
@@ -251,15 +236,16 @@ class Dihedral(Constraint):
         _refuse_coincident(self, r, first_row)
         F, G, H = _legs(r)
         for first, second, three in ((F, G, slice(0, 3)), (H, G, slice(1, 4))):
-            k = first_true(norm(cross(first, second)) < COLLINEAR * norm(first) * norm(second))
-            if k is not None:
-                i, j, m = self.atoms[k, three]
-                raise SingularGeometryError(
-                    f"dihedral constraint singular: atoms {i}, {j}, {m} of row {first_row + k}, {self.row_name(k)}, "
-                    "are collinear; bend them, or hold a dihedral of other atoms",
-                    rows=[first_row + k],
-                    atoms=self.atoms[k].tolist(),
-                )
+            straight = norm(cross(first, second)) < COLLINEAR * norm(first) * norm(second)
+            self.refuse_singular(straight, first_row, partial(_collinear, self.atoms[:, three]))
+
+
+def _collinear(trios: IntArray, k: int, row: str) -> str:
+    i, j, m = trios[k]
+    return (
+        f"dihedral constraint singular: atoms {i}, {j}, {m} of {row}, are collinear; bend them, or hold a dihedral of "
+        "other atoms"
+    )
 
 
 def _arms(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

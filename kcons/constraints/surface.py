@@ -18,7 +18,7 @@ from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.linear import LinearRows
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import dot, first_true, norm, unit
-from kcons.errors import InputError, SingularGeometryError
+from kcons.errors import InputError
 
 _VECTOR = (3,)
 
@@ -40,25 +40,14 @@ class Surface(Constraint):
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         if self.n_rows == 0:
             return
-        k = first_true(~(self._singular(r) > 0))
-        if k is not None:
-            raise SingularGeometryError(
-                f"atom {self.atoms[k, 0]} lies {self.singular_at}: gradient of row {first_row + k}, "
-                f"{self.row_name(k)}, undefined; move the atom",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
-        if self.target is None:
-            return
-        radius = self.target_at(time)
-        k = first_true(~(radius > 0))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: radius {radius[k]:g} is not positive; "
-                "give a length greater than zero, or None to hold the present one",
-                item="radius",
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_singular(
+            ~(self._singular(r) > 0),
+            first_row,
+            lambda k, row: (
+                f"atom {self.atoms[k, 0]} lies {self.singular_at}: gradient of {row}, undefined; move the atom"
+            ),
+        )
+        self.refuse_nonpositive(time, first_row, "radius")
 
 
 class Sphere(Surface):
@@ -315,24 +304,23 @@ class Ellipsoid(Constraint):
         return self._size
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
-        k = first_true(norm(self._scaled(r[:, 0] - self.center)) == 0)
-        if k is not None:
-            raise SingularGeometryError(
-                f"atom {self.atoms[k, 0]} lies at the centre of the ellipsoid: gradient of row {first_row + k}, "
-                f"{self.row_name(k)}, undefined; move the atom",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_singular(
+            norm(self._scaled(r[:, 0] - self.center)) == 0,
+            first_row,
+            lambda k, row: (
+                f"atom {self.atoms[k, 0]} lies at the centre of the ellipsoid: gradient of {row}, undefined; "
+                "move the atom"
+            ),
+        )
         if self.target is None:
             return
-        k = first_true(~(self.target_at(time) > -self._size))
-        if k is not None:
-            raise InputError(
-                f"row {first_row + k}, {self.row_name(k)}: target {self.target_at(time)[k]:g} lies beyond the "
-                "centre of the ellipsoid; use 0 for its surface",
-                item="target",
-                atoms=self.atoms[k].tolist(),
-            )
+        target = self.target_at(time)
+        self.refuse_input(
+            ~(target > -self._size),
+            first_row,
+            lambda k: f"target {target[k]:g} lies beyond the centre of the ellipsoid; use 0 for its surface",
+            "target",
+        )
 
 
 class Plane(LinearRows):

@@ -1,17 +1,16 @@
-"""What a row is held at: a number, the value found at the start, or a function of time."""
+"""What a row is held at: a number, the value found at the start, or a function of time, with its derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import FloatArray as FloatArray
 from kcons.constraints.arguments import numbers
-from kcons.constraints.differences import first_derivative, second_derivative
 from kcons.errors import InputError
 
 TimeFunction: TypeAlias = Callable[[float], ArrayLike]
@@ -98,3 +97,39 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
         row = int(np.flatnonzero(~np.isfinite(array.ravel()))[0])
         raise InputError(f"the target of row {row} is not finite: {array.ravel()[row]}", item="target")
     return np.ascontiguousarray(np.broadcast_to(array, (rows,)))
+
+
+# -- derivatives that a user did not give: central differences ---------------------------------------
+
+# Weights of f(a + kh) -/+ f(a - kh), k = 1, 2, ...
+_FIRST_4 = (2 / 3, -1 / 12)
+_FIRST_8 = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+_SECOND_8 = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
+
+Function = Callable[[Any], FloatArray]
+
+
+def first_derivative_4(function: Function, at: Any, step: Any) -> FloatArray:
+    """df/ds, error of order step^4; best at a step of about 1e-3 of the scale of f (12 digits)."""
+    return _first(function, at, step, _FIRST_4)
+
+
+def first_derivative(function: Function, at: Any, step: Any) -> FloatArray:
+    """df/ds, error of order step^8; best at a step of about 1/50 of the scale of f (13 digits)."""
+    return _first(function, at, step, _FIRST_8)
+
+
+def second_derivative(function: Function, at: Any, step: Any) -> FloatArray:
+    """d2f/ds2, error of order step^8; best at a step of about 1/50 of the scale of f (11 digits)."""
+    centre = function(at)
+    total = np.zeros_like(centre)
+    for k, c in enumerate(_SECOND_8, start=1):
+        total = total + c * ((function(at + k * step) - centre) + (function(at - k * step) - centre))
+    return total / step**2
+
+
+def _first(function: Function, at: Any, step: Any, weights: tuple[float, ...]) -> FloatArray:
+    total: FloatArray | float = 0.0
+    for k, c in enumerate(weights, start=1):
+        total = total + c * (function(at + k * step) - function(at - k * step))
+    return np.asarray(total / step)

@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import lent, numbers
 from kcons.constraints.constraint import Constraint
-from kcons.constraints.differences import first_derivative_4
-from kcons.constraints.target import FloatArray, Target
+from kcons.constraints.target import FloatArray, Target, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
-from kcons.errors import InputError, SingularGeometryError
+from kcons.errors import InputError
 
 _VECTOR = (3,)
 
@@ -327,13 +326,11 @@ class CustomVelocity(VelocityRows):
 
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         size = np.sqrt(np.sum(self.gradient(r, time) ** 2, axis=(1, 2)))
-        k = first_true(~(np.isfinite(size) & (size > 0)))
-        if k is not None:
-            raise SingularGeometryError(
-                f"row {first_row + k}, {self.row_name(k)}: the coefficients are zero or not finite; move the atoms",
-                rows=[first_row + k],
-                atoms=self.atoms[k].tolist(),
-            )
+        self.refuse_singular(
+            ~(np.isfinite(size) & (size > 0)),
+            first_row,
+            lambda k, row: f"{row}: the coefficients are zero or not finite; move the atoms",
+        )
 
 
 def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
@@ -344,10 +341,8 @@ def _pairs(first: ArrayLike, second: ArrayLike, family: str) -> ArrayLike:
 
 
 def _refuse_short(item: Constraint, part: FloatArray, whole: FloatArray, what: str, first_row: int) -> None:
-    k = first_true(~(part > 1e-7 * whole))
-    if k is not None:
-        raise SingularGeometryError(
-            f"row {first_row + k}, {item.row_name(k)}: {what}, so its direction is undefined; move the atoms",
-            rows=[first_row + k],
-            atoms=item.atoms[k].tolist(),
-        )
+    item.refuse_singular(
+        ~(part > 1e-7 * whole),
+        first_row,
+        lambda k, row: f"{row}: {what}, so its direction is undefined; move the atoms",
+    )

@@ -23,7 +23,7 @@ from kcons.mdanalysis.topology import snapshot_of
 from kcons.motion.motion import Motion
 from kcons.topology.other_units import all_rescaled
 from kcons.topology.rows_by_name import HeldRows
-from kcons.topology.topology import Snapshot
+from kcons.topology.topology import Snapshot, require_standard_form, whole_numbers
 from kcons.topology.virtual_sites import VirtualSites
 from kcons.topology.whole_molecules import whole_molecules
 
@@ -93,11 +93,14 @@ def to_ase(universe: Any, constraints: Iterable[Constraint] = ()) -> ase.Atoms:
     InputError, ConstraintError
         What does not fit the atoms.
     """
+    return _held_atoms(_with_bonds_of(snapshot_of(universe), constraints), _rows(constraints, 1.0))
+
+
+def _held_atoms(snapshot: Snapshot, rows: Sequence[Constraint]) -> ase.Atoms:
     from kcons.ase import constrain
     from kcons.ase.topology import atoms_of
 
-    rows = _rows(constraints, 1.0)
-    atoms = atoms_of(_with_bonds_of(snapshot_of(universe), constraints))
+    atoms = atoms_of(snapshot)
     if rows:
         constrain(atoms, rows, project=True)
     return atoms
@@ -213,15 +216,10 @@ def openmm_to_ase(
     part: Any = None,
 ) -> ase.Atoms:
     """`Atoms` with what a System holds; see `from_openmm`."""
-    from kcons.ase import constrain
-    from kcons.ase.topology import atoms_of
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
-    atoms = atoms_of(snapshot_of_topology(topology, positions, system=system, velocities=velocities))
-    rows = all_rescaled(_constraints_in(system, part), 1 / NM)
-    if rows:
-        constrain(atoms, rows, project=True)
-    return atoms
+    snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
+    return _held_atoms(snapshot, all_rescaled(_constraints_in(system, part), 1 / NM))
 
 
 # -- pieces ---------------------------------------------------------------------------------------
@@ -251,16 +249,14 @@ def universe_of(snapshot: Snapshot) -> Any:
         velocities=snapshot.velocities is not None,
     )
     names = chains[np.argsort(first)]
-    ids = np.array(
-        ["".join(c for c in text if c.isdigit() or c == "-") or "0" for text in topology.residue_ids.tolist()]
-    )
+    ids = whole_numbers(topology.residue_ids)
     attributes: dict[str, Any] = {
         "names": topology.names.astype(object),
         "types": np.where(topology.elements == "", "X", topology.elements).astype(object),
         "elements": topology.elements.astype(object),
         "masses": topology.masses,
-        "resids": ids.astype(np.int64),
-        "resnums": ids.astype(np.int64),
+        "resids": ids,
+        "resnums": ids,
         "segids": names.astype(object),
         "chainIDs": topology.chains[topology.residues].astype(object),
     }
@@ -285,12 +281,7 @@ def _dimensions(snapshot: Snapshot) -> Any:
     cell = snapshot.cell
     if not snapshot.pbc.all():
         warnings.warn("boxes of MDAnalysis are periodic in all directions; this cell is not", UserWarning, stacklevel=4)
-    if np.abs(np.triu(cell, 1)).max() > 1e-6 * np.abs(cell).max():
-        raise InputError(
-            "MDAnalysis wants the first cell vector along x, the second in the xy plane; turn cell and positions "
-            "(ase: atoms.cell.standard_form()) before",
-            item="cell",
-        )
+    require_standard_form(cell, "MDAnalysis")
     return triclinic_box(*cell)
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Unpack
 
 import MDAnalysis
 import numpy as np
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.errors import InputError
-from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
+from kcons.topology.holding import Holding, Options, with_options
+from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import Snapshot, Topology, as_written, elements_of, listed, near_misses, sorted_pairs
 
 __all__ = ["constraints_of", "selected", "snapshot_of"]
@@ -20,57 +20,15 @@ __all__ = ["constraints_of", "selected", "snapshot_of"]
 _REMEDY = "load a topology that has them (PSF, TPR, PRMTOP, MOL2, ...)"
 
 
-def constraints_of(
-    universe: Any,
-    constrain: str | None = "hbonds",
-    *,
-    rigid_water: bool = True,
-    water_names: Iterable[str] = (),
-    water_geometry: str | tuple[float, float] | None = None,
-    rigid_residues: Iterable[str] = (),
-    rigid_bodies: Iterable[str | Sequence[int] | IntArray] = (),
-    on: Mapping[str, RowMaker] | None = None,
-    select: str = "all",
-    angles: Literal["angles", "distances"] = "angles",
-    guess_bonds: bool | Literal["missing"] = "missing",
-) -> HeldRows:
+@with_options
+def constraints_of(universe: Any, constrain: str | None = "hbonds", **options: Unpack[Options]) -> HeldRows:
     """Rows by name, in angstrom, with targets of the present frame.
 
     Parameters
     ----------
     universe : Universe or AtomGroup
         Atoms of a group are counted within the group; those of a Universe as it counts them.
-    constrain : {'hbonds', 'allbonds', 'hangles', 'allangles', 'none'} or None
-        Bonds with hydrogens; all bonds; these and the angles H-X-H and H-O-X; all bonds and angles.
-    rigid_water : bool
-        Hold water by three distances; found by residue name and composition. Sites without mass (TIP4P) are placed,
-        not held: ``.virtual_sites``.
-    water_names : iterable of str
-        Residue names that are water besides the usual ones.
-    water_geometry : str, (float, float) or None
-        'tip3p', 'spc', ..., or O-H length and H-O-H angle in degrees; None holds each molecule as it is.
-    rigid_residues : iterable of str
-        Names of residues held rigid.
-    rigid_bodies : iterable
-        Atoms or selections, each held rigid as a whole.
-    on : mapping, optional
-        Rows on selections: selection -> callable, for example ``{"protein": CenterOfMass}``.
-    select : str
-        Rows are kept if all of their atoms are in this selection.
-    angles : {'angles', 'distances'}
-        Angles as rows in radian, or as distances of their ends as in OpenMM.
-    guess_bonds : bool or 'missing'
-        'missing' guesses bonds of atoms without any, with a warning; False never; True all of them.
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        Selections that match nothing, unknown names, no coordinates, masses, elements or bonds.
+    **options
     """
     group = universe.atoms
     local = not isinstance(universe, MDAnalysis.Universe)
@@ -79,24 +37,7 @@ def constraints_of(
         found = selected(group, words)
         return np.flatnonzero(np.isin(group.indices, found)) if local else found
 
-    mask = None
-    if select != "all":
-        mask = np.zeros(len(group), dtype=bool)
-        mask[numbers(select)] = True
-    return held_rows(
-        snapshot_of(universe),
-        constrain,
-        rigid_water=rigid_water,
-        water_names=water_names,
-        water_geometry=water_geometry,
-        rigid_residues=rigid_residues,
-        rigid_bodies=[numbers(body) if isinstance(body, str) else np.asarray(body) for body in rigid_bodies],
-        on=as_makers(on, numbers),
-        selected=mask,
-        angles=angles,
-        guess=guess_bonds,
-        remedy=_REMEDY,
-    )
+    return rows_of(snapshot_of(universe), Holding(constrain, **options), numbers, _REMEDY)
 
 
 def selected(universe: Any, words: str) -> IntArray:

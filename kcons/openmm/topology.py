@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Unpack
 
 import numpy as np
 import openmm
@@ -13,8 +13,9 @@ from openmm import unit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.topology.rows_by_name import HeldRows, RowMaker, as_makers, held_rows
-from kcons.topology.topology import Snapshot, Topology, selected_atoms, selected_numbers, sorted_pairs
+from kcons.topology.holding import Holding, Options, with_options
+from kcons.topology.rows_by_name import HeldRows, rows_of
+from kcons.topology.topology import Snapshot, Topology, require_standard_form, selected_numbers, sorted_pairs
 
 __all__ = ["bonds_of", "constraints_of", "openmm_topology", "snapshot_of"]
 
@@ -23,21 +24,14 @@ ANGSTROM = 0.1
 _REMEDY = "give a Topology with bonds (createStandardBonds, addBond)"
 
 
+@with_options
 def constraints_of(
     topology: Any,
     positions: unit.Quantity | ArrayLike,
     constrain: str | None = "hbonds",
     *,
     system: openmm.System | None = None,
-    rigid_water: bool = True,
-    water_names: Iterable[str] = (),
-    water_geometry: str | tuple[float, float] | None = None,
-    rigid_residues: Iterable[str] = (),
-    rigid_bodies: Iterable[Sequence[int] | IntArray] = (),
-    on: Mapping[Any, RowMaker] | None = None,
-    select: ArrayLike | str = "all",
-    angles: Literal["angles", "distances"] = "angles",
-    guess_bonds: bool | Literal["missing"] = "missing",
+    **options: Unpack[Options],
 ) -> HeldRows:
     """Rows by name for an OpenMM Topology, in nm; give them to `kcons.openmm.hold`.
 
@@ -46,42 +40,13 @@ def constraints_of(
     topology : openmm.app.Topology
     positions : Quantity or array_like, shape (n_atoms, 3)
         Plain numbers are in nm.
-    constrain, rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles
-        See `kcons.topology.rows_by_name.held_rows`.
     system : openmm.System, optional
         Where the masses are taken from; otherwise they are those of the elements.
-    on : mapping, optional
-        Tuples of atoms -> callable that makes a row of them.
-    select : 'all', mask or atoms
-        Rows are kept if all of their atoms are among these.
-    guess_bonds : bool or 'missing'
-
-    Returns
-    -------
-    HeldRows
-        A list of constraints; ``.constraint_set`` has them as a set.
-
-    Raises
-    ------
-    InputError
-        As `held_rows`.
+    **options
     """
     snapshot = snapshot_of(topology, positions, system=system)
-    n = snapshot.topology.n_atoms
-    return held_rows(
-        snapshot,
-        constrain,
-        rigid_water=rigid_water,
-        water_names=water_names,
-        water_geometry=water_geometry,
-        rigid_residues=rigid_residues,
-        rigid_bodies=rigid_bodies,
-        on=as_makers(on, lambda key: selected_numbers(key, n)),
-        selected=selected_atoms(select, n),
-        angles=angles,
-        guess=guess_bonds,
-        remedy=_REMEDY,
-    )
+    numbers = partial(selected_numbers, n=snapshot.topology.n_atoms)
+    return rows_of(snapshot, Holding(constrain, **options), numbers, _REMEDY)
 
 
 def snapshot_of(
@@ -200,13 +165,7 @@ def reduced(cell: FloatArray) -> FloatArray:
     InputError
         A cell that would have to be turned, which would turn the positions too.
     """
-    size = float(np.abs(cell).max())
-    if np.abs(np.triu(cell, 1)).max() > 1e-6 * size or np.diag(cell).min() <= 0:
-        raise InputError(
-            "OpenMM wants the first cell vector along x, the second in the xy plane; turn cell and positions "
-            "(ase: atoms.cell.standard_form()) before",
-            item="cell",
-        )
+    require_standard_form(cell, "OpenMM", positive=True)
     a, b, c = np.tril(cell)
     c = c - b * np.round(c[1] / b[1])
     c = c - a * np.round(c[0] / a[0])

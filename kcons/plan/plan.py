@@ -9,7 +9,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.images import BoolArray
+from kcons.constraints.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels

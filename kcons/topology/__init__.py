@@ -4,12 +4,14 @@
 - `whole_molecules`: groups and molecules made whole across the faces of the cell
 - `guessed_bonds`: bonds for systems that come without
 - `rigid_groups`: rigid groups of atoms as rows
+- `holding`: the options for what is held, the same for every MD engine
 - `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water
 - `virtual_sites`: massless sites that are placed by three atoms
 - `other_units`: constraints in another unit of length
 """
 
+from kcons.topology.holding import Holding
 from kcons.topology.rows_by_name import HeldRows, held_rows
 from kcons.topology.topology import Snapshot, Topology
 
-__all__ = ["HeldRows", "Snapshot", "Topology", "held_rows"]
+__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "held_rows"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.images import minimum_image
-from kcons.constraints.in_cell import completed
+from kcons.constraints.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs
@@ -69,9 +68,9 @@ def guess_bonds(snapshot: Snapshot, atoms: BoolArray | None = None, among: BoolA
         raise InputError(f"position of {topology.atom_name(atom)} is not finite", item="positions", atoms=[atom])
     if len(able) < 2:
         return np.zeros((0, 2), np.int64)
-    cell = None if snapshot.cell is None else snapshot.cell / snapshot.angstrom
+    lattice = snapshot.in_unit(1.0).lattice
     reach = 2 * STRETCH * float(radius[able].max())
-    pairs, away = close_pairs(x[able], cell, snapshot.pbc, reach)
+    pairs, away = close_pairs(x[able], lattice, reach)
     pairs = able[pairs]
     i, j = pairs.T
     near = away < STRETCH * (radius[i] + radius[j])
@@ -116,15 +115,14 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
     if len(finite) < 2:
         return nothing
     y = x[finite]
-    cell, pbc = (None, np.zeros(3, dtype=bool)) if lattice is None else (lattice[0], lattice[1].any(axis=0))
     # Atoms may be stored in any image: the nearest neighbour is looked for among the wrapped ones.
-    wrapped = y if cell is None else wrapped_into(y, cell, pbc)[1]
+    wrapped = y if lattice is None else wrapped_into(y, lattice)[1]
     near = cKDTree(wrapped).query(wrapped, k=2)[0][:, 1]
     typical = float(np.median(near))
-    if cell is not None and pbc.any():
+    if lattice is not None:
         # No bond is longer than a cell vector: an image of the atom itself would be nearer.
-        typical = min(typical, float(np.linalg.norm(cell[pbc], axis=1).min()))
-    pairs, away = close_pairs(y, cell, pbc, GAP * NEAREST * _LONE * typical)
+        typical = min(typical, float(np.linalg.norm(lattice[0][lattice[1].any(axis=0)], axis=1).min()))
+    pairs, away = close_pairs(y, lattice, GAP * NEAREST * _LONE * typical)
     for side in (0, 1):
         np.minimum.at(near, pairs[:, side], away)
     near = np.minimum(near, _LONE * typical)
@@ -146,9 +144,7 @@ def bonds_without_elements(x: FloatArray, lattice: FloatArray | None, atoms: Int
         return nothing
     kept = bonds[seen[bonds[:, 0]]]
     i, j, k = bond_angles(kept, len(y)).T
-    u, w = y[i] - y[j], y[k] - y[j]
-    if lattice is not None:
-        u, w = minimum_image(u, lattice), minimum_image(w, lattice)
+    u, w = minimum_image(y[i] - y[j], lattice), minimum_image(y[k] - y[j], lattice)
     angle = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
     return nothing if np.any(angle < SHARPEST) else finite[kept]
 
@@ -186,17 +182,17 @@ def _nearest_of_hydrogens(pairs: IntArray, away: FloatArray, hydrogen: BoolArray
     return keep
 
 
-def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: float) -> tuple[IntArray, FloatArray]:
-    """Pairs closer than `reach` in any image, shape (n, 2), and their distances; cell vectors as rows."""
+def close_pairs(x: FloatArray, lattice: FloatArray | None, reach: float) -> tuple[IntArray, FloatArray]:
+    """Pairs closer than `reach` in any image, shape (n, 2), and their distances."""
     from scipy.spatial import cKDTree
 
-    if cell is None or not pbc.any():
+    if lattice is None:
         pairs = cKDTree(x).query_pairs(reach, output_type="ndarray").astype(np.int64)
         return pairs, np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    axes = np.flatnonzero(pbc)
-    fractional, y, full, inverse = wrapped_into(x, cell, pbc)
+    axes = np.flatnonzero(lattice[1].any(axis=0))
+    fractional, y = wrapped_into(x, lattice)
     # Atoms within reach of a face of the cell are repeated beyond the opposite one.
-    depth = reach * np.linalg.norm(inverse, axis=0)
+    depth = reach * np.linalg.norm(lattice[1], axis=0)
     whole, number, place = y, np.arange(len(x)), fractional
     for axis in axes.tolist():
         copies, owners, places = [whole], [number], [place]
@@ -205,7 +201,7 @@ def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: f
                 continue
             moved = place[:, axis] + sign
             inside = (moved > -depth[axis]) & (moved < 1 + depth[axis])
-            copies.append(whole[inside] + sign * full[axis])
+            copies.append(whole[inside] + sign * lattice[0][axis])
             owners.append(number[inside])
             shifted = place[inside].copy()
             shifted[:, axis] += sign
@@ -223,12 +219,9 @@ def close_pairs(x: FloatArray, cell: FloatArray | None, pbc: BoolArray, reach: f
     return owned[first], away[first]
 
 
-def wrapped_into(
-    x: FloatArray, cell: FloatArray, pbc: BoolArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Fractional and Cartesian coordinates in the cell along its periodic axes, the cell completed, and its inverse."""
-    full = completed(cell, pbc)
-    inverse = np.linalg.inv(full)
-    fractional = x @ inverse
+def wrapped_into(x: FloatArray, lattice: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fractional and Cartesian coordinates in the cell along its periodic axes."""
+    pbc = lattice[1].any(axis=0)
+    fractional = x @ np.linalg.inv(lattice[0])
     fractional[:, pbc] -= np.floor(fractional[:, pbc])
-    return fractional, fractional @ full, full, np.asarray(inverse)
+    return fractional, fractional @ lattice[0]

@@ -19,31 +19,15 @@ from kcons.constraints import Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, SingularGeometryError
-from kcons.topology.topology import Snapshot, listed, near_misses
+from kcons.topology.topology import BoolArray, Snapshot, listed, near_misses
 from kcons.topology.virtual_sites import VirtualSites, fitted
 from kcons.topology.whole_molecules import whole_groups
 
 #: Residues that are water, and the molecule when there are no residues.
 WATER = frozenset(
     {
-        *(
-            "HOH",
-            "H2O",
-            "WAT",
-            "SOL",
-            "DOD",
-            "OH2",
-            "HHO",
-            "OHH",
-            "T3P",
-            "T4P",
-            "T5P",
-            "T3H",
-            "T4E",
-            "TP3",
-            "TP4",
-            "TP5",
-        ),
+        *("HOH", "H2O", "WAT", "SOL", "DOD", "OH2", "HHO", "OHH"),
+        *("T3P", "T4P", "T5P", "T3H", "T4E", "TP3", "TP4", "TP5"),
         *("TIP", "TIP2", "TIP3", "TIP3P", "TIP4", "TIP4P", "TIP4E", "TIP5", "TIP5P", "TP3M", "TIPS"),
         *("SPC", "SPCE", "SPC/E", "OPC", "OPC3"),
     }
@@ -86,16 +70,25 @@ class Waters:
     triples: IntArray
     sites: VirtualSites
 
+    def among(self, atoms: BoolArray) -> Waters:
+        """Those of which all atoms are marked."""
+        held, seen = atoms[self.triples].all(axis=1), atoms[self.sites.parents].all(axis=1)
+        sites = VirtualSites(self.sites.sites[seen], self.sites.parents[seen], self.sites.coefficients[seen])
+        return Waters(self.triples[held], sites)
+
     def rows(self, geometry: tuple[float, float] | None, angstrom: float) -> list[Constraint]:
-        """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""
-        if not len(self.triples):
-            return []
-        pairs = self.triples[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
-        if geometry is None:
-            return [Distance(pairs)]
-        length, angle = geometry
-        lengths = np.array([length, length, 2 * length * np.sin(np.radians(angle) / 2)]) * angstrom
-        return [Distance(pairs, np.tile(lengths, len(self.triples)))]
+        """See `water_rows`."""
+        return [water_rows(self.triples, geometry, angstrom)] if len(self.triples) else []
+
+
+def water_rows(triples: IntArray, geometry: tuple[float, float] | None, angstrom: float = 1.0) -> Distance:
+    """Three distances a molecule: O-H, O-H, H-H; as they are, or of a given O-H length (angstrom) and angle."""
+    pairs = triples[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
+    if geometry is None:
+        return Distance(pairs)
+    length, angle = geometry
+    lengths = np.array([length, length, 2 * length * np.sin(np.radians(angle) / 2)]) * angstrom
+    return Distance(pairs, np.tile(lengths, len(triples)))
 
 
 def find_waters(snapshot: Snapshot, names: frozenset[str] = WATER, model_site: float = 0.0) -> Waters:

@@ -8,46 +8,35 @@ own.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 
 from kcons.constraints import Angle, Constraint, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.one_piece import minimum_image
 from kcons.errors import InputError
 from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.holding import CONSTRAIN, GroupOptions, Holding, RowMaker
 from kcons.topology.rigid_groups import (
     FLAT,
-    GEOMETRIES,
-    WATER,
+    Waters,
     body_rows,
     find_waters,
     inside_bodies,
     listed_bodies,
     residue_bodies,
 )
-from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, near_misses, sorted_pairs
+from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 from kcons.topology.virtual_sites import VirtualSites
-from kcons.topology.whole_molecules import minimum_image
 
-#: What can be held by name, and what that means.
-CONSTRAIN: dict[str, str] = {
-    "none": "no bonds",
-    "hbonds": "bonds with a hydrogen",
-    "allbonds": "all bonds",
-    "hangles": "all bonds, and the angles H-X-H and H-O-X",
-    "allangles": "all bonds and all angles",
-}
 #: Beyond this an angle is held by a linear row, in degrees.
 STRAIGHT = 179.0
 #: No bond is that long, in angstrom.
 TORN = 10.0
-
-#: Rows on a selection: gets the atoms, gives constraints.
-RowMaker = Callable[[IntArray], Constraint]
 
 
 class HeldRows(list[Constraint]):
@@ -100,17 +89,12 @@ def held_rows(
     snapshot: Snapshot,
     constrain: str | None = "hbonds",
     *,
-    rigid_water: bool = True,
-    water_names: Iterable[str] = (),
-    water_geometry: str | tuple[float, float] | None = None,
-    rigid_residues: Iterable[str] = (),
-    rigid_bodies: Iterable[Sequence[int] | IntArray] = (),
     on: Sequence[tuple[IntArray, RowMaker]] = (),
     selected: BoolArray | None = None,
-    angles: Literal["angles", "distances"] = "angles",
     guess: bool | Literal["missing"] = "missing",
     flat: float = FLAT,
     remedy: str = "give a topology with bonds",
+    **options: Unpack[GroupOptions],
 ) -> HeldRows:
     """Rows that hold what is named.
 
@@ -119,23 +103,10 @@ def held_rows(
     snapshot : Snapshot
     constrain : {'hbonds', 'allbonds', 'hangles', 'allangles', 'none'} or None
         See `CONSTRAIN`; the first three are what they are in OpenMM.
-    rigid_water : bool
-        Hold water by O-H, O-H and H-H; found by residue name and composition.
-    water_names : iterable of str
-        Residue names that are water besides the usual ones.
-    water_geometry : str, (float, float) or None
-        A model of `GEOMETRIES`, or O-H length in angstrom and H-O-H angle in degrees; None holds each molecule as it
-        is.
-    rigid_residues : iterable of str
-        Names of residues held rigid, each by itself.
-    rigid_bodies : iterable of array_like of int
-        Lists of atoms, each held rigid.
     on : sequence of (atoms, callable)
         Rows on selections; the callable gets the atoms and gives a constraint, for example `CenterOfMass`.
     selected : ndarray of bool, shape (n_atoms,), optional
         Rows are kept if all of their atoms are marked; `rigid_bodies` and `on` are not restricted.
-    angles : {'angles', 'distances'}
-        Whether angles are rows in radian, or distances of their ends, as in OpenMM.
     guess : bool or 'missing'
         Whether bonds are guessed: 'missing' where atoms have none, with a warning; True all of them anew; False
         never.
@@ -143,6 +114,9 @@ def held_rows(
         See `kcons.topology.rigid_groups.body_rows`.
     remedy : str
         What the error about missing bonds recommends.
+    **options
+        rigid_water, water_names, water_geometry, rigid_residues, rigid_bodies, angles: see
+        `kcons.topology.holding.Holding`.
 
     Returns
     -------
@@ -159,54 +133,43 @@ def held_rows(
     UserWarning
         If bonds were guessed without being asked for (guess='missing').
     """
-    kind = "none" if constrain is None else str(constrain).lower()
-    if kind not in CONSTRAIN:
-        raise InputError(
-            f"cannot constrain {constrain!r}{near_misses(kind, CONSTRAIN)}; there are {', '.join(CONSTRAIN)}",
-            item="constrain",
-        )
-    if angles not in ("angles", "distances"):
-        raise InputError(f"angles must be 'angles' or 'distances', not {angles!r}", item="angles")
-    if isinstance(rigid_residues, str):
-        rigid_residues = (rigid_residues,)
-    residues, bodies = tuple(rigid_residues), tuple(rigid_bodies)
-    geometry, model_site = _geometry(water_geometry)
-    if not (kind != "none" or rigid_water or residues or bodies or on):
-        raise InputError("nothing is to be held; name bonds, water, residues, bodies or rows", item="constrain")
-    called = WATER | {str(n).strip().upper() for n in water_names} if rigid_water else frozenset()
-    nowhere = np.zeros(snapshot.topology.n_atoms, dtype=bool)
-    guessed = 0
-    if snapshot.topology.residues_known:
-        waters = find_waters(snapshot, called, model_site)
-        if kind != "none":
-            # The bonds of rigid water are known; guessing them would take most of the time.
-            snapshot = _with_water_bonds(snapshot, waters.triples)
-            nowhere[waters.triples] = nowhere[waters.sites.sites] = True
-            snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
-    else:
-        # Molecules take the place of residues, and bonds make molecules.
-        if kind != "none" or rigid_water or residues:
-            snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
-        snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
-        waters = find_waters(snapshot, called, model_site)
+    holding = Holding(constrain, on=on, select="all" if selected is None else selected, guess_bonds=guess, **options)
+    return rows_of(snapshot, holding, np.asarray, remedy, flat)
+
+
+def rows_of(
+    snapshot: Snapshot,
+    holding: Holding,
+    numbers: Callable[[Any], IntArray],
+    remedy: str,
+    flat: float = FLAT,
+) -> HeldRows:
+    """`held_rows` for what an MD engine selects in its own way; to be called where users call.
+
+    Parameters
+    ----------
+    numbers : callable
+        Gets what stands in `holding` as a selection, gives atoms as numbers or as a mask.
+    """
+    kind, topology = holding.kind, snapshot.topology
+    geometry, model_site = holding.geometry()
+    selected = None
+    if not (isinstance(holding.select, str) and holding.select == "all"):
+        selected = np.zeros(topology.n_atoms, dtype=bool)
+        selected[numbers(holding.select)] = True
+    bodies = [numbers(b) if isinstance(b, str) else b for b in holding.bodies]
+    snapshot, waters, guessed = _with_waters(snapshot, holding, model_site, remedy)
+    groups = residue_bodies(snapshot, holding.residues)
     if selected is not None:
-        inside = selected[waters.triples].all(axis=1)
-        seen = selected[waters.sites.parents].all(axis=1)
-        waters = replace(
-            waters,
-            triples=waters.triples[inside],
-            sites=VirtualSites(waters.sites.sites[seen], waters.sites.parents[seen], waters.sites.coefficients[seen]),
-        )
-    groups = residue_bodies(snapshot, residues)
-    if selected is not None:
+        waters = waters.among(selected)
         groups = [kept for kept in (g[selected[g].all(axis=1)] for g in groups) if len(kept)]
     groups = _without_waters(groups, waters.triples)
     groups += listed_bodies(snapshot, bodies)
-    rows = _internal(snapshot, kind, [waters.triples, *groups], selected, angles)
+    rows = _internal(snapshot, kind, [waters.triples, *groups], selected, holding.angles)
     rows += waters.rows(geometry, snapshot.angstrom)
     rows += body_rows(snapshot, groups, flat)
-    for atoms, make in on:
-        made = make(atoms)
+    for key, make in holding.own_rows:
+        made = make(numbers(key))
         if not isinstance(made, Constraint):
             raise InputError(f"{make!r} gave {made!r}, which is no kcons constraint", item="on")
         rows.append(made)
@@ -217,7 +180,7 @@ def held_rows(
     held = ConstraintSet(
         rows, snapshot.positions, snapshot.topology.masses, cell=snapshot.cell, pbc=snapshot.pbc.tolist()
     )
-    if guessed and guess == "missing":
+    if guessed and holding.guess_bonds == "missing":
         warnings.warn(
             f"{guessed} bonds were guessed from distances and covalent radii, since "
             f"the {snapshot.host or 'topology'} does not have them; {remedy}, or pass guess_bonds=False to refuse",
@@ -227,28 +190,28 @@ def held_rows(
     return HeldRows(held, snapshot, waters.sites, guessed)
 
 
-def _geometry(given: str | tuple[float, float] | None) -> tuple[tuple[float, float] | None, float]:
-    if given is None:
-        return None, 0.0
-    if isinstance(given, str):
-        name = given.lower().replace("-", "").replace("/", "").replace("_", "")
-        if name not in GEOMETRIES:
-            raise InputError(
-                f"no water model {given!r}{near_misses(given, GEOMETRIES)}; there are {', '.join(GEOMETRIES)}; or give "
-                "(O-H in angstrom, H-O-H in degrees)",
-                item="water_geometry",
-            )
-        length, angle, site = GEOMETRIES[name]
-        return (length, angle), site
-    length, angle = (float(v) for v in given)
-    if not (length > 0 and 0 < angle < 180):
-        raise InputError(
-            f"water of O-H {length:g} angstrom and angle {angle:g}: give both positive", item="water_geometry"
-        )
-    return (length, angle), 0.0
-
-
 # -- bonds ----------------------------------------------------------------------------------------
+
+
+def _with_waters(snapshot: Snapshot, holding: Holding, model_site: float, remedy: str) -> tuple[Snapshot, Waters, int]:
+    """The snapshot with the bonds that are needed, its rigid water, and how many bonds are guessed."""
+    nowhere = np.zeros(snapshot.topology.n_atoms, dtype=bool)
+    guess, named = holding.guess_bonds, holding.kind != "none"
+    if not snapshot.topology.residues_known:
+        # Molecules take the place of residues, and bonds make molecules.
+        guessed = 0
+        if named or holding.rigid_water or holding.residues:
+            snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
+        snapshot = replace(snapshot, topology=snapshot.topology.with_molecules())
+        return snapshot, find_waters(snapshot, holding.waters, model_site), guessed
+    waters = find_waters(snapshot, holding.waters, model_site)
+    if not named:
+        return snapshot, waters, 0
+    # The bonds of rigid water are known; guessing them would take most of the time.
+    snapshot = _with_water_bonds(snapshot, waters.triples)
+    nowhere[waters.triples] = nowhere[waters.sites.sites] = True
+    snapshot, guessed = _with_bonds(snapshot, guess, remedy, nowhere)
+    return snapshot, waters, guessed
 
 
 def _with_water_bonds(snapshot: Snapshot, triples: IntArray) -> Snapshot:
@@ -332,8 +295,8 @@ def _internal(
     triples = triples[~inside_bodies(topology.n_atoms, triples, rigid)]
     if angles == "distances":
         return [*rows, Distance(np.sort(triples[:, [0, 2]], axis=1))]
-    u = minimum_image(snapshot, snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]])
-    w = minimum_image(snapshot, snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]])
+    u = minimum_image(snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
+    w = minimum_image(snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
     value = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))
     straight = value > np.radians(STRAIGHT)
     rows.append(Angle(triples[~straight]))
@@ -360,7 +323,7 @@ def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:
 
 
 def _refuse_torn(snapshot: Snapshot, bonds: IntArray) -> None:
-    d = minimum_image(snapshot, snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]])
+    d = minimum_image(snapshot.positions[bonds[:, 0]] - snapshot.positions[bonds[:, 1]], snapshot.lattice)
     long = np.linalg.norm(d, axis=1) / snapshot.angstrom
     if len(long) and long.max() > TORN:
         i, j = (int(a) for a in bonds[int(np.argmax(long))])
@@ -395,10 +358,3 @@ def _nothing(topology: Topology, kind: str, selected: BoolArray | None) -> str:
     if kind == "hbonds" and not topology.hydrogen.any():
         return "nothing to hold: there are no hydrogens; add them to the file, or hold all bonds (allbonds)"
     return f"nothing to hold: found no water, and {CONSTRAIN[kind]} are none"
-
-
-def as_makers(
-    on: Mapping[Any, RowMaker] | None, atoms_of: Callable[[Any], IntArray]
-) -> list[tuple[IntArray, RowMaker]]:
-    """Rows on selections with the selections resolved."""
-    return [] if on is None else [(atoms_of(key), make) for key, make in on.items()]

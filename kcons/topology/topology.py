@@ -9,17 +9,18 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.one_piece import BoolArray, lattice_of, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
 StrArray = NDArray[np.str_]
-BoolArray = NDArray[np.bool_]
 
 #: Standard atomic masses in dalton, for recognising elements.
 MASSES: dict[str, float] = {
@@ -35,16 +36,8 @@ MASSES: dict[str, float] = {
 _LONG = ("CL", "BR", "SE", "SI", "FE", "ZN", "MG", "MN", "LI", "AL")
 #: Ions whose name is no symbol.
 _IONS = {
-    "SOD": "Na",
-    "POT": "K",
-    "CLA": "Cl",
-    "CAL": "Ca",
-    "CES": "Cs",
-    "LIT": "Li",
-    "RUB": "Rb",
-    "BAR": "Ba",
-    "CIO": "Cs",
-}
+    "SOD": "Na", "POT": "K", "CLA": "Cl", "CAL": "Ca", "CES": "Cs", "LIT": "Li", "RUB": "Rb", "BAR": "Ba", "CIO": "Cs",
+}  # fmt: skip
 #: Names of massless sites.
 _SITES = ("MW", "EP", "LP", "M", "OM", "VS", "XX", "X", "DUM")
 #: How far a mass may be from that of its element.
@@ -183,6 +176,11 @@ class Snapshot:
                 item="positions",
             )
 
+    @cached_property
+    def lattice(self) -> FloatArray | None:
+        """The periodic cell and its inverse, as `ConstraintSet.lattice`."""
+        return lattice_of(self.cell, self.pbc)
+
     def in_unit(self, angstrom: float) -> Snapshot:
         """The same with another unit of length."""
         factor = angstrom / self.angstrom
@@ -232,14 +230,12 @@ def connected(pairs: IntArray, n: int) -> tuple[IntArray, int]:
 
 def bond_angles(bonds: IntArray, n_atoms: int) -> IntArray:
     """All i-j-k with bonds i-j and j-k, i < k, sorted by (j, i, k), shape (n, 3)."""
-    both = np.concatenate([bonds, bonds[:, ::-1]])
-    both = both[np.lexsort((both[:, 1], both[:, 0]))]
-    degree = np.bincount(both[:, 0], minlength=n_atoms)
-    starts = np.cumsum(degree) - degree
+    starts, ends = neighbour_lists(bonds, n_atoms)
+    degree = np.diff(starts)
     found = []
     for d in np.unique(degree[degree > 1]).tolist():
         vertex = np.flatnonzero(degree == d)
-        neighbours = both[starts[vertex][:, None] + np.arange(d), 1]
+        neighbours = ends[starts[vertex][:, None] + np.arange(d)]
         a, b = np.triu_indices(d, 1)
         centre = np.repeat(vertex, len(a))
         found.append(np.stack([neighbours[:, a].ravel(), centre, neighbours[:, b].ravel()], axis=1))
@@ -371,6 +367,28 @@ def _formula(symbols: StrArray, counts: IntArray) -> str:
     return "".join(f"{s}{present[s] if present[s] > 1 else ''}" for s in order)
 
 
+def whole_numbers(ids: StrArray) -> IntArray:
+    """Numbers of residues whose ids may have letters; 0 where there are no digits."""
+    digits = ["".join(c for c in text if c.isdigit() or c == "-") or "0" for text in ids.tolist()]
+    return np.array([int(d) for d in digits], dtype=np.int64)
+
+
+def require_standard_form(cell: FloatArray, engine: str, positive: bool = False) -> None:
+    """Refuse a cell that would have to be turned, and the positions with it; if `positive`, also one turned inside out.
+
+    Raises
+    ------
+    InputError
+    """
+    turned = np.abs(np.triu(cell, 1)).max() > 1e-6 * np.abs(cell).max()
+    if turned or (positive and np.diag(cell).min() <= 0):
+        raise InputError(
+            f"{engine} wants the first cell vector along x, the second in the xy plane; turn cell and positions "
+            "(ase: atoms.cell.standard_form()) before",
+            item="cell",
+        )
+
+
 # -- messages -------------------------------------------------------------------------------------
 
 
@@ -408,12 +426,3 @@ def selected_numbers(select: Any, n: int) -> IntArray:
     if given.min() < 0 or given.max() >= n:
         raise InputError(f"the selection names atoms beyond 0 to {n - 1}", item="select")
     return given.astype(np.int64)
-
-
-def selected_atoms(select: Any, n: int) -> BoolArray | None:
-    """Which of n atoms `selected_numbers` names, shape (n,); None for 'all'."""
-    if isinstance(select, str) and select == "all":
-        return None
-    mask = np.zeros(n, dtype=bool)
-    mask[selected_numbers(select, n)] = True
-    return mask

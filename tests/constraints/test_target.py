@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraints.target import MovingTarget, as_target
+from kcons.constraints.target import MovingTarget, as_target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
 
 
@@ -61,3 +61,17 @@ def test_bad_values_of_a_function_are_named():
         MovingTarget(lambda t: np.nan).at(2.0, 1)
     with pytest.raises(InputError, match=r"target at t = 2 has shape \(3,\); give one number or 2"):
         MovingTarget(lambda t: [1.0, 2.0, 3.0]).at(2.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("formula", "expected", "order"),
+    [
+        (first_derivative_4, np.cos(0.3), 4),
+        (first_derivative, np.cos(0.3), 8),
+        (second_derivative, -np.sin(0.3), 8),
+    ],
+)
+def test_order(formula, expected, order):
+    steps = np.array([0.4, 0.2, 0.1])
+    errors = [abs(float(formula(lambda t: np.asarray(np.sin(t)), 0.3, h)) - expected) for h in steps]
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(order, abs=0.1)

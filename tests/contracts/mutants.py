@@ -487,27 +487,27 @@ MUTANTS = [
     ),
     # -- checks of trajectories --
     (
-        "mdanalysis/check/constraint_check.py",
-        "self._table.allow(of_targets + self._tolerance * self._table.sizes)",
-        "self._table.allow(self._tolerance * self._table.sizes)",
+        "mdanalysis/check/bound_rows.py",
+        "self.table.allow(of_targets + self.tolerance * self.table.sizes)",
+        "self.table.allow(self.tolerance * self.table.sizes)",
         "tests/mdanalysis/test_check_precision.py::test_two_roundings_make_more_than_one",
     ),
     (
-        "mdanalysis/check/constraint_check.py",
-        "self._table.allow(of_targets + self._tolerance * self._table.sizes)",
-        "self._table.allow(of_targets + self._tolerance)",
+        "mdanalysis/check/bound_rows.py",
+        "self.table.allow(of_targets + self.tolerance * self.table.sizes)",
+        "self.table.allow(of_targets + self.tolerance)",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
     (
-        "mdanalysis/check/constraint_check.py",
-        "found.margins + self._tolerance * table.sizes > 0",
-        "found.margins + self._tolerance > 0",
+        "mdanalysis/check/conclusions.py",
+        "found.margins + rows.tolerance * table.sizes > 0",
+        "found.margins + rows.tolerance > 0",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
     ),
     (
-        "mdanalysis/check/constraint_check.py",
-        "np.where(seen, found.mean(found.rounded), self._of_targets)",
-        "self._of_targets",
+        "mdanalysis/check/bound_rows.py",
+        "np.where(seen, found.mean(found.rounded), self.of_targets)",
+        "self.of_targets",
         "tests/mdanalysis/test_check_precision.py::test_targets_that_are_means_have_the_mean_rounding_of_their_frames",
     ),
     (
@@ -517,7 +517,7 @@ MUTANTS = [
         "tests/mdanalysis/test_check_precision.py::test_a_wild_molecule_of_the_topology_excuses_no_other",
     ),
     (
-        "mdanalysis/check/row_table.py",
+        "mdanalysis/check/frames/row_table.py",
         "np.where(periodic, 1.0, constraint_set.scale)",
         "np.where(periodic, 1.0, 1.0)",
         "tests/mdanalysis/test_check_precision.py::test_the_tolerance_is_a_part_of_the_length",
@@ -542,7 +542,7 @@ MUTANTS = [
     ),
     (
         "topology/guessed_bonds.py",
-        "wrapped = y if cell is None else wrapped_into(y, cell, pbc)[1]",
+        "wrapped = y if lattice is None else wrapped_into(y, lattice)[1]",
         "wrapped = y",
         "tests/motion/restoring/test_moved_groups.py::test_bonds_in_a_cell_do_not_hang_on_where_atoms_are_stored",
     ),

@@ -92,6 +92,84 @@ def test_names_of_modules_are_their_own():
     assert {name for name, count in stems.items() if count > 1} <= SHARED
 
 
+#: At most: lines of a module, of a function and of a class; parameters but for self, outside of the compiled solvers.
+LINES, FUNCTION, CLASS, PARAMETERS = 500, 100, 300, 11
+#: Folders whose kernels take one argument an array.
+KERNELS = ("solvers/", "steppers/stages/fused_stages.py", "thermostats/isokinetic/fused_step.py")
+#: What is larger: name -> size, one a line. Nothing is added and no size raised; what has become small is taken out.
+LARGER = {
+    "models/growth/integration.py: parameters of solve": 12,
+    "motion/motion.py: lines": 614,
+    "motion/motion.py: lines of Motion": 579,
+    "openmm/carried/carried_constraints.py: lines of CarriedConstraints": 379,
+    "openmm/collective/collective_rows.py: lines of CollectiveRows": 366,
+    "openmm/collective/context_rows.py: lines of ContextRows": 325,
+    "openmm/collective/row_program.py: lines of GroupRows": 303,
+    "openmm/ensembles/isokinetic_ensemble.py: lines of Isokinetic": 329,
+    "openmm/integrator/guard.py: lines of Guard": 323,
+    "openmm/integrator/projected.py: lines of ProjectedIntegrator": 429,
+    "solvers/chains/sweeps.py: lines of _solve": 202,
+    "solvers/general_clusters.py: lines of GeneralClusters": 319,
+    "solvers/rigid_triangles.py: lines of triangle_positions": 134,
+    "solvers/small_clusters.py: lines of _kernels": 232,
+    "solvers/small_clusters.py: lines of _kernels.positions": 114,
+    "solvers/small_clusters.py: lines of _kernels.tangents": 108,
+    "solvers/sparse/elimination.py: lines of _minimum_degree": 110,
+    "steppers/splitting.py: lines": 526,
+    "steppers/state.py: lines": 528,
+    "steppers/state.py: lines of System": 303,
+}
+
+
+def sizes(path: Path) -> dict[str, int]:
+    """What of a module is larger than it may be: its name, with what was measured, and the measure."""
+    text = path.read_text(encoding="utf-8")
+    place = path.relative_to(PACKAGE).as_posix()
+    found = {f"{place}: lines": (len(text.splitlines()), LINES)}
+
+    def look(node: ast.AST, outer: str) -> None:
+        for inner in ast.iter_child_nodes(node):
+            name = outer
+            if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                name = f"{outer}.{inner.name}" if outer else inner.name
+                length = (inner.end_lineno or 0) - inner.lineno + 1
+                is_class = isinstance(inner, ast.ClassDef)
+                found[f"{place}: lines of {name}"] = (length, CLASS if is_class else FUNCTION)
+                if not is_class and not place.startswith(KERNELS):
+                    given = inner.args
+                    names = [a.arg for a in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+                    names += [a.arg for a in (given.vararg, given.kwarg) if a is not None]
+                    count = len([n for n in names if n not in ("self", "cls")])
+                    found[f"{place}: parameters of {name}"] = (count, PARAMETERS)
+            look(inner, name)
+
+    look(ast.parse(text), "")
+    return {name: size for name, (size, most) in found.items() if size > most}
+
+
+def test_modules_functions_and_classes_are_small():
+    """But for what is listed, which may become smaller only, and goes where it is small."""
+    found = {name: size for path in FILES for name, size in sizes(path).items()}
+    assert {name: size for name, size in found.items() if size > LARGER.get(name, 0)} == {}, "too large"
+    assert set(LARGER) <= set(found), "no longer larger: take it out of the list"
+
+
+def test_what_is_larger_than_it_may_be_is_found(tmp_path, monkeypatch):
+    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
+    body = "    x = 0\n"
+    long = f"def f({', '.join(f'a{k}' for k in range(12))}):\n{body * 100}"
+    small = f"def g(self, {', '.join(f'a{k}' for k in range(11))}):\n{body * 99}"
+    held = f"class C:\n{body * 299}\nclass D:\n{body * 300}"
+    path = tmp_path / "module.py"
+    path.write_text(f"{long}\n{small}\n{held}")
+    assert sizes(path) == {
+        "module.py: lines": 805,
+        "module.py: lines of f": 101,
+        "module.py: parameters of f": 12,
+        "module.py: lines of D": 301,
+    }
+
+
 @pytest.mark.parametrize(("old", "new"), kcons.MOVED.items())
 def test_modules_are_found_by_the_names_they_had(old, new):
     """One module under both names, and it knows itself by the new one."""

@@ -13,8 +13,10 @@ from kcons.topology.topology import (
     connected,
     elements_of,
     near_misses,
+    require_standard_form,
     sorted_pairs,
     split_residues,
+    whole_numbers,
 )
 
 
@@ -103,3 +105,17 @@ def test_units_and_numbers_of_atoms():
 def test_near_misses():
     assert near_misses("tip3", ["TIP3P", "SPC"]) == " (did you mean TIP3P?)"
     assert near_misses("benzene", ["SPC"]) == ""
+
+
+def test_numbers_of_residues_that_have_letters():
+    assert whole_numbers(np.array(["12", "12A", "-3", "B", ""])).tolist() == [12, 12, -3, 0, 0]
+    assert whole_numbers(np.zeros(0, "U1")).tolist() == []
+
+
+def test_cells_that_would_have_to_be_turned():
+    lower = np.array([[7.0, 0, 0], [2.0, 8.0, 0], [-1.0, 3.0, 9.0]])
+    require_standard_form(lower, "OpenMM", positive=True)
+    for cell, positive in ((lower[[1, 0, 2]], False), (lower * [1, 1, -1], True)):
+        with pytest.raises(InputError, match="OpenMM wants the first cell vector along x"):
+            require_standard_form(cell, "OpenMM", positive=positive)
+    require_standard_form(np.diag([7.0, 8.0, 0.0]), "MDAnalysis")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import warnings
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from kcons.errors import InputError, UnreadableError
 from kcons.mdanalysis.check.constraint_check import ConstraintCheck
 from kcons.mdanalysis.check.files.file_precision import precision_of
 from kcons.mdanalysis.check.files.target_file import TargetFile
-from kcons.mdanalysis.check.memory import give_back
 from kcons.mdanalysis.check.result import CheckResult
 from kcons.mdanalysis.loading import format_of, load_trajectory, open_universe, quiet
 from kcons.mdanalysis.topology import constraints_of
+from kcons.topology.holding import Options
 
 
 def check_trajectory(
@@ -24,10 +25,6 @@ def check_trajectory(
     topology: str | Path,
     constrain: str | None = "hbonds",
     *,
-    select: str = "all",
-    rigid_water: bool = True,
-    rigid_residues: Sequence[str] = (),
-    rigid_bodies: Iterable[Any] = (),
     targets: str | Path = "first",
     frames: str | None = None,
     workers: int = 1,
@@ -40,7 +37,7 @@ def check_trajectory(
     ----------
     trajectory, topology : path
         Files that MDAnalysis reads.
-    constrain, select, rigid_water, rigid_residues, rigid_bodies
+    constrain
         What is held; see `kcons.mdanalysis.constraints_of`.
     targets : {'first', 'mean', 'topology'} or path
         'topology': the coordinates in the topology's file; else as for `ConstraintCheck`.
@@ -51,7 +48,8 @@ def check_trajectory(
     backend : {'threads', 'multiprocessing', 'dask'}, optional
         Where there are several workers; by default threads for DCD files and rows that are all lengths, else processes.
     **options
-        For `ConstraintCheck`.
+        What is held besides, such as select, rigid_water and rigid_residues, for `kcons.mdanalysis.constraints_of`;
+        all others for `ConstraintCheck`.
 
     Raises
     ------
@@ -66,12 +64,7 @@ def check_trajectory(
     # Complain about the parameter file before anything long.
     file = None if str(targets) in ("first", "mean", "topology") else TargetFile(targets)
     names = (str(trajectory), str(topology))
-    held: dict[str, Any] = {
-        "select": select,
-        "rigid_water": rigid_water,
-        "rigid_residues": rigid_residues,
-        "rigid_bodies": tuple(rigid_bodies),
-    }
+    held = {name: options.pop(name) for name in Options.__annotations__ if name in options}
     text = None
     if str(targets) == "topology":
         universe = open_universe(topology)
@@ -93,9 +86,9 @@ def check_trajectory(
         given = str(targets)
     check = ConstraintCheck(universe, constraints, targets=file or given, names=names, **options)
     if text is not None:
-        check.target_text = text
+        check.asked.target_text = text
     if guessed:
-        check.remarks.append(
+        check.asked.remarks.append(
             f"{guessed} bonds were guessed from distances and covalent radii: {topology} does not have them; give a "
             "topology with bonds, such as PSF, PRMTOP or TPR"
         )
@@ -135,3 +128,14 @@ def _slice(frames: str | None) -> dict[str, int | None]:
     if not 2 <= len(numbers) <= 3 or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
         raise InputError(f"frames are {frames!r}; give them as A:B or A:B:STEP, such as 100::10", item="frames")
     return dict(zip(("start", "stop", "step"), numbers, strict=False))
+
+
+def give_back() -> None:
+    """Let the C library return freed pages; parsing a large topology and setting up leave tens of megabytes of them.
+
+    Does nothing where the library is not glibc, whose heap shrinks by itself only at its end.
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
-from kcons.mdanalysis.check.deviations import Deviations
 from kcons.mdanalysis.check.files.file_precision import FilePrecision
 from kcons.mdanalysis.check.files.plain_dcd import Block
-from kcons.mdanalysis.check.frame_kernels import coordinate_grid, kinetic
+from kcons.mdanalysis.check.frames.deviations import Deviations
+from kcons.mdanalysis.check.frames.frame_kernels import coordinate_grid, kinetic
+from kcons.mdanalysis.check.frames.row_table import RowTable
 from kcons.mdanalysis.check.rank_by_pieces import PIECE, rank_of
-from kcons.mdanalysis.check.row_table import RowTable
 
 #: Clusters of each kind in a sample: compiled code takes four at once, solvers up to eight.
 OF_A_KIND = 8

@@ -16,28 +16,23 @@ from numpy.typing import NDArray
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError, NonFiniteError, UnreadableError
+from kcons.errors import InputError, KconsError, UnreadableError
 from kcons.mdanalysis.check.atom_names import AtomNames
+from kcons.mdanalysis.check.bound_rows import BoundRows
 from kcons.mdanalysis.check.compiling import compiled_elsewhere, frame_of, look_once, sample_of
-from kcons.mdanalysis.check.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.conclusions import Asked, concluded
 from kcons.mdanalysis.check.files.endings import intact_frames, last_offset, leftover
-from kcons.mdanalysis.check.files.file_precision import FilePrecision, by_frame, described, precision_of
-from kcons.mdanalysis.check.files.plain_dcd import PlainDcd, plain_dcd
+from kcons.mdanalysis.check.files.file_precision import FilePrecision, by_frame, precision_of
+from kcons.mdanalysis.check.files.plain_dcd import plain_dcd
 from kcons.mdanalysis.check.files.target_file import TargetFile
 from kcons.mdanalysis.check.findings import (
     Part,
-    by_unit,
-    gaps_of,
     joined,
-    rms_of,
-    row_result,
-    verdict_of,
 )
-from kcons.mdanalysis.check.frame_kernels import coordinate_grid, farthest, kinetic
 from kcons.mdanalysis.check.rank_by_pieces import rank_of
+from kcons.mdanalysis.check.reading import Reading, blocks_of, broken_by
 from kcons.mdanalysis.check.result import Break, CheckResult
-from kcons.mdanalysis.check.row_table import SECOND_ORDER, RowTable, cell_matrix, size_of
-from kcons.mdanalysis.check.temperature import BOLTZMANN, masses_of, temperature_of
+from kcons.mdanalysis.check.temperature import masses_of
 from kcons.mdanalysis.check.workers import inherited, short_pickle, with_backend
 from kcons.mdanalysis.loading import READ_ERRORS, format_of, quiet
 
@@ -137,41 +132,39 @@ class ConstraintCheck(AnalysisBase):
             )
         if worst < 0:
             raise InputError(f"worst is {worst}; give a number of rows to name", item="worst")
-        self._labels = AtomNames(universe)
-        self.remarks: list[str] = []
+        labels = AtomNames(universe)
+        remarks: list[str] = []
         self._unit_masses = np.ones(len(universe.atoms))
-        self._masses, reason = masses_of(universe, given, self._labels)
+        self._masses, reason = masses_of(universe, given, labels)
         if reason:
-            self.remarks.append(f"no temperature: {reason}")
+            remarks.append(f"no temperature: {reason}")
         if targets not in ("given", "first", "mean"):
             file = targets if isinstance(targets, TargetFile) else TargetFile(targets)
-            given, self.target_text = tuple(file.apply(given, self._labels)), str(file.path)
-            self._mode = "given"
+            given, mode, text = tuple(file.apply(given, labels)), "given", str(file.path)
         else:
-            self._mode = str(targets)
-            self.target_text = {"first": "the first frame", "mean": "the mean of the frames"}.get(
-                self._mode, "as given"
-            )
+            mode = str(targets)
+            text = {"first": "the first frame", "mean": "the mean of the frames"}.get(mode, "as given")
         self._given = given
         self._tolerance, self._target_error = float(tolerance), np.broadcast_to(errors, len(universe.atoms))
-        self._removed, self._wants_rank, self._n_worst = removed, rank, int(worst)
+        self._wants_rank = rank
         reader = self._trajectory
         self._path = str(getattr(reader, "filename", None) or "")
         self._format = format_of(reader)
-        self._names = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
+        called = names or (self._path or "memory", str(getattr(universe, "filename", None) or "topology"))
         if self._path and Path(self._path).is_file():
-            self._precision = precision_of(self._path, self._format, precision)
+            in_file = precision_of(self._path, self._format, precision)
         else:
-            self._precision = FilePrecision(self._format or "MEMORY", precision or 0.0)
+            in_file = FilePrecision(self._format or "MEMORY", precision or 0.0)
         if getattr(reader, "transformations", ()):
             # What a transformation did to the coordinates no longer lies on the grid of the file.
-            self._precision = FilePrecision(self._format, self._precision.step, self._precision.unit)
-            self.remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
-        self._by_frame = None
-        if self._precision.exact and precision is None:
-            self._by_frame = by_frame(self._path, reader._xdr.offsets, self._precision)
+            in_file = FilePrecision(self._format, in_file.step, in_file.unit)
+            remarks.append("the trajectory has transformations; deviations are those of transformed coordinates")
+        of_frames = None
+        if in_file.exact and precision is None:
+            of_frames = by_frame(self._path, reader._xdr.offsets, in_file)
+        self._reading = Reading(in_file, of_frames, self._masses, reader.n_frames)
+        self.asked = Asked(called, labels, mode, text, removed, int(worst), remarks)
         self._pass_of_means = False
-        self._intact = reader.n_frames
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
@@ -205,17 +198,17 @@ class ConstraintCheck(AnalysisBase):
             Path(self._path).is_file() and chosen["frames"] is None and _open_ended(start, stop, step, n_frames)
         )
         self._bind(self._first(chosen))
-        in_blocks = self._blocks_of() is not None
+        in_blocks = blocks_of(self._trajectory, self._rows.table) is not None
         # The compiled look at a block sees damage by itself.
-        self._intact = n_frames
+        self._reading.intact = n_frames
         if not in_blocks:
-            self._intact = intact_frames(self._path, self._format, n_frames, self._trajectory.n_atoms)
+            self._reading.intact = intact_frames(self._path, self._format, n_frames, self._trajectory.n_atoms)
         options = with_backend(options, in_blocks)
-        self._pass_of_means = self._mode == "mean"
+        self._pass_of_means = self.asked.mode == "mean"
         with inherited(self, options["backend"]):
             if self._pass_of_means:
                 super().run(**chosen, **options)
-                self._hold_means()
+                self._rows.hold_means(self.results.part, self._trajectory.ts)
                 self._pass_of_means = False
             super().run(**chosen, **options)
         return self
@@ -233,7 +226,8 @@ class ConstraintCheck(AnalysisBase):
             first = int(asked[0]) if len(asked) else None
         if first is None:
             raise InputError(
-                f"{self._names[0]}: no frames are left by start, stop and step; it has {self._trajectory.n_frames}",
+                f"{self.asked.names[0]}: no frames are left by start, stop and step; it has "
+                f"{self._trajectory.n_frames}",
                 item="frames",
             )
         return first
@@ -246,52 +240,29 @@ class ConstraintCheck(AnalysisBase):
                 time = float(ts.time)
         except READ_ERRORS as error:
             raise self._nothing(frame, str(error)) from None
-        precision = self._precision_at(frame)
-        x = coordinate_grid(ts.positions, precision.grid)
         given = self._given
-        if self._mode != "given":
+        if self.asked.mode != "given":
             given = tuple(item if item.moving or not item.holonomic else item.with_target(None) for item in given)
-        masses = self._unit_masses if self._masses is None else self._masses
-        # Rows whose targets are those of this frame, or of the mean of all.
-        self._measured = np.concatenate([np.full(item.n_rows, item.target is None) for item in given])
         self._refuse_numbers(ts, frame, given)
-        cell = cell_matrix(ts.dimensions)
-        held = ConstraintSet(given, x, masses, cell=cell, time=time)
-        table = self._table = RowTable(held, precision)
-        with np.errstate(all="ignore"):
-            slopes = abs(held.jacobian(x, time))
-            reach, squares = (np.asarray(part.sum(axis=1)).ravel() for part in (slopes, slopes.power(2)))
-        is_length = np.concatenate([np.full(c.n_rows, c.family == "Distance") for c in held.constraints])
-        # An error of 1 of each coordinate: the error of a row, at most and in the mean square.
-        self._reach = np.where(is_length, 2 * np.sqrt(3.0), SECOND_ORDER * reach)
-        self._spread = np.sqrt(squares / 3.0)
-        measured, told = (
-            table.errors_of(errors, x, ts.dimensions, time) for errors in (precision.half_step(x), self._target_error)
-        )
-        self._allow(np.where(self._measured, measured, told))
+        masses = self._unit_masses if self._masses is None else self._masses
+        precision = self._reading.precision_at(frame)
+        rows = self._rows = BoundRows(given, masses, ts, time, precision, self._target_error, self._tolerance)
+        held = rows.table.set
         shot = frame_of(ts, time, plain_dcd(self._trajectory) is not None)
         first_use = partial(compiled_elsewhere, lambda: sample_of(held, shot, precision, self._wants_rank))
         self._rank: int | None = None
         if self._wants_rank:
             try:
-                self._rank = first_use(lambda: rank_of(held, x))
+                self._rank = first_use(lambda: rank_of(held, rows.positions))
             except KconsError as error:
-                self.remarks.append(f"no rank: {error}")
-        first_use(lambda: look_once(table, shot))
-
-    def _precision_at(self, frame: int) -> FilePrecision:
-        return self._precision if self._by_frame is None else self._by_frame[frame]
-
-    def _allow(self, of_targets: FloatArray) -> None:
-        """Say what rounding makes of the targets, at most; the tolerance and the rounding of frames come besides."""
-        self._of_targets = of_targets
-        self._table.allow(of_targets + self._tolerance * self._table.sizes)
+                self.asked.remarks.append(f"no rank: {error}")
+        first_use(lambda: look_once(rows.table, shot))
 
     def _nothing(self, frame: int, reason: str) -> UnreadableError:
         """Of a trajectory of which nothing can be told."""
         return UnreadableError(
-            f"{self._names[0]}: frame {frame}, the first to be checked, cannot be read ({reason}); start at another "
-            "frame, or write the file again",
+            f"{self.asked.names[0]}: frame {frame}, the first to be checked, cannot be read ({reason}); start at "
+            "another frame, or write the file again",
             item="trajectory",
         )
 
@@ -304,21 +275,6 @@ class ConstraintCheck(AnalysisBase):
         if ts.dimensions is not None and not np.isfinite(ts.dimensions).all():
             raise self._nothing(frame, f"the cell is {ts.dimensions}")
 
-    def _hold_means(self) -> None:
-        """Take the means that the first pass found as targets."""
-        part: Part = self.results.part
-        held, found = self._table.set, part.found
-        means = found.mean(found.total)
-        moved = [
-            item if item.moving or not item.holonomic else item.with_target(item.target_at(0.0) + means[a:b])
-            for item, a, b in zip(held.constraints, held.starts[:-1], held.starts[1:], strict=True)
-        ]
-        first, precision = self._trajectory.ts, self._table.precision
-        positions = coordinate_grid(first.positions, precision.grid)
-        self._table = RowTable(held.replaced(moved, positions, float(first.time)), precision)
-        seen = self._measured & (found.counted > 0)
-        self._allow(np.where(seen, found.mean(found.rounded), self._of_targets))
-
     def _prepare_sliced_trajectory(self, slicer: Any) -> None:
         with quiet():
             super()._prepare_sliced_trajectory(slicer)
@@ -327,98 +283,11 @@ class ConstraintCheck(AnalysisBase):
         self, indexed_frames: NDArray[np.int64], verbose: bool | None = None, *, progressbar_kwargs: Any = None
     ) -> Any:
         """Read one worker's frames, in order and without seeking where they follow each other; stop at a break."""
-        numbers = indexed_frames[:, 1]
-        n = len(numbers)
-        found = Deviations(self._table.set.n_rows, n)
-        part = Part(
-            np.array(numbers, dtype=np.int64),
-            np.zeros(n),
-            found,
-            np.full(n, np.nan),
-            np.zeros((n, 3)),
-            np.full(n, np.nan),
-        )
-        # Means need all frames; what is only told about rows does not.
-        every = (1 if self._pass_of_means else min(max(n // SUMMED, 1), MOST_SKIPPED), max(n // SAMPLES, 1))
-        table = self._table.fresh()
-        file = self._blocks_of()
         verbose = getattr(self, "_verbose", False) if verbose is None else verbose
-        with ProgressBar(total=n, verbose=verbose, **(progressbar_kwargs or {})) as bar:
-            if file is not None:
-                done = self._read_blocks(file, table, part, every, bar)
-            else:
-                with quiet():
-                    done = self._read_frames(table, part, every, bar)
-        table.collect(found)
-        found.cut(done)
-        part.frames, part.times = part.frames[:done], part.times[:done]
-        part.twice_kinetic, part.momentum, part.reach = (
-            array[:done] for array in (part.twice_kinetic, part.momentum, part.reach)
-        )
+        with ProgressBar(total=len(indexed_frames), verbose=verbose, **(progressbar_kwargs or {})) as bar:
+            table = self._rows.table.fresh()
+            part = self._reading.read(self._trajectory, indexed_frames[:, 1], table, self._pass_of_means, bar)
         return _Remote(part)
-
-    def _blocks_of(self) -> PlainDcd | None:
-        """The file, where it can be read in blocks."""
-        return plain_dcd(self._trajectory) if self._table.only_lengths else None
-
-    def _read_blocks(self, file: PlainDcd, table: RowTable, part: Part, every: tuple[int, int], bar: Any) -> int:
-        """Frames that were looked at, up to a break."""
-        numbers = np.where(part.frames < 0, part.frames + file.n_frames, part.frames)
-        part.times[:] = file.times(numbers)
-        points = np.empty((file.n_atoms, 3), dtype=np.float32)
-        done = 0
-        try:
-            for block in file.blocks(numbers):
-                looked, part.reach[done : done + len(block.words)] = table.look_at_block(
-                    part.found, done, block, points, every
-                )
-                done += looked
-                bar.update(looked)
-                if looked < len(block.words):
-                    table.refuse(points, block.dimensions[looked])
-        except (OSError, KconsError) as error:
-            part.broken = self._break(error, int(part.frames[done]))
-        return done
-
-    def _read_frames(self, table: RowTable, part: Part, every: tuple[int, int], bar: Any) -> int:
-        """Frames that MDAnalysis' reader gave, up to a break."""
-        trajectory = self._trajectory
-        n = len(part.frames)
-        previous = None
-        for k, frame in enumerate(part.frames.tolist()):
-            try:
-                if frame >= self._intact:
-                    raise OSError("its records or lines are damaged")
-                ts = trajectory.next() if previous is not None and frame == previous + 1 else trajectory[frame]
-                previous = frame
-                table.precision = self._precision_at(frame)
-                self._look(table, part, k, ts, k % every[1] == 0 or k == n - 1, k % every[0] == 0)
-            except (*READ_ERRORS, KconsError, FloatingPointError) as error:
-                part.broken = self._break(error, frame)
-                return k
-            bar.update()
-        return n
-
-    def _break(self, error: BaseException, frame: int) -> Break:
-        """What the reader says; iteration hides it."""
-        if isinstance(error, StopIteration):
-            try:
-                self._trajectory[frame]
-            except READ_ERRORS as hidden:
-                error = hidden
-        lines = str(error).strip().splitlines()
-        return Break(frame, lines[0].strip() if lines else "the file ends", not isinstance(error, NonFiniteError))
-
-    def _look(self, table: RowTable, part: Part, k: int, ts: Any, sample: bool, summed: bool) -> None:
-        x = _flat(ts.positions)
-        v = _flat(ts.velocities) if ts.has_velocities else None
-        time = float(ts.time)
-        part.times[k] = time
-        table.look(part.found, k, x, v, ts.dimensions, time, summed)
-        if sample:
-            part.reach[k] = size_of(farthest(x))
-        if v is not None and self._masses is not None:
-            part.twice_kinetic[k], *part.momentum[k] = kinetic(v, self._masses)
 
     def _get_aggregator(self) -> ResultsGroup:
         return ResultsGroup(lookup={"part": joined})
@@ -433,7 +302,28 @@ class ConstraintCheck(AnalysisBase):
         if not len(part.frames):
             assert part.broken is not None
             raise self._nothing(part.broken.frame, part.broken.reason)
-        self.results.check = self._concluded(part)
+        if part.broken is None and self._to_the_end:
+            part.broken = self._end_of_file()
+        masses = self._unit_masses if self._masses is None else self._masses
+        n_in_file = int(self._trajectory.n_frames)
+        self.results.check = concluded(part, self._rows, self.asked, self._reading, self._rank, masses, n_in_file)
+
+    def _end_of_file(self) -> Break | None:
+        """What lies behind the last frame, or keeps it from being read."""
+        trajectory = self._trajectory
+        n = trajectory.n_frames
+        broken = leftover(self._path, self._format, n, trajectory.n_atoms, last_offset(trajectory))
+        try:
+            with quiet():
+                trajectory[n - 1]
+        except READ_ERRORS as error:
+            broken = broken or broken_by(error, trajectory, n - 1)
+        return broken
+
+    @property
+    def remarks(self) -> list[str]:
+        """What there is to say besides."""
+        return self.asked.remarks
 
     @property
     def check(self) -> CheckResult:
@@ -441,92 +331,9 @@ class ConstraintCheck(AnalysisBase):
         result: CheckResult = self.results.check
         return result
 
-    def _concluded(self, part: Part) -> CheckResult:
-        found, n_frames = part.found, len(part.frames)
-        table, held = self._table, self._table.set
-        if part.broken is None and self._to_the_end:
-            n = self._trajectory.n_frames
-            atoms, last = self._trajectory.n_atoms, last_offset(self._trajectory)
-            part.broken = leftover(self._path, self._format, n, atoms, last)
-            try:
-                with quiet():
-                    self._trajectory[n - 1]
-            except READ_ERRORS as error:
-                part.broken = part.broken or self._break(error, n - 1)
-        violated = found.margins > 0
-        beyond_file = found.margins + self._tolerance * table.sizes > 0
-        # Targets that are nothing but rounding.
-        untold = self._measured & (self._of_targets > table.sizes)
-        gaps = gaps_of(part, int(self._measured.sum()), int(untold.sum()), self.target_text)
-        # The rounding of a mean averages out.
-        of_targets = self._of_targets if self._mode != "mean" else np.where(self._measured, 0.0, self._of_targets)
-        rounding = (
-            self._spread
-            / np.maximum(self._reach, np.finfo(float).tiny)
-            * np.hypot(found.mean(found.rounded), of_targets)
-        )
-        units = by_unit(table, part, np.where(untold, 0.0, self._of_targets), rounding, self._tolerance)
-        order = np.lexsort((-np.where(violated, found.margins, found.largest), ~violated))
-        worst = [row_result(table, self._labels, int(row), part) for row in order[: max(self._n_worst, 1)]]
-        in_frame = (found.excess > 0).any(axis=0)
-        frames = part.frames[in_frame]
-        status = "tolerated" if beyond_file.any() else "kept"
-        status = "violated" if violated.any() else "incomplete" if gaps else status
-        masses = self._unit_masses if self._masses is None else self._masses
-        freedom, temperature = None, None
-        if self._rank is not None:
-            freedom, temperature, remarks = temperature_of(part, self._rank, masses, self._removed)
-            self.remarks.extend(remarks)
-        series = {
-            f"{name} {UNITS[unit]}": values[unit].tolist()
-            for unit in range(len(UNITS))
-            if (self._table.units == unit).any()
-            for name, values in (
-                ("largest", found.worst),
-                ("rms", rms_of(found)),
-                ("rounding", found.rounding),
-            )
-        }
-        if temperature is not None:
-            assert freedom is not None
-            series["temperature K"] = (part.twice_kinetic / (BOLTZMANN * freedom)).tolist()
-        return CheckResult(
-            trajectory=self._names[0],
-            topology=self._names[1],
-            n_atoms=held.n_atoms,
-            n_rows=held.n_rows,
-            n_constrained=len(held.touched),
-            status=status,
-            verdict=verdict_of(
-                status, self._tolerance, worst[0], units, (int(violated.sum()), held.n_rows), frames, n_frames, gaps
-            ),
-            precision=described([self._precision_at(frame) for frame in part.frames.tolist()], part.reach),
-            tolerance=self._tolerance,
-            targets=self.target_text,
-            frames=part.frames.tolist(),
-            times=part.times.tolist(),
-            n_frames_in_file=int(self._trajectory.n_frames),
-            units=units,
-            worst=worst[: self._n_worst],
-            violated_rows=int(violated.sum()),
-            violated_frames=int(in_frame.sum()),
-            first_violated_frame=int(frames[0]) if len(frames) else None,
-            rank=self._rank,
-            degrees_of_freedom=freedom,
-            temperature=temperature,
-            broken=part.broken,
-            series=series,
-            gaps=gaps,
-            remarks=list(self.remarks),
-        )
-
 
 def _open_ended(start: int | None, stop: int | None, step: int | None, n_frames: int) -> bool:
     """Whether a slice means the end of a trajectory, wherever it is."""
     if step is not None and step < 0:
         start, stop = stop, start
     return stop is None or stop < 0 or stop > n_frames or (start or 0) < 0
-
-
-def _flat(values: Any) -> NDArray[np.float32]:
-    return np.ascontiguousarray(values, dtype=np.float32).reshape(-1)

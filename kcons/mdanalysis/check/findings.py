@@ -10,9 +10,9 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.mdanalysis.check.atom_names import AtomNames
-from kcons.mdanalysis.check.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.frames.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.frames.row_table import RowTable
 from kcons.mdanalysis.check.result import Break, RowResult, UnitResult, fitted
-from kcons.mdanalysis.check.row_table import RowTable
 
 
 @dataclass
@@ -26,6 +26,26 @@ class Part:
     momentum: FloatArray
     reach: FloatArray
     broken: Break | None = None
+
+    @classmethod
+    def of(cls, frames: IntArray, n_rows: int) -> Part:
+        """Frames that were not looked at yet."""
+        n = len(frames)
+        nothing = np.full(n, np.nan)
+        return cls(
+            np.array(frames, dtype=np.int64),
+            np.zeros(n),
+            Deviations(n_rows, n),
+            nothing,
+            np.zeros((n, 3)),
+            nothing.copy(),
+        )
+
+    def cut(self, n_frames: int) -> None:
+        """Leave out what was not reached."""
+        self.found.cut(n_frames)
+        for name in ("frames", "times", "twice_kinetic", "momentum", "reach"):
+            setattr(self, name, getattr(self, name)[:n_frames])
 
     def with_next(self, other: Part) -> Part:
         return Part(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -50,44 +50,40 @@ def verdict(result: CheckResult) -> Text:
     return Text(result.verdict, style=f"bold {COLOURS[result.status]}")
 
 
+def _table(headers: Sequence[str], rows: Iterable[Sequence[str | Text]], **options: Any) -> Table:
+    """Words to the left, numbers to the right."""
+    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1), **options)
+    for header in headers:
+        shown.add_column(header, justify="left" if header in ("unit", "what") else "right")
+    for row in rows:
+        shown.add_row(*row)
+    return shown
+
+
 def unit_table(result: CheckResult) -> Table:
     """One line for lengths, one for angles."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1))
-    headers = ("rows", "largest", "rms", "rms of rounding", "mean", "largest mean\nof a row", "drift of rms\na ns")
+    headers = ["unit", "rows", "largest", "rms", "rms of rounding", "mean", "largest mean\nof a row"]
+    headers.append("drift of rms\na ns")
     rates = any(unit.rate_rms is not None for unit in result.units)
-    shown.add_column("unit")
-    for header in (*headers, *(("largest |Av|\na ps", "rms |Av|\na ps") if rates else ())):
-        shown.add_column(header, justify="right")
+    if rates:
+        headers += ["largest |Av|\na ps", "rms |Av|\na ps"]
+    rows = []
     for unit in result.units:
-        drift = ""
-        if unit.drift is not None:
-            drift = f"{1000 * unit.drift.slope:.1e}"
-            drift = drift if unit.drift.significant else f"({drift})"
-        cells = [
-            unit.unit,
-            str(unit.n_rows),
-            f"{unit.largest:.2e}",
-            f"{unit.rms:.2e}",
-            f"{unit.rounding_rms:.2e}",
-            f"{unit.mean:.1e}",
-            f"{unit.largest_mean:.1e}",
-            drift,
-        ]
+        drift = "" if unit.drift is None else f"{1000 * unit.drift.slope:.1e}"
+        if unit.drift is not None and not unit.drift.significant:
+            drift = f"({drift})"
+        cells = [unit.unit, str(unit.n_rows), f"{unit.largest:.2e}", f"{unit.rms:.2e}", f"{unit.rounding_rms:.2e}"]
+        cells += [f"{unit.mean:.1e}", f"{unit.largest_mean:.1e}", drift]
         if rates:
             cells += ["" if r is None else f"{r:.1e}" for r in (unit.rate_largest, unit.rate_rms)]
-        shown.add_row(*cells)
-    return shown
+        rows.append(cells)
+    return _table(headers, rows)
 
 
 def row_table(result: CheckResult) -> Table:
     """The worst rows."""
-    shown = Table(title="worst rows", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
-    shown.add_column("row", justify="right")
-    shown.add_column("what")
-    for header in ("target", "largest", "allowed", "mean", "frame"):
-        shown.add_column(header, justify="right")
-    for row in result.worst:
-        shown.add_row(
+    rows: list[list[str | Text]] = [
+        [
             str(row.row),
             row.name,
             f"{row.target:.4f} {row.unit}",
@@ -95,8 +91,11 @@ def row_table(result: CheckResult) -> Table:
             f"{row.allowed:.2e}",
             f"{row.mean:.1e}",
             "" if row.frame is None else str(row.frame),
-        )
-    return shown
+        ]
+        for row in result.worst
+    ]
+    headers = ["row", "what", "target", "largest", "allowed", "mean", "frame"]
+    return _table(headers, rows, title="worst rows", title_justify="left")
 
 
 def plot(result: CheckResult, path: Path | IO[bytes]) -> None:

@@ -92,11 +92,10 @@ class ConstrainedGrowth:
         bound.rows = tuple(row.bind(p) for row in self.rows)
         for number, row in enumerate(bound.rows):
             row.check(p, number)
-        for what, values in (("rate", bound.model.rates(p)), ("source", bound.model.sources(p))):
-            if values is not None and not np.all(np.isfinite(values)):
-                species = int(np.argwhere(~np.isfinite(values))[0][0])
-                raise InputError(f"the {what} of species {species} at the start is not finite", item="rates")
-        bound._refuse(bound._solve(p, bound.model.drift(p)), p)
+        bad = bound.model.not_finite(p)
+        if bad is not None:
+            raise InputError(f"the {bad[0]} of species {bad[1]} at the start is not finite", item="rates")
+        bound._held(p)
         return bound
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
@@ -112,6 +111,12 @@ class ConstrainedGrowth:
         return orthogonal_rows.solve(
             p.x, [row.gradient(p) for row in self.rows], [row.rate(p) for row in self.rows], drift
         )
+
+    def _held(self, p: Populations, drift: FloatArray | None = None) -> orthogonal_rows.Solution:
+        """z where the rows allow one."""
+        found = self._solve(p, self.model.drift(p) if drift is None else drift)
+        self._refuse(found, p)
+        return found
 
     def _refuse(self, found: orthogonal_rows.Solution, p: Populations) -> None:
         """Raise where the rank is lost and the rows ask for the impossible."""
@@ -173,22 +178,17 @@ class ConstrainedGrowth:
         """dx/dt (notes eq. 133), shape of x."""
         p = Populations.from_values(t, x)
         drift = self.model.drift(p)
-        found = self._solve(p, drift)
-        self._refuse(found, p)
-        return drift + p.x * found.z
+        return drift + p.x * self._held(p, drift).z
 
     def constraint_rates(self, t: float, x: ArrayLike) -> FloatArray:
         """z, shape of x (notes eqs. 137, 139)."""
         p = Populations.from_values(t, x)
-        found = self._solve(p, self.model.drift(p))
-        self._refuse(found, p)
-        return found.z
+        return self._held(p).z
 
     def multipliers(self, t: float, x: ArrayLike) -> FloatArray:
         """lambda with z = A^T lambda, shape (m,) or (m, N) (notes eq. 138); of least norm where rows depend."""
         p = Populations.from_values(t, x)
-        found = self._solve(p, self.model.drift(p))
-        self._refuse(found, p)
+        found = self._held(p)
         if p.x.ndim == 1 and np.any(found.dependent):
             A = np.array([row.gradient(p) for row in self.rows])
             return np.asarray(projection.pseudo_inverse(A.T).matrix @ found.z)

@@ -21,7 +21,7 @@ from kcons.constraints.arguments import numbers
 from kcons.errors import BudgetError, InputError
 from kcons.models.growth.compensated_sums import compensated_sum
 from kcons.models.growth.mixture import Mixture
-from kcons.models.growth.model import FloatArray, Populations
+from kcons.models.growth.model import FloatArray, Populations, taken
 from kcons.models.growth.rows import EPSILON, Row
 
 if TYPE_CHECKING:
@@ -150,10 +150,7 @@ class Relaxation(EntropyLaw):
         return 1.0 / (2.0 * self.tau) if not self.partial else None
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
-        taken = copy.copy(self)
-        if self.tau.ndim:
-            taken.tau = self.tau[lanes]
-        return taken
+        return taken(self, lanes, "tau")
 
 
 class NoProduction(EntropyLaw):
@@ -292,15 +289,9 @@ class EntropyRow(Row):
         return bound
 
     def take(self, lanes: NDArray[np.intp]) -> EntropyRow:
-        taken = copy.copy(self)
-        taken.mixture, taken.law = self.mixture.take(lanes), self.law.take(lanes)
-        if np.ndim(self.start):
-            taken.start = np.asarray(self.start)[lanes]
-        if self.total is not None and self.total.ndim:
-            taken.total = self.total[lanes]
-        if self.excess0 is not None and self.excess0.ndim:
-            taken.excess0 = self.excess0[lanes]
-        return taken
+        part = taken(self, lanes, "start", "total", "excess0")
+        part.mixture, part.law = self.mixture.take(lanes), self.law.take(lanes)
+        return part
 
 
 class EntropyBalance(NamedTuple):

@@ -19,7 +19,7 @@ from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
-from kcons.models.growth.model import FloatArray, Populations, positive_populations
+from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 Event = Callable[[float, FloatArray], float]
@@ -167,7 +167,9 @@ def solve(
     """
     solver = _solver(method)
     t0, t1 = _span(t_span)
-    log_start = _start(system, x0, log_x0)
+    log_start = starting_logarithms(x0, log_x0)
+    if log_start.shape != (system.n,):
+        raise InputError(f"the start has shape {log_start.shape}, not ({system.n},)", item="x0")
     p0 = Populations.from_logarithms(t0, log_start)
     bound = system.bind(p0)
     log_start = bound.project(t0, log_start) if project else log_start
@@ -214,14 +216,14 @@ def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
     p = Populations.from_logarithms(t, y)
     if not np.all(np.isfinite(p.x)):
         return
-    for what, values in (("rate", system.model.rates(p)), ("source", system.model.sources(p))):
-        if values is not None and not np.all(np.isfinite(values)):
-            species = int(np.argmin(np.isfinite(values)))
-            raise NonFiniteError(
-                f"the {what} of species {species} is not finite at t = {t:.8g}, "
-                f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
-                item=f"{what}s",
-            )
+    bad = system.model.not_finite(p)
+    if bad is not None:
+        what, species = bad
+        raise NonFiniteError(
+            f"the {what} of species {species} is not finite at t = {t:.8g}, "
+            f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
+            item=f"{what}s",
+        )
 
 
 # -- one step at a time ------------------------------------------------------------------------------
@@ -401,21 +403,6 @@ def _span(t_span: Sequence[float]) -> tuple[float, float]:
     if not (np.isfinite(t0) and np.isfinite(t1)):
         raise InputError("t_span is not finite", item="t_span")
     return t0, t1
-
-
-def _start(system: ConstrainedGrowth, x0: ArrayLike | None, log_x0: ArrayLike | None) -> FloatArray:
-    if (x0 is None) == (log_x0 is None):
-        raise InputError("give the start either as x0 or as log_x0", item="x0")
-    if log_x0 is None:
-        assert x0 is not None
-        log_start = np.log(positive_populations(x0))
-    else:
-        log_start = numbers(log_x0, "log_x0").copy()
-        if not np.all(np.isfinite(log_start)):
-            raise InputError("log_x0 is not finite", item="log_x0")
-    if log_start.shape != (system.n,):
-        raise InputError(f"the start has shape {log_start.shape}, not ({system.n},)", item="x0")
-    return log_start
 
 
 def _times(t_eval: ArrayLike, t0: float, t1: float) -> FloatArray:

@@ -18,7 +18,7 @@ from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import two_sum
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
-from kcons.models.growth.model import FloatArray, Populations, positive_populations
+from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
 
 #: Trajectories that take their steps together.
 BATCH = 2048
@@ -100,15 +100,9 @@ def solve_ensemble(
     times = np.atleast_1d(numbers(t_eval, "t_eval"))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times, axis=0) <= 0) or np.any(times[0] < t0):
         raise InputError("t_eval holds finite times that increase, none before t0", item="t_eval")
-    if (x0 is None) == (log_x0 is None):
-        raise InputError("give the starts either as x0 or as log_x0", item="x0")
-    if log_x0 is None:
-        assert x0 is not None
-        start = np.log(positive_populations(x0))
-    else:
-        start = numbers(log_x0, "log_x0").copy()
-    if start.ndim != 2 or len(start) != system.n or not np.all(np.isfinite(start)):
-        raise InputError(f"the starts have shape ({system.n}, N) and are finite", item="x0")
+    start = starting_logarithms(x0, log_x0)
+    if start.ndim != 2 or len(start) != system.n:
+        raise InputError(f"the starts have shape ({system.n}, N), not {start.shape}", item="x0")
     if system.model.vectorized is False:
         raise InputError(
             "an ensemble needs functions that are vectorized: GrowthModel(..., vectorized=True)", item="model"

@@ -9,7 +9,6 @@ T, so that T(s_eq - s_0) = g(x_0) - g_eq is the only budget of entropy that ends
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Self
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
 from kcons.models.growth.compensated_sums import compensated_sum, two_sum
-from kcons.models.growth.model import FloatArray, Populations
+from kcons.models.growth.model import FloatArray, Populations, taken
 
 #: Below this |ln x/x_eq| the excess of a species is summed as a power series.
 NEAR = 0.2
@@ -144,14 +143,8 @@ class Mixture:
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
         """The mixtures of some of N systems."""
-        taken = copy.copy(self)
-        if self.mu0.ndim == 2:
-            taken.mu0 = self.mu0[:, lanes]
-        if self.kT.ndim:
-            taken.kT = self.kT[lanes]
-        if self._log_w.ndim:
-            taken._log_w, taken._log_fraction = self._log_w[lanes], self._log_fraction[:, lanes]
-        return taken
+        parts = ["mu0"] * (self.mu0.ndim == 2) + ["kT"] + ["_log_w", "_log_fraction"] * (self._log_w.ndim > 0)
+        return taken(self, lanes, *parts)
 
 
 def entropy_function(u: ArrayLike) -> FloatArray:

@@ -9,8 +9,9 @@ For this reason every function here is handed `Populations`, which hold both x a
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from kcons.constraints.arguments import lent, numbers
 from kcons.errors import InputError, NonFiniteError
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 #: A function of time and populations, arguments in SciPy's order.
 OfState = Callable[[float, FloatArray], ArrayLike]
 
@@ -79,6 +81,24 @@ def positive_populations(x: ArrayLike) -> FloatArray:
     return array
 
 
+def starting_logarithms(x0: ArrayLike | None, log_x0: ArrayLike | None) -> FloatArray:
+    """ln x of a start that is given as populations or as their logarithms.
+
+    Raises
+    ------
+    InputError
+        Both or none; populations that are negative, zero or not finite; logarithms that are not finite.
+    """
+    if (x0 is None) == (log_x0 is None):
+        raise InputError("give the start either as x0 or as log_x0", item="x0")
+    if x0 is not None:
+        return np.log(positive_populations(x0))
+    start = numbers(log_x0, "log_x0").copy()
+    if not np.all(np.isfinite(start)):
+        raise InputError("log_x0 is not finite", item="log_x0")
+    return start
+
+
 class GrowthModel:
     """Relative rates phi(t, x) and sources Psi(t, x).
 
@@ -130,6 +150,13 @@ class GrowthModel:
             )
         return psi
 
+    def not_finite(self, p: Populations) -> tuple[str, int] | None:
+        """'rate' or 'source', and the first species of which it is not finite; None if all are."""
+        for what, values in (("rate", self.rates(p)), ("source", self.sources(p))):
+            if values is not None and not np.all(np.isfinite(values)):
+                return what, int(np.argwhere(~np.isfinite(values))[0][0])
+        return None
+
     def drift(self, p: Populations) -> FloatArray:
         """Psi + G phi: dx/dt without constraints (notes eq. 124)."""
         psi = self.sources(p)
@@ -144,6 +171,16 @@ class GrowthModel:
     def take(self, lanes: NDArray[np.intp]) -> GrowthModel:
         """The model of some of N systems side by side; itself where parameters are common to all."""
         return self
+
+
+def taken(item: T, lanes: NDArray[np.intp], *names: str) -> T:
+    """A copy of which arrays of one entry a system, in their last axis, hold some of the systems only."""
+    part = copy.copy(item)
+    for name in names:
+        values = getattr(item, name)
+        if np.ndim(values):
+            setattr(part, name, np.asarray(values)[..., lanes])
+    return part
 
 
 def evaluate(function: OfState, p: Populations, n: int, vectorized: bool, what: str) -> FloatArray:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.arguments import numbers
 from kcons.errors import ConstraintError, InputError
-from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate
+from kcons.models.growth.model import FloatArray, OfState, Populations, evaluate, taken
 
 #: How far off, in parts of its own size, a start may lie from the rows that it is to keep.
 START_TOLERANCE = 1e-10
@@ -140,10 +140,7 @@ class HolonomicRow(Row):
         return bound
 
     def take(self, lanes: NDArray[np.intp]) -> Self:
-        taken = copy.copy(self)
-        if isinstance(self.target, np.ndarray) and self.target.ndim:
-            taken.target = self.target[lanes]
-        return taken
+        return taken(self, lanes, "target")
 
 
 class LinearRow(HolonomicRow):

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from kcons.constraints import Distance
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.images import minimum_image
+from kcons.constraints.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError
@@ -35,11 +35,6 @@ Bonds = Callable[[], IntArray]
 _MOST_EXAMINED, _MOST_ROWS = 200, 600
 
 
-def shortest_image(held: ConstraintSet, d: FloatArray) -> FloatArray:
-    """Vectors of bonds, which are short: their shortest images."""
-    return d if held.lattice is None else minimum_image(d, held.lattice)
-
-
 def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | None) -> IntArray:
     """What counts as a bond, shape (n, 2).
 
@@ -56,7 +51,7 @@ def bonds_of(held: ConstraintSet, x: FloatArray, time: float, given: IntArray | 
         fragment, _ = connected(rows, held.n_atoms)
         sure = sure[fragment[sure[:, 0]] != fragment[sure[:, 1]]]
     pairs, first = np.unique(np.concatenate([np.sort(sure, axis=1), rows]), axis=0, return_index=True)
-    length = np.linalg.norm(shortest_image(held, x[pairs[:, 0]] - x[pairs[:, 1]]), axis=1)
+    length = np.linalg.norm(minimum_image(x[pairs[:, 0]] - x[pairs[:, 1]], held.lattice), axis=1)
     # What is to become longer was a bond, and what is to become shorter will be one.
     order = {tuple(pair): n for n, pair in enumerate(pairs.tolist())}
     place = np.array([order[tuple(pair)] for pair in rows.tolist()], dtype=np.int64)
@@ -272,17 +267,17 @@ class Geometry:
         return np.intersect1d(self.pieces.neighbours(i), self.pieces.neighbours(k)).tolist()
 
     def _lengths(self, x: FloatArray, pairs: IntArray) -> FloatArray:
-        return np.linalg.norm(shortest_image(self.held, x[pairs[:, 1]] - x[pairs[:, 0]]), axis=1)
+        return np.linalg.norm(minimum_image(x[pairs[:, 1]] - x[pairs[:, 0]], self.held.lattice), axis=1)
 
     def _angles(self, x: FloatArray, triples: IntArray) -> FloatArray:
-        u = shortest_image(self.held, x[triples[:, 0]] - x[triples[:, 1]])
-        w = shortest_image(self.held, x[triples[:, 2]] - x[triples[:, 1]])
+        u = minimum_image(x[triples[:, 0]] - x[triples[:, 1]], self.held.lattice)
+        w = minimum_image(x[triples[:, 2]] - x[triples[:, 1]], self.held.lattice)
         return np.arctan2(np.linalg.norm(cross(u, w), axis=1), np.einsum("ni,ni->n", u, w))
 
     def _follows(self, x: FloatArray, atoms: IntArray) -> bool:
         """Whether the rows hold a bond or an angle: its gradient lies in the span of theirs."""
         centre = x[atoms[1]]
-        arms = [shortest_image(self.held, x[a] - centre) for a in atoms[[0, -1]]]
+        arms = [minimum_image(x[a] - centre, self.held.lattice) for a in atoms[[0, -1]]]
         gradient = np.zeros((len(atoms), 3))
         if len(atoms) == 2:
             gradient[0] = arms[0]

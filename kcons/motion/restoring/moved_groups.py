@@ -25,10 +25,11 @@ import scipy.sparse as sp
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import ConvergenceError, ImageError, InfeasibleError, KconsError, SingularGeometryError
-from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry, shortest_image
+from kcons.motion.restoring.kept_geometry import OFF, Bonds, Geometry
 from kcons.motion.restoring.rigid_pieces import Move, bend, free_motions, stretch, torsion
 from kcons.plan.plan import Plan
 
@@ -189,7 +190,7 @@ class _Motions:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry, self.held, self.pieces = geometry, geometry.held, geometry.pieces
         self.time, self.pinned = geometry.time, geometry.pinned
-        self._whole = self.pieces.whole(geometry.start, partial(shortest_image, self.held))
+        self._whole = self.pieces.whole(geometry.start, self.held.lattice)
         self._images = self._whole - geometry.start
         self._left = MOST_MOVES
 
@@ -249,7 +250,7 @@ class _Motions:
 
     def _own(self, family: str, atoms: IntArray) -> tuple[Move | None, tuple[int, int, int] | None]:
         """The motion that changes one row and, if possible, no other bond or angle."""
-        image = partial(shortest_image, self.held)
+        image = partial(minimum_image, lattice=self.held.lattice)
         found: list[tuple[IntArray | None, Move | None]] = []
         if family == "Distance":
             i, k = atoms.tolist()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.one_piece import make_whole, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.topology.topology import connected, sorted_pairs
@@ -43,10 +44,7 @@ class Pieces:
         kept = np.zeros(n_atoms, dtype=bool)
         kept[np.isin(label, label[atoms])] = True
         self.bonds = pairs[kept[pairs].all(axis=1)] if len(pairs) else pairs
-        both = np.concatenate([self.bonds, self.bonds[:, ::-1]])
-        both = both[np.lexsort((both[:, 1], both[:, 0]))]
-        degree = np.bincount(both[:, 0], minlength=n_atoms)
-        self._ends, self._starts = both[:, 1], np.concatenate([[0], np.cumsum(degree)])
+        self._starts, self._ends = neighbour_lists(self.bonds, n_atoms)
         self.label = label
         self._walk(np.flatnonzero(kept))
 
@@ -120,14 +118,10 @@ class Pieces:
             return np.setdiff1d(whole, self.atoms[self._begin[j] : self._end[j]], assume_unique=True)
         return None
 
-    def whole(self, x: FloatArray, minimum_image: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    def whole(self, x: FloatArray, lattice: FloatArray | None) -> FloatArray:
         """Positions with every molecule in one piece: each atom in the image next to the one it was reached from."""
-        y = x.copy()
-        for k in self.atoms.tolist():
-            j = self._parent[k]
-            if j >= 0:
-                y[k] = y[j] + minimum_image(x[k] - y[j])
-        return y
+        parents = [k if self._parent[k] < 0 else self._parent[k] for k in self.atoms.tolist()]
+        return make_whole(x, self.atoms, np.array(parents, dtype=np.int64), lattice)
 
 
 @dataclass(frozen=True)

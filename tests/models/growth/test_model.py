@@ -5,6 +5,7 @@ import pytest
 
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth import ConstrainedGrowth, GrowthModel, Populations, solve
+from kcons.models.growth.model import starting_logarithms
 
 
 def test_drift_is_the_equation_of_the_notes():
@@ -87,3 +88,23 @@ def test_rates_that_are_not_numbers_are_refused():
     model = GrowthModel(lambda t, x: [np.nan, 1.0], n=2)
     with pytest.raises(InputError, match=r"rate.*not finite"):
         solve(ConstrainedGrowth(model), (0.0, 1.0), [1.0, 1.0])
+
+
+def test_a_start_is_given_in_one_way():
+    assert starting_logarithms([1.0, np.e], None).tolist() == [0.0, 1.0]
+    given = np.array([0.0, -1e6])
+    found = starting_logarithms(None, given)
+    assert found.tolist() == given.tolist() and found is not given
+    for both in ((None, None), ([1.0], [0.0])):
+        with pytest.raises(InputError, match="either as x0 or as log_x0"):
+            starting_logarithms(*both)
+    with pytest.raises(InputError, match="log_x0 is not finite"):
+        starting_logarithms(None, [0.0, -np.inf])
+
+
+def test_what_is_not_finite_is_named():
+    model = GrowthModel(lambda t, x: [0.0, t], lambda t, x: [1.0 / x[0], 0.0], n=2)
+    with np.errstate(all="ignore"):
+        assert model.not_finite(Populations.from_values(1.0, [1.0, 1.0])) is None
+        assert model.not_finite(Populations.from_values(np.inf, [1.0, 1.0])) == ("rate", 1)
+        assert model.not_finite(Populations(1.0, np.zeros(2), np.full(2, -800.0))) == ("source", 0)

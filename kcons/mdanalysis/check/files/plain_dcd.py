@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-import numba as nb
 import numpy as np
 from MDAnalysis.coordinates.DCD import DCDReader
 from MDAnalysis.coordinates.timestep import Timestep
@@ -24,7 +23,6 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.mdanalysis.check.frame_kernels import farthest, lengths, powers_below, triangles
 
 #: Bytes of a block: what stays in the cache of a core.
 BLOCK = 1 << 20
@@ -177,130 +175,3 @@ def plain_dcd(reader: Any) -> PlainDcd | None:
     if fixed or (charmm and fourth) or opening != (CELL if charmm and cell else 4 * reader.n_atoms):
         return None
     return PlainDcd(reader, begin, charmm and cell)
-
-
-@nb.njit(cache=True, nogil=True)
-def _gather(words, begin, points, powers):  # type: ignore[no-untyped-def]
-    """Coordinates of a frame, atom by atom; see `powers_below`."""
-    n = len(points)
-    values = words.view(np.float32)
-    x, y, z = values[begin + 1 :], values[begin + n + 3 :], values[begin + 2 * n + 5 :]
-    for a in range(n):
-        points[a, 0], points[a, 1], points[a, 2] = x[a], y[a], z[a]
-    powers_below(points.reshape(-1), powers)
-
-
-@nb.njit(cache=True, nogil=True)
-def look_at(  # type: ignore[no-untyped-def]
-    words,
-    begin,
-    points,
-    powers,
-    first,
-    summed_every,
-    reach_every,
-    n_all,
-    limits,
-    lattices,
-    rounding,
-    corners,
-    corner_targets,
-    corner_slack,
-    corner_margins,
-    corner_largest,
-    corner_sums,
-    places,
-    targets,
-    slack,
-    margins,
-    largest,
-    sums_by_row,
-    found,
-    side,
-    place,
-    far,
-):
-    """`triangles` and `lengths` of all frames of a block.
-
-    Parameters
-    ----------
-    words, begin
-        See `Block`.
-    points : ndarray of float32, shape (n_atoms, 3)
-        Room; on return the last frame that was looked at.
-    powers : ndarray of float32, shape (n_atoms,)
-        Room.
-    first, summed_every, reach_every, n_all : int
-        Place of the first frame among n_all; one frame in how many counts in the sums by row, and in the reach.
-    limits, lattices : ndarray, shape (n_frames,), (n_frames, 2, 3, 3)
-        See `lengths`; limits are NaN where the cell is.
-    rounding : (float, float, float)
-        step, base and factor, see `lengths`.
-    found : ndarray, shape (6, n_frames)
-        Filled with what `lengths` returns, but the row.
-    side, place : ndarray, shape (n_frames,)
-        Filled. `side` is -1 where the worst row is a single one, and `place` its number.
-    far : ndarray of int32, shape (n_frames,)
-        Filled where `reach_every` says so: see `farthest`.
-
-    Returns
-    -------
-    int
-        Frames until the first that is not finite.
-    """
-    x = points.reshape(-1)
-    step, base, factor = rounding
-    has_triangles, has_singles = corner_targets.shape[1] > 0, len(targets) > 0
-    for f in range(len(words)):
-        k = first + f
-        _gather(words[f], begin, points, powers)
-        summed = k % summed_every == 0
-        if np.isnan(limits[f]):
-            return f
-        sums, squares, worst, excess, coarsest, seen = 0.0, 0.0, 0.0, -np.inf, 0.0, 0.0
-        side[f], place[f] = -1, 0
-        if has_triangles:
-            sums, squares, worst, excess, side[f], place[f], coarsest, seen = triangles(
-                x,
-                corners,
-                corner_targets,
-                corner_slack,
-                limits[f],
-                lattices[f],
-                step,
-                base,
-                factor,
-                powers,
-                corner_margins,
-                corner_largest,
-                corner_sums,
-                summed,
-            )
-        if has_singles:
-            more, more_squares, most, more_excess, row, coarse, more_seen = lengths(
-                x,
-                places,
-                targets,
-                slack,
-                limits[f],
-                lattices[f],
-                step,
-                base,
-                factor,
-                powers,
-                margins,
-                largest,
-                sums_by_row,
-                summed,
-            )
-            sums, squares, seen = sums + more, squares + more_squares, seen + more_seen
-            worst, coarsest = max(worst, most), max(coarsest, coarse)
-            if more_excess > excess:
-                excess, side[f], place[f] = more_excess, -1, row
-        if not squares < np.inf:
-            return f
-        found[0, f], found[1, f], found[2, f] = sums, squares, worst
-        found[3, f], found[4, f], found[5, f] = excess, coarsest, seen
-        if k % reach_every == 0 or k == n_all - 1:
-            far[f] = farthest(x)
-    return len(words)

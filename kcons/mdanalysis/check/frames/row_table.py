@@ -13,21 +13,11 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import NonFiniteError
-from kcons.mdanalysis.check.deviations import UNITS, Deviations
 from kcons.mdanalysis.check.files.file_precision import FilePrecision
-from kcons.mdanalysis.check.files.plain_dcd import Block, look_at
-from kcons.mdanalysis.check.frame_kernels import (
-    LANES,
-    UNIFORM,
-    coordinate_grid,
-    farthest,
-    filled,
-    length_rates,
-    lengths,
-    padded,
-    powers_below,
-    triangles,
-)
+from kcons.mdanalysis.check.files.plain_dcd import Block
+from kcons.mdanalysis.check.frames.deviations import UNITS, Deviations
+from kcons.mdanalysis.check.frames.frame_kernels import coordinate_grid, farthest
+from kcons.mdanalysis.check.frames.length_table import LengthTable, size_of
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 
 #: What second order adds to the error of rows other than distances, at most.
@@ -79,18 +69,8 @@ class RowTable:
                 other_rows.append(np.arange(first, end))
         self.length_rows: IntArray = np.concatenate(length_rows)
         self.other_rows: IntArray = np.concatenate(other_rows)
-        self._pairs, wanted = np.concatenate(pairs), np.concatenate(held)
-        self._all_places: NDArray[np.uint32] | None = None
-        # Rigid water first: three sides at once, for less than two. What is left goes one by one.
-        sides = _triangles(self._pairs)
-        single = np.ones(len(self._pairs), dtype=bool)
-        single[sides.ravel()] = False
-        self._triangle_rows = self.length_rows[sides]
-        corners = np.stack([self._pairs[sides[0], 0], self._pairs[sides[0], 1], self._pairs[sides[1], 1]])
-        self._corners = np.ascontiguousarray(corners, dtype=np.uint32)
-        self._triangle_targets = np.ascontiguousarray(wanted[sides])
-        self._single_rows = self.length_rows[single]
-        self._places, self._targets = padded(self._pairs[single], wanted[single])
+        self._pairs = np.concatenate(pairs)
+        self._lengths = LengthTable(self.length_rows, self._pairs, np.concatenate(held), constraint_set.n_atoms)
         self._others: ConstraintSet | None = None
         if len(self.other_rows):
             self._others, self._other_atoms = constraint_set.subset(self.other_rows)
@@ -100,16 +80,7 @@ class RowTable:
     def allow(self, slack: FloatArray) -> None:
         """Say what each row may be off by, besides the rounding of its coordinates; shape (n_rows,)."""
         self._slack = slack
-        self._triangle_slack = np.ascontiguousarray(slack[self._triangle_rows])
-        self._single_slack = filled(slack[self._single_rows])
-
-    def _forget(self) -> None:
-        """Begin anew, with room of one's own."""
-        self._powers = np.zeros(self.set.n_atoms, dtype=np.float32)
-        triangles, singles = self._triangle_targets.shape, self._targets.shape
-        self._triangle_margins, self._margins = (np.full(n, -np.inf, np.float32) for n in (triangles, singles))
-        self._triangle_largest, self._largest = (np.zeros(n, np.float32) for n in (triangles, singles))
-        self._triangle_sums, self._sums = np.zeros((3, *triangles)), np.zeros((3, *singles))
+        self._lengths.allow(slack)
 
     @property
     def only_lengths(self) -> bool:
@@ -120,7 +91,7 @@ class RowTable:
         """One that shares all but what is changed while frames are looked at; each worker needs its own to look."""
         other = copy.copy(self)
         other._box, other._dimensions = np.zeros((2, 3, 3)), ()
-        other._forget()
+        other._lengths = self._lengths.fresh()
         return other
 
     def errors_of(
@@ -221,58 +192,10 @@ class RowTable:
             atom = int(np.argmin(np.isfinite(v.reshape(-1, 3)).all(axis=1)))
             raise NonFiniteError(f"velocity of atom {atom} is {v.reshape(-1, 3)[atom]}", item="velocity", atom=atom)
         if len(self.length_rows):
-            far = size_of(farthest(x)) if self.precision.exact else 0.0
-            base, factor = self.precision.coefficients(far)
-            powers = UNIFORM
-            if factor > 0:
-                powers = self._powers
-                powers_below(x, powers)
-            rounding = (self.precision.grid, base, factor, powers)
-            here, row = into.by_frame[0, :, k], -1
-            if self._triangle_rows.size:
-                *found, side, triangle, coarsest, seen = triangles(
-                    x,
-                    self._corners,
-                    self._triangle_targets,
-                    self._triangle_slack,
-                    limit,
-                    lattice,
-                    *rounding,
-                    self._triangle_margins,
-                    self._triangle_largest,
-                    self._triangle_sums,
-                    summed,
-                )
-                here[:] = (*found, coarsest, seen)
-                row = self._triangle_rows[side, triangle]
-            if len(self._single_rows):
-                sums, squares, worst, excess, place, coarsest, seen = lengths(
-                    x,
-                    self._places,
-                    self._targets,
-                    self._single_slack,
-                    limit,
-                    lattice,
-                    *rounding,
-                    self._margins,
-                    self._largest,
-                    self._sums,
-                    summed,
-                )
-                if excess > here[3]:
-                    row = self._single_rows[min(place, len(self._single_rows) - 1)]
-                here[[0, 1, 5]] += sums, squares, seen + len(self._single_rows) - len(self._targets)
-                here[2:5] = np.maximum(here[2:5], (worst, excess, coarsest))
-            if not here[1] < np.inf:
+            if not self._lengths.look(into, k, x, (lattice, limit), self.precision, summed):
                 self.refuse(x)
-            into.worst_row[0, k] = row
             if v is not None:
-                if self._all_places is None:
-                    self._all_places, _ = padded(self._pairs, 0.0)
-                n = len(self.length_rows)
-                squares, worst, row = length_rates(x, v, self._all_places, n, limit, lattice, self.precision.grid)
-                into.rate_squares[0, k] = squares
-                into.rate_worst[0, k], into.rate_row[0, k] = worst, self.length_rows[row]
+                self._lengths.look_at_rates(into, k, x, v, (lattice, limit), self.precision.grid)
         if self._others is not None:
             self._look_at_others(into, k, x, v, lattice if limit < np.inf else None, time, summed)
 
@@ -304,62 +227,12 @@ class RowTable:
             lattices[f], limits[f] = self.cell_of(block.dimensions[f])
         if alike:
             lattices[1:], limits[1:] = lattices[0], limits[0]
-        here = slice(k, k + n)
-        side, place = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        far = np.full(n, np.float32(np.nan).view(np.int32))
-        done = look_at(
-            block.words,
-            block.x,
-            points,
-            self._powers,
-            k,
-            *every,
-            into.n_frames,
-            limits,
-            lattices,
-            (0.0, *self.precision.coefficients(0.0)),
-            self._corners,
-            self._triangle_targets,
-            self._triangle_slack,
-            self._triangle_margins,
-            self._triangle_largest,
-            self._triangle_sums,
-            self._places,
-            self._targets,
-            self._single_slack,
-            self._margins,
-            self._largest,
-            self._sums,
-            into.by_frame[0, :, here],
-            side,
-            place,
-            far,
-        )
-        into.seen[0, k : k + done] -= len(self._targets) - len(self._single_rows)
-        rows = np.where(
-            side < 0, self._row_of(self._single_rows, place), self._row_of(self._triangle_rows, place, side)
-        )
-        into.worst_row[0, here] = rows
-        return done, size_of(far)
-
-    @staticmethod
-    def _row_of(rows: IntArray, place: IntArray, side: IntArray | None = None) -> IntArray:
-        """Numbers of rows; where they are not of this kind, any."""
-        n = rows.shape[-1]
-        if not n:
-            return np.full(len(place), -1, dtype=np.int64)
-        at = np.minimum(place, n - 1)
-        result: IntArray = rows[at] if side is None else rows[np.maximum(side, 0), at]
-        return result
+        coefficients = self.precision.coefficients(0.0)
+        return self._lengths.look_at_block(into, k, block, points, every, (lattices, limits), coefficients)
 
     def collect(self, into: Deviations) -> None:
         """Put what was found by row where it belongs."""
-        n = len(self._single_rows)
-        for rows, margins, largest, sums in (
-            (self._single_rows, self._margins[:n], self._largest[:n], self._sums[:, :n]),
-            (self._triangle_rows, self._triangle_margins, self._triangle_largest, self._triangle_sums),
-        ):
-            into.margins[rows], into.largest[rows], into.by_row[:, rows] = margins, largest, sums
+        self._lengths.collect(into)
 
     def _look_at_others(
         self,
@@ -428,27 +301,6 @@ class RowTable:
         if len(bad):
             raise NonFiniteError(f"position of atom {bad[0]} is {points[bad[0]]}", item="position", atom=int(bad[0]))
         raise NonFiniteError("a length is no number", item="position")
-
-
-def size_of(bits: Any) -> Any:
-    """What `farthest` found, as a number."""
-    found = np.asarray(bits, dtype=np.int32).view(np.float32)
-    return found.astype(np.float64) if found.ndim else float(found)
-
-
-def _triangles(pairs: IntArray) -> IntArray:
-    """Rows that follow each other as (a, b), (a, c), (b, c): shape (3, n), n a multiple of four."""
-    if len(pairs) < 3:
-        return np.zeros((3, 0), dtype=np.int64)
-    one, two, three = pairs[:-2], pairs[1:-1], pairs[2:]
-    fits = (one[:, 0] == two[:, 0]) & (one[:, 1] == three[:, 0]) & (two[:, 1] == three[:, 1])
-    chosen, free = [], 0
-    for k in np.flatnonzero(fits).tolist():
-        if k >= free:
-            chosen.append(k)
-            free = k + 3
-    first = np.array(chosen[: len(chosen) // LANES * LANES], dtype=np.int64)
-    return np.stack([first, first + 1, first + 2])
 
 
 def cell_matrix(dimensions: Any) -> FloatArray | None:
