@@ -1,7 +1,7 @@
 """RATTLE at the speed of OpenMM's own Verlet: compiled leapfrog steps, with velocities at the positions on both ends.
 
-n steps of velocity Verlet are half a kick and a drift, n - 1 leapfrog steps, and half a kick, which ends with velocities
-tangent to the constraints. OpenMM interprets the steps of a CustomIntegrator and has compiled those of its
+n steps of velocity Verlet are half a kick and a drift, n - 1 leapfrog steps, and half a kick, which ends with
+velocities tangent to the constraints. OpenMM interprets the steps of a CustomIntegrator and has compiled those of its
 VerletIntegrator; so the ends are a CustomIntegrator here, and what lies between is OpenMM's own. The forces of the last
 half kick are those of the first of the next call: n steps cost n evaluations, in however many calls.
 """
