@@ -10,7 +10,6 @@ horizon in more and more steps, until more steps make it worse.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kcons import State, System, run, steppers
-from kcons.comparison import METHODS, Reference, scenes
+from kcons.comparison import METHODS, Reference, json_files, scenes
 from kcons.comparison import measure as compare
 
 STEP_METHODS = ("rattle", "blanes-moan4", "blanes-moan6")
@@ -183,9 +182,9 @@ def main() -> None:
     parser.add_argument("--redraw", type=Path, help="numbers of an earlier run instead of a new one")
     parser.add_argument("--plot", type=Path, help="file for the figure")
     options = parser.parse_args()
-    result = measure(options.full) if options.redraw is None else json.loads(options.redraw.read_text())
+    result = measure(options.full) if options.redraw is None else json_files.read(options.redraw)
     if options.out is not None:
-        options.out.write_text(json.dumps(result, indent=None, ensure_ascii=False) + "\n")
+        json_files.write(options.out, result, indent=None)
     if options.plot is not None:
         plot(result, options.plot)
     print(show(result))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from kcons.comparison.averages.sampling import GOAL, METHODS, Sampled, SamplingComparison
+from kcons.comparison.study import json_files
 from kcons.comparison.work_precision.measure import duration
 
 #: Colour-blind safe (Okabe and Ito), and a marker each.
@@ -176,9 +176,7 @@ def write(comparison: SamplingComparison, folder: Path, *, tables: Sequence[str]
     """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
-    data.write_text(
-        json.dumps(comparison.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    json_files.write(data, comparison.to_dict())
     plot(comparison, picture)
     written = [data, picture]
     if tables:

@@ -204,5 +204,6 @@ def _words(cell: Mapping[str, Any] | None) -> str:
     checks = cell["checks"]
     bad = [c for c in checks if not c["passed"]]
     told = bad[0] if bad else max(checks, key=lambda c: c["value"] / c["limit"] if c["limit"] else 0.0)
-    number = f"{told['name']} {told['value']:.2g}"
+    # Files hold null for NaN.
+    number = f"{told['name']} {'nan' if told['value'] is None else format(told['value'], '.2g')}"
     return f"right: {number}" if cell["verdict"] == "right" else f"**{cell['verdict']}**: {number}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 from kcons import __version__
 from kcons.comparison.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.comparison.hard_cases.worker import Worker
+from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import code_digest, environment
 from kcons.comparison.work_precision.measure import Watcher
 from kcons.errors import InputError
-from kcons.steppers.files import in_one_piece
 
 FORMAT = "kcons-hard-cases-1"
 #: Seconds after which a program that has not answered is given up: quick and full.
@@ -107,8 +106,7 @@ def save(result: Mapping[str, Any], path: Path, before: Mapping[str, Any] | None
     cells = {**(before or {})}
     for name, row in result["cells"].items():
         cells[name] = {**cells.get(name, {}), **row}
-    with in_one_piece(path) as file:
-        file.write((json.dumps({**result, "cells": cells}, indent=1) + "\n").encode())
+    json_files.write(path, {**result, "cells": cells})
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -119,13 +117,7 @@ def load(path: Path) -> dict[str, Any]:
     InputError
         The file holds none.
     """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["format"] != FORMAT:
-            raise KeyError("format")
-    except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} holds no result of kcons hardcases: {error!r}", item="file") from None
-    return dict(found)
+    return json_files.read(path, FORMAT, of="kcons hardcases")
 
 
 def _earlier(kept: Path | None, made_by: Mapping[str, Any]) -> dict[str, Any]:
@@ -135,7 +127,7 @@ def _earlier(kept: Path | None, made_by: Mapping[str, Any]) -> dict[str, Any]:
         found = load(kept)
     except InputError:
         return {}
-    return dict(found["cells"]) if found["made_by"] == json.loads(json.dumps(made_by)) else {}
+    return dict(found["cells"]) if found["made_by"] == json_files.plain(made_by) else {}
 
 
 def _described(case: Case) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 from kcons import __version__
 from kcons.comparison.stability import fuzz, runs
 from kcons.comparison.stability.scenes import SCENES
+from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import code_digest, environment
 from kcons.comparison.work_precision.measure import Watcher
 from kcons.errors import InputError
-from kcons.steppers.files import in_one_piece
 
 FORMAT = "kcons-stability-1"
 PARTS = ("steps", "drift", "reversal", "fuzz")
@@ -61,7 +60,7 @@ def run(
     made_by = {"version": __version__, "code": code_digest(), "quick": quick}
     result: dict[str, Any] = {"format": FORMAT, "made_by": made_by, "environment": environment(), "pieces": {}}
     if kept is not None and kept.is_file():
-        before = json.loads(kept.read_text(encoding="utf-8"))
+        before = json_files.read(kept)
         if before.get("format") == FORMAT and before["made_by"] == made_by:
             result["pieces"] = before["pieces"]
     watcher = watcher or Watcher()
@@ -72,7 +71,7 @@ def run(
         if name not in result["pieces"]:
             result["pieces"][name] = call()
             if kept is not None:
-                save(result, kept)
+                json_files.write(kept, result)
     watcher.end()
     return result
 
@@ -96,12 +95,6 @@ def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> list[tuple[str, Ca
         (f"fuzz/{k}", lambda k=k: [asdict(fuzz.trial(seed)) for seed in range(k, min(k + batch, trials))])  # type: ignore[misc]
         for k in range(0, trials, batch)
     ]
-
-
-def save(result: dict[str, Any], path: Path) -> None:
-    """Write in one piece."""
-    with in_one_piece(path) as file:
-        file.write((json.dumps(result, indent=1) + "\n").encode())
 
 
 def digest(result: dict[str, Any]) -> dict[str, Any]:
@@ -130,17 +123,15 @@ def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[s
     """
     if result["made_by"]["quick"]:
         raise InputError("these results are quick ones; run without --quick", item="into")
-    before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if before.get("format") != FORMAT:
-        raise InputError(f"{path} has no results of the stability study", item="into")
+    before = json_files.read(path, FORMAT, of="kcons stability")
     made = {"made_by": result["made_by"], "environment": result["environment"]}
     names = [name for name in result["pieces"] if not name.startswith("fuzz/")]
     summed = {"fuzz": result["fuzz"]} if "fuzz" in result else {}
-    after = {
-        **before,
+    added = {
         **summed,
         "pieces": {**before["pieces"], **{name: result["pieces"][name] for name in names}},
         "added": {**before.get("added", {}), **dict.fromkeys([*names, *summed], made)},
     }
-    save(after, path)
+    after = json_files.plain({**before, **added})
+    json_files.write(path, after)
     return before, after

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import process_time
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import environment
 
 if TYPE_CHECKING:
@@ -110,11 +110,11 @@ def script(
     """
     chosen = parser.parse_args(arguments)
     if chosen.show:
-        show(json.loads(chosen.show.read_text(encoding="utf-8")))
+        show(json_files.read(chosen.show))
         return
     result = measure(chosen)
     if chosen.out:
-        chosen.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        json_files.write(chosen.out, result)
     show(result)
 
 
@@ -132,7 +132,7 @@ def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick
 
     def keep(result: dict[str, Any]) -> None:
         if out:
-            out.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n", encoding="utf-8")
+            json_files.write(out, {**result, "environment": environment()})
 
-    earlier = json.loads(out.read_text(encoding="utf-8")) if out and out.exists() else None
+    earlier = json_files.read(out) if out and out.exists() else None
     return measure(quick=quick, keep=keep, earlier=earlier)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -14,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from kcons.comparison.methods.methods import METHODS
+from kcons.comparison.study import json_files
 from kcons.comparison.study.html_page import PageTable
 from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_HOST, Cost, Standing, verdict
 from kcons.comparison.work_precision.measurement import Comparison, Measurement, duration
@@ -352,9 +352,7 @@ def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -
     """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
-    data.write_text(
-        json.dumps(plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    json_files.write(data, comparison.to_dict())
     plot(comparison, picture)
     written = [data, picture]
     if tables:
@@ -391,14 +389,3 @@ def page_table(comparison: Comparison) -> PageTable:
         )
         marks.append("good" if front else "bad" if m.status == "failed" else "")
     return PageTable(headings, rows, text_columns=(0, 3, len(headings) - 1), marks=marks)
-
-
-def plain(value: Any) -> Any:
-    """JSON has no NaN: it becomes null."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -7,7 +7,6 @@ an interrupted run goes on where it stopped.
 from __future__ import annotations
 
 import gc
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -20,6 +19,7 @@ from kcons import __version__
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.scenes import Scene
+from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import code_digest, environment
 from kcons.comparison.work_precision import whole_page
 from kcons.comparison.work_precision.measure import Watcher, compare, reference_of
@@ -30,6 +30,8 @@ from kcons.comparison.work_precision.timing_rounds import FULL_ROUNDS, QUICK_ROU
 from kcons.errors import InputError, KconsError
 
 FORMAT = "kcons-report-1"
+#: Digits that go to files.
+DIGITS = 4
 #: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
 QUICK_SECONDS = 280.0
 
@@ -98,7 +100,7 @@ def run(
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
     """What a measurement depends on: code, scene, settings."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(item)))
+    plain = json_files.plain(asdict(item))
     for name in ("heading", "seconds", "quick_seconds"):
         plain.pop(name)
     return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
@@ -207,18 +209,13 @@ def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[s
 def read(folder: Path, key: str) -> dict[str, Any] | None:
     """What was measured of a part; None where there is nothing that can be read."""
     try:
-        data: dict[str, Any] = json.loads((folder / f"{key}.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return unpacked(json_files.read(folder / f"{key}.json", FORMAT))
+    except (OSError, InputError):
         return None
-    return unpacked(data) if data.get("format") == FORMAT else None
 
 
 def _put(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
-    # Aside and then into place: a run that is interrupted leaves no half of a file.
-    path = folder / f"{item.key}.json"
-    beside = path.with_suffix(".part")
-    beside.write_text(packed(found), encoding="utf-8")
-    beside.replace(path)
+    json_files.write(folder / f"{item.key}.json", packed(found))
 
 
 def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
@@ -228,16 +225,14 @@ def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
 
 def packed(found: Mapping[str, Any]) -> str:
     """JSON, four digits, measurements one a line under the names of their columns."""
-    data = _slim(found)
+    data = json_files.plain(found, DIGITS)
     lines: list[str] = []
     if "comparison" in data:
-        measurements = found["comparison"]["measurements"]
+        measurements = data["comparison"]["measurements"]
         columns = list(measurements[0]) if measurements else []
-        rows = [[_slim(m[name]) for name in columns] for m in measurements]
-        lines = [json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows]
+        lines = [json_files.text([m[name] for name in columns], indent=None) for m in measurements]
         data["comparison"] = {**data["comparison"], "columns": columns, "measurements": "ROWS"}
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    return text.replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]") + "\n"
+    return json_files.text(data).replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]")
 
 
 def unpacked(data: dict[str, Any]) -> dict[str, Any]:
@@ -251,17 +246,6 @@ def unpacked(data: dict[str, Any]) -> dict[str, Any]:
         for row in comparison["measurements"]
     ]
     return {**data, "comparison": comparison}
-
-
-def _slim(value: Any) -> Any:
-    from kcons.comparison.work_precision.report import plain
-
-    value = plain(value)
-    if isinstance(value, dict):
-        return {key: _slim(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_slim(item) for item in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def redraw(folder: Path, into: Path | None = None) -> list[Path]:

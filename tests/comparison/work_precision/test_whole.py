@@ -64,7 +64,7 @@ def test_files_of_every_part(finished):
     assert names >= {"index.html", "gone.json", "later.json"}
     for key in ("chain-3", "sphere"):
         assert names >= {f"{key}.json", f"{key}.png", f"{key}.txt"}
-    assert not [name for name in names if name.endswith(".part")]
+    assert not [name for name in names if name.endswith(".unfinished")]
     assert "kcons RATTLE" in (finished / "sphere.txt").read_text(encoding="utf-8")
 
 
