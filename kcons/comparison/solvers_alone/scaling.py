@@ -20,8 +20,9 @@ import numpy as np
 
 from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES, STAGES
 from kcons.comparison.solvers_alone.bare_systems import BareSystem, chain, water
-from kcons.comparison.solvers_alone.solver_precision import COLORS, MARKERS
-from kcons.comparison.study.html_page import PageTable
+from kcons.comparison.solvers_alone.solver_precision import LOOKS
+from kcons.comparison.study.curves import Curve, Panel, draw
+from kcons.comparison.study.tables import Table
 from kcons.comparison.work_precision.measure import Watcher
 
 if TYPE_CHECKING:
@@ -202,33 +203,26 @@ def exponents(result: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
 
 def figure(result: Mapping[str, Any]) -> Figure:
     """Seconds of P and V, and memory, against size; exponents in the legends."""
-    from matplotlib.figure import Figure
-
     kinds = [kind for kind in KINDS if any(p["kind"] == kind for p in result["points"])]
     fields = {"p_seconds": "positions, s", "v_seconds": "velocities, s", MEMORY: "memory, bytes"}
     fitted = exponents(result)
-    page = Figure(figsize=(13.0, 3.6 * max(len(kinds), 1)), layout="constrained")
-    panels = page.subplots(max(len(kinds), 1), len(fields), squeeze=False)
-    for row, kind in enumerate(kinds):
-        for column, (field, label) in enumerate(fields.items()):
-            axes = panels[row, column]
-            for candidate in CANDIDATES:
-                points = [p for p in _of(result, kind, candidate.name) if p.get(field)]
-                if not points:
-                    continue
+
+    def panel(kind: str, field: str, label: str) -> Panel:
+        curves = []
+        for candidate in CANDIDATES:
+            points = [p for p in _of(result, kind, candidate.name) if p.get(field)]
+            if points:
                 power = fitted.get((kind, candidate.name, field))
                 text = candidate.title + ("" if power is None else f", $N^{{{power:.2f}}}$")
-                style = dict(color=COLORS[candidate.name], marker=MARKERS[candidate.name])
-                axes.loglog([p["size"] for p in points], [p[field] for p in points], label=text, **style)
-            axes.set_xlabel(KINDS[kind][1])
-            axes.set_ylabel(label)
-            axes.grid(alpha=0.3)
-            if axes.lines:
-                axes.legend(fontsize="x-small")
-    return page
+                sizes, costs = [p["size"] for p in points], [p[field] for p in points]
+                curves.append(Curve(sizes, costs, text, LOOKS[candidate.name]))
+        return Panel(curves, KINDS[kind][1], label, legend="x-small")
+
+    panels = [[panel(kind, field, label) for field, label in fields.items()] for kind in kinds]
+    return draw(panels or [[Panel([])] * len(fields)], (13.0, 3.6 * max(len(kinds), 1)))
 
 
-def table(result: Mapping[str, Any]) -> PageTable:
+def table(result: Mapping[str, Any]) -> Table:
     """All points, and under each solver its exponents."""
     titles = {candidate.name: candidate.title for candidate in CANDIDATES}
     headings = ("system", "size", "solver", "P, s", "V, s", "set-up, s", "memory, MB", "note")
@@ -248,7 +242,7 @@ def table(result: Mapping[str, Any]) -> PageTable:
                 shown = ["" if power is None else f"N^{power:.2f}" for power in powers]
                 rows.append([what, "exponent", titles[candidate.name], *shown, f"from {FIT_FROM:,} on"])
                 marks.append("")
-    return PageTable(headings, rows, text_columns=(0, 2, 7), marks=marks)
+    return Table(headings, rows, words=(0, 2, 7), marks=marks)
 
 
 def _of(result: Mapping[str, Any], kind: str, solver: str) -> list[Mapping[str, Any]]:

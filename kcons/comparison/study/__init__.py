@@ -3,5 +3,7 @@
 - `json_files`: results in files
 - `machine`: where something was measured, and with what code
 - `scripts`: calls timed in turn, tables, options of scripts
+- `tables`, `curves`: what is shown, and its writers
+- `report_files`: the files of a report
 - `html_page`: one self-contained HTML page
 """

@@ -12,9 +12,10 @@ import numpy as np
 
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import environment
+from kcons.comparison.study.tables import Table, terminal
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.table import Table as RichTable
 
 
 def in_turn(
@@ -61,7 +62,7 @@ def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict
 
 def table(
     title: str, headings: Sequence[str], words: Collection[str] = (), rows: Iterable[Sequence[str]] = ()
-) -> Table:
+) -> RichTable:
     """A table whose columns are numbers, but for those whose headings are in `words`.
 
     Parameters
@@ -71,14 +72,8 @@ def table(
     words : collection of str, optional
     rows : iterable of sequence of str, optional
     """
-    from rich.table import Table
-
-    made = Table(title=title)
-    for heading in headings:
-        made.add_column(heading, justify="left" if heading in words else "right")
-    for row in rows:
-        made.add_row(*row)
-    return made
+    columns = [k for k, heading in enumerate(headings) if heading in words]
+    return terminal(Table(headings, list(rows), columns, title=title))
 
 
 def options(about: str | None, *, full: str) -> argparse.ArgumentParser:

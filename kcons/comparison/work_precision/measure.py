@@ -21,8 +21,9 @@ from kcons.comparison.methods.methods import METHODS, chosen
 from kcons.comparison.scenes import Reference, Scene
 from kcons.comparison.scenes.potential import Potential
 from kcons.comparison.study.machine import environment, kernels_cached
+from kcons.comparison.study.tables import duration
 from kcons.comparison.work_precision import timing_rounds
-from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status, duration
+from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.study import html_page
-from kcons.comparison.study.html_page import PageTable, Section
+from kcons.comparison.study.html_page import Section
+from kcons.comparison.study.tables import Table, duration, markdown, plain_text
 from kcons.comparison.work_precision import report
 from kcons.comparison.work_precision.fronts import (
     COSTS,
@@ -21,7 +22,7 @@ from kcons.comparison.work_precision.fronts import (
     summary,
     verdict,
 )
-from kcons.comparison.work_precision.measurement import Comparison, duration
+from kcons.comparison.work_precision.measurement import Comparison
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def write_part(folder: Path, key: str, heading: str, module: str, data: Mapping[
     return written
 
 
-def shown(part: Part) -> tuple[Figure | None, PageTable | None, str]:
+def shown(part: Part) -> tuple[Figure | None, Table | None, str]:
     """Figure, table and explanation of a part; nothing where nothing was measured."""
     if "comparison" in part.data:
         found = Comparison.from_dict(part.data["comparison"])
@@ -135,7 +136,7 @@ def _notes(found: Comparison) -> list[str]:
     return lines
 
 
-def _machines(parts: Sequence[Part]) -> PageTable:
+def _machines(parts: Sequence[Part]) -> Table:
     """Every machine, version and commit that measured a part, as a rule one."""
     rows: dict[tuple[str, ...], list[str]] = {}
     for part in parts:
@@ -150,10 +151,10 @@ def _machines(parts: Sequence[Part]) -> PageTable:
         rows.setdefault(row, []).append(environment["date"])
     headings = ["processor", "system", "versions", "commit", "run", "parts", "from", "to"]
     cells = [[*row, str(len(dates)), min(dates), max(dates)] for row, dates in rows.items()]
-    return PageTable(headings, cells, text_columns=(0, 1, 2, 3, 4, 6, 7))
+    return Table(headings, cells, words=(0, 1, 2, 3, 4, 6, 7))
 
 
-def winners(parts: Sequence[Part]) -> PageTable:
+def winners(parts: Sequence[Part]) -> Table:
     """Who wins where: a line for each scene and host with a method of kcons and another one."""
     headings = [
         "scene",
@@ -193,7 +194,7 @@ def winners(parts: Sequence[Part]) -> PageTable:
                 ]
             )
             marks.append("bad" if row["losses"] else "good")
-    return PageTable(headings, rows, text_columns=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
+    return Table(headings, rows, words=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
 
 
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
@@ -238,7 +239,7 @@ def results(parts: Sequence[Part]) -> str:
     where = [f"{row[0]}; {row[2]}; commit {row[3]}; {row[4]} run, {row[6]} to {row[7]}." for row in machines.rows]
     sentences, close = _lost_and_won(parts)
     listed = ["\n".join(f"- {line}" for line in close)] if close else []
-    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts), SHORT), ""])
+    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts).of(SHORT)), ""])
 
 
 def factor(ratio: float) -> str:
@@ -275,26 +276,3 @@ def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
 def _at_least_margin(found: Comparison) -> Comparison:
     """The same, as if times repeated to within `LEAST_MARGIN`."""
     return replace(found, timing={**found.timing, "margin": None})
-
-
-def plain_text(table: PageTable) -> str:
-    """The table in columns of characters."""
-    rows = [list(table.headings), *[list(row) for row in table.rows]]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(table.headings))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (
-            cell.ljust(width) if k in table.text_columns else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        return "  ".join(padded).rstrip()
-
-    return "\n".join(line(row) for row in rows)
-
-
-def markdown(table: PageTable, columns: Sequence[int]) -> str:
-    """Some columns of a table as a table of Markdown, for the documentation."""
-    heads = [table.headings[k] for k in columns]
-    ruler = ["---" if k in table.text_columns else "---:" for k in columns]
-    lines = [heads, ruler, *([row[k].replace("|", "\\|") for k in columns] for row in table.rows)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -13,6 +13,7 @@ import pytest
 from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
+from kcons.comparison.study import tables
 from kcons.comparison.work_precision import parts_of_the_whole, timing_rounds, whole, whole_page
 from kcons.comparison.work_precision.measure import Watcher
 from kcons.comparison.work_precision.measurement import Comparison
@@ -158,7 +159,7 @@ def test_winners_name_host_and_gain(finished):
         by_time = row["decided by"] == "wall time"
         assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
     assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
-    text = whole_page.markdown(table, (0, 1, 4))
+    text = tables.markdown(table.of((0, 1, 4)))
     assert text.splitlines()[0] == "| scene | host | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
