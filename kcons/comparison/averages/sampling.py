@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.comparison.scenes.fluid import Fluid
-from kcons.comparison.work_precision.measure import Watcher, environment
+from kcons.comparison.study.machine import environment
+from kcons.comparison.study.study import Watcher
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, Stepper
@@ -237,17 +238,15 @@ def compare(
         raise InputError(f"{most} samples are too few for an error; give {FEWEST} or more", item="most")
     picked = chosen(methods)
     watching = watcher or Watcher()
-    watching.begin("Metropolis sampling", budget)
-    energy, start, moves = _metropolis(fluid, budget, most, seed, watching)
-    watching.end()
+    with watching.piece("Metropolis sampling", budget):
+        energy, start, moves = _metropolis(fluid, budget, most, seed, watching)
 
     measurements: list[Sampled] = []
     share = budget / len(fluid.time_steps)
     for method in picked:
         for dt in fluid.time_steps:
-            watching.begin(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share)
-            measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
-            watching.end()
+            with watching.piece(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share):
+                measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
     return SamplingComparison(
         scene=_described(fluid, start, seed),
         reference={

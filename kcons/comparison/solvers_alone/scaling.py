@@ -11,8 +11,9 @@ import os
 import selectors
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +23,8 @@ from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES, STAGES
 from kcons.comparison.solvers_alone.bare_systems import BareSystem, chain, water
 from kcons.comparison.solvers_alone.solver_precision import LOOKS
 from kcons.comparison.study.curves import Curve, Panel, draw
+from kcons.comparison.study.study import Watcher, work_off
 from kcons.comparison.study.tables import Table
-from kcons.comparison.work_precision.measure import Watcher
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,22 +83,20 @@ def measure(
         Plain data for JSON: 'points', each with kind, size, rows, solver, status ('ok', 'stopped', 'failed', 'not
         run') and the fields of `GROWING` and `MEMORY`.
     """
-    watching = watcher or Watcher()
     wanted = dict(sizes or {kind: small if quick else large for kind, (_, _, large, small) in KINDS.items()})
     names = list(solvers or (QUICK_SOLVERS if quick else [candidate.name for candidate in CANDIDATES]))
     patience = patience or (QUICK_PATIENCE if quick else PATIENCE)
-    found: dict[str, Any] = {"format": FORMAT, "quick": quick, "patience": patience, "points": []}
-    if earlier is not None and earlier.get("format") == FORMAT and earlier.get("quick") == quick:
-        found["points"] = list(earlier["points"])
+    before = earlier if earlier and earlier["quick"] == quick else {}
+    found = {"format": FORMAT, "quick": quick, "patience": patience, "points": [], **before}
     done = {(point["kind"], point["solver"]) for point in found["points"]}
-    missing = [(kind, name) for kind in wanted for name in names if (kind, name) not in done]
-    watching.begin("scaling", max(len(missing), 1))
-    for count, (kind, name) in enumerate(missing, 1):
-        found["points"] += list(_grown(kind, name, wanted[kind], patience))
-        watching.advance(count)
+
+    def put(_: tuple[str, str], new: Iterable[dict[str, Any]]) -> None:
+        found["points"] = [*found["points"], *new]
         if keep is not None:
             keep(found)
-    watching.end()
+
+    work = {(kind, name): partial(_grown, kind, name, wanted[kind], patience) for kind in wanted for name in names}
+    work_off("scaling", work, put, done, watcher)
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache, partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,8 @@ import numpy as np
 from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES, STAGES, Candidate
 from kcons.comparison.solvers_alone.bare_systems import BareSystem, chain, methyl, protein, water
 from kcons.comparison.study.curves import Curve, Panel, draw
+from kcons.comparison.study.study import Watcher, work_off
 from kcons.comparison.study.tables import Table
-from kcons.comparison.work_precision.measure import Watcher
 from kcons.errors import UnsupportedError
 
 if TYPE_CHECKING:
@@ -75,25 +76,25 @@ def measure(
         Plain data for JSON: 'points', each with system, solver, tolerance, stage ('P' or 'V'), status ('ok',
         'failed' or 'not run'), seconds, ns_per_row and residual.
     """
-    watching = watcher or Watcher()
     names = list(systems or [name for name, (_, small) in SYSTEMS.items() if small == quick])
-    found: dict[str, Any] = {"format": FORMAT, "quick": quick, "systems": {}, "points": []}
-    if earlier is not None and earlier.get("format") == FORMAT and earlier.get("quick") == quick:
-        found["systems"], found["points"] = dict(earlier["systems"]), list(earlier["points"])
+    before = earlier if earlier and earlier["quick"] == quick else {}
+    found = {"format": FORMAT, "quick": quick, "systems": {}, "points": [], **before}
     done = {(point["system"], point["solver"]) for point in found["points"]}
-    missing = [(name, candidate) for name in names for candidate in CANDIDATES if (name, candidate.name) not in done]
-    watching.begin("constraint solvers alone", max(len(missing), 1))
-    built: tuple[str, BareSystem] | None = None
-    for count, (name, candidate) in enumerate(missing, 1):
-        if built is None or built[0] != name:
-            built = (name, SYSTEMS[name][0]())
-            system = built[1]
-            found["systems"][name] = {"title": system.name, "atoms": len(system.positions), "rows": system.n_rows}
-        found["points"] += _points(name, built[1], candidate, QUICK_PATIENCE if quick else PATIENCE)
-        watching.advance(count)
+    built = lru_cache(maxsize=1)(lambda name: SYSTEMS[name][0]())
+
+    def points(name: str, candidate: Candidate) -> list[dict[str, Any]]:
+        system: BareSystem = built(name)
+        about = {"title": system.name, "atoms": len(system.positions), "rows": system.n_rows}
+        found["systems"] = {**found["systems"], name: about}
+        return _points(name, system, candidate, QUICK_PATIENCE if quick else PATIENCE)
+
+    def put(_: tuple[str, str], new: list[dict[str, Any]]) -> None:
+        found["points"] = found["points"] + new
         if keep is not None:
             keep(found)
-    watching.end()
+
+    work = {(name, candidate.name): partial(points, name, candidate) for name in names for candidate in CANDIDATES}
+    work_off("constraint solvers alone", work, put, done, watcher)
     return found
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import environment
+from kcons.comparison.study.machine import stamp
+from kcons.comparison.study.study import Kept
 from kcons.comparison.study.tables import Table, terminal
 
 if TYPE_CHECKING:
@@ -116,6 +117,8 @@ def script(
 def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick: bool) -> dict[str, Any]:
     """A measurement that goes on from what the file `out` has, and is written to it after each of its parts.
 
+    What other code measured, or with other settings, is not gone on from.
+
     Parameters
     ----------
     out : Path or None
@@ -124,10 +127,6 @@ def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick
         Gets `quick`, `keep`, which takes what has been measured so far, and `earlier`, what the file has or None.
     quick : bool
     """
-
-    def keep(result: dict[str, Any]) -> None:
-        if out:
-            json_files.write(out, {**result, "environment": environment()})
-
-    earlier = json_files.read(out) if out and out.exists() else None
-    return measure(quick=quick, keep=keep, earlier=earlier)
+    kept = Kept(out, stamp(quick=quick))
+    earlier = {name: value for name, value in kept.earlier().items() if name not in kept.head}
+    return measure(quick=quick, keep=kept.put, earlier=earlier or None)

@@ -21,6 +21,7 @@ from kcons.comparison.methods.methods import METHODS, chosen
 from kcons.comparison.scenes import Reference, Scene
 from kcons.comparison.scenes.potential import Potential
 from kcons.comparison.study.machine import environment, kernels_cached
+from kcons.comparison.study.study import Watcher
 from kcons.comparison.study.tables import duration
 from kcons.comparison.work_precision import timing_rounds
 from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status
@@ -38,22 +39,6 @@ FORCE_POINTS, FORCE_SECONDS = 15, 0.5
 
 #: A host is interrupted within a step after so many budgets.
 PATIENCE = 3
-
-
-class Watcher:
-    """Told what is going on. This one keeps silent; the command line shows progress bars."""
-
-    def begin(self, what: str, total: float) -> None:
-        """A piece of work of `total` units starts."""
-
-    def advance(self, done: float) -> None:
-        """So much of it is done."""
-
-    def end(self) -> None:
-        """It is over."""
-
-    def overall(self, what: str, done: float, total: float) -> None:
-        """A part of something larger starts; of its `total` expected seconds `done` are over."""
 
 
 def compare(
@@ -98,10 +83,8 @@ def compare(
     if scene.openmm is not None:
         scene.openmm.patience = budget
     watching = watcher or Watcher()
-    watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
-    warm_up(scene, picked)
-    watching.advance(1)
-    watching.end()
+    with watching.piece("loading kernels" if kernels_cached() else "compiling kernels (once)", 1):
+        warm_up(scene, picked)
 
     if reference is None:
         reference = reference_of(scene, watching)
@@ -148,11 +131,8 @@ def compare(
 
 def reference_of(scene: Scene, watcher: Watcher) -> Reference:
     """The reference solution, with its progress shown."""
-    watcher.begin("reference solution", 1)
-    try:
+    with watcher.piece("reference solution", 1):
         return scene.reference(lambda done, total: watcher.advance(done / total))
-    finally:
-        watcher.end()
 
 
 def force_seconds(scene: Scene) -> float:
@@ -203,16 +183,8 @@ def measure(
         Whether the constraints' part is timed, which costs a little.
     """
     watching = watcher or Watcher()
-    shown = setting if method.adaptive else setting / scene.units.time_unit
-    planned = None if method.adaptive else round(scene.horizon / setting)
-    common: dict[str, Any] = dict(
-        method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
-    )
-    watching.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
-    try:
-        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common, watched)
-    finally:
-        watching.end()
+    deadline = perf_counter() + budget
+    return _measure(scene, method, setting, reference, budget, deadline, watching, watched)
 
 
 def timed_again(
@@ -245,8 +217,7 @@ def timed_again(
     if rounds is None:
         return measurements, None
     watching = watcher or Watcher()
-    watching.begin("times of short runs, in rounds", rounds.most)
-    try:
+    with watching.piece("times of short runs, in rounds", rounds.most):
         return timing_rounds.timed(
             scene,
             measurements,
@@ -257,8 +228,6 @@ def timed_again(
             whole=lambda method, setting: measure(scene, method, setting, reference, budget, watched=False),
             told=watching.advance,
         )
-    finally:
-        watching.end()
 
 
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
@@ -285,11 +254,7 @@ def _all_settings(
     begun = perf_counter()
     given_up: Measurement | None = None
     for setting in method.settings(scene):
-        shown = setting if method.adaptive else setting / scene.units.time_unit
-        planned = None if method.adaptive else round(scene.horizon / setting)
-        common: dict[str, Any] = dict(
-            method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
-        )
+        common = _about(scene, method, setting)
         if found and perf_counter() - begun > budget:
             note = f"the budget of {budget:g} s is used up"
             found.append(Measurement(status="not run", note=note, **common))
@@ -298,13 +263,11 @@ def _all_settings(
         if last is not None and last.step_seconds is not None:
             # A tighter tolerance takes at least as many steps as a looser one.
             left = budget - (perf_counter() - begun)
-            if given_up is not None or last.step_seconds * (planned or last.steps) > left:
+            if given_up is not None or last.step_seconds * (common["steps_planned"] or last.steps) > left:
                 given_up = last
                 found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
                 continue
-        watcher.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
-        found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher, common))
-        watcher.end()
+        found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher))
         if found[-1].status == "not run":  # it cannot run this scene at any step
             break
         if found[-1].status == "partial":
@@ -312,6 +275,17 @@ def _all_settings(
             if given_up.step_seconds is None:  # not one step was done: no use in trying shorter ones
                 break
     return found
+
+
+def _about(scene: Scene, method: Method, setting: float) -> dict[str, Any]:
+    """What is known of a measurement before it."""
+    return {
+        "method": method.name,
+        "title": method.title,
+        "setting": setting if method.adaptive else setting / scene.units.time_unit,
+        "adaptive": method.adaptive,
+        "steps_planned": None if method.adaptive else round(scene.horizon / setting),
+    }
 
 
 @dataclass
@@ -334,10 +308,11 @@ def _measure(
     budget: float,
     deadline: float,
     watcher: Watcher,
-    common: dict[str, Any],
     watched: bool = True,
 ) -> Measurement:
     log = _Log()
+    common = _about(scene, method, setting)
+    what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {common['setting']:g}"
     note = ""
     status: Status = "ok"
     run: Run | None = None
@@ -345,7 +320,11 @@ def _measure(
     setup = None
     scene.potential.forget()
     try:
-        with interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
+        with (
+            watcher.piece(what, scene.horizon),
+            interrupted_after(PATIENCE * budget),
+            np.errstate(all="ignore"),
+        ):
             run = method.start(scene, setting)
             setup = perf_counter() - begun
             if not watched:

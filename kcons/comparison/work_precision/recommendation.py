@@ -16,9 +16,10 @@ from kcons.comparison.methods.method import Method
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.methods.snippets import code
 from kcons.comparison.scenes import Reference, Scene
+from kcons.comparison.study.study import Watcher
 from kcons.comparison.study.tables import duration
 from kcons.comparison.work_precision.fronts import COSTS, EVERY_HOST, Cost, cost_of, floor_of, host_of, is_ours, verdict
-from kcons.comparison.work_precision.measure import Watcher, measure, timed_again, warm_up
+from kcons.comparison.work_precision.measure import measure, timed_again, warm_up
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError

@@ -15,14 +15,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from kcons import __version__
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.scenes import Scene
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import code_digest, environment
+from kcons.comparison.study.machine import stamp
+from kcons.comparison.study.study import Kept, Watcher
 from kcons.comparison.work_precision import whole_page
-from kcons.comparison.work_precision.measure import Watcher, compare, reference_of
+from kcons.comparison.work_precision.measure import compare, reference_of
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import PLAN, Item
 from kcons.comparison.work_precision.recommendation import sharpen
@@ -70,9 +70,8 @@ def run(
     expected = {item.key: item.quick_seconds if quick else item.seconds for item in items}
     pending = []
     for item in items:
-        old = read(folder, item.key)
-        unfinished = old is None or "failed" in old or "unfinished" in old
-        if not fresh and old is not None and old["key"] == key_of(item, quick) and not unfinished:
+        old = _kept(folder, item, quick).earlier()
+        if not fresh and old and not {"failed", "unfinished"} & set(old):
             watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
             expected.pop(item.key)
         else:
@@ -87,7 +86,8 @@ def run(
             share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
             started = time.perf_counter()
             found = _part(item, quick, share, watching, folder, fresh)
-            _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
+            _kept(folder, item, quick).put(found)
+            whole_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
             if "seconds" in found:
                 done += expected[item.key]
                 spent += time.perf_counter() - started
@@ -100,17 +100,21 @@ def run(
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
     """What a measurement depends on: code, scene, settings."""
-    plain = json_files.plain(asdict(item))
+    part = asdict(item)
     for name in ("heading", "seconds", "quick_seconds"):
-        plain.pop(name)
-    return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
+        part.pop(name)
+    return stamp(quick=quick, part=part)
+
+
+def _kept(folder: Path, item: Item, quick: bool) -> Kept:
+    return Kept(folder / f"{item.key}.json", key_of(item, quick), form=FORMAT, under="key", pack=packed)
 
 
 def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
     """Measure one part; what keeps it from being measured is its result."""
     reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
     if reason:
-        return {"not run": reason, "environment": environment()}
+        return {"not run": reason}
     begun = time.perf_counter()
     try:
         if item.module:
@@ -118,21 +122,18 @@ def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path,
         else:
             found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
     except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
-        return {"failed": f"{type(error).__name__}: {error}", "environment": environment()}
-    return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
+        return {"failed": f"{type(error).__name__}: {error}"}
+    return {**found, "seconds": time.perf_counter() - begun}
 
 
 def _by_module(item: Item, quick: bool, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
     """A part with a module of its own; what it has measured is kept from time to time."""
-    head = {"format": FORMAT, "key": key_of(item, quick), "unfinished": True}
-    old = None if fresh else read(folder, item.key)
-    earlier = old["result"] if old is not None and "result" in old and old["key"] == head["key"] else None
-
-    def keep(result: dict[str, Any]) -> None:
-        _put(folder, item, {**head, "result": result, "environment": environment()})
-
+    kept = _kept(folder, item, quick)
     result: dict[str, Any] = import_module(item.module).measure(
-        quick=quick, keep=keep, watcher=watcher, earlier=earlier
+        quick=quick,
+        keep=lambda result: kept.put({"unfinished": True, "result": result}),
+        watcher=watcher,
+        earlier=None if fresh else kept.earlier().get("result"),
     )
     return result
 
@@ -151,9 +152,8 @@ def _excluded(item: Item, quick: bool) -> str:
 
 
 def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
-    watcher.begin("building the scene", 1)
-    scene = scene_of(item, quick)
-    watcher.end()
+    with watcher.piece("building the scene", 1):
+        scene = scene_of(item, quick)
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
     names, left_out = methods_of(item, scene, quick)
     reference = reference_of(scene, watcher)
@@ -212,15 +212,6 @@ def read(folder: Path, key: str) -> dict[str, Any] | None:
         return unpacked(json_files.read(folder / f"{key}.json", FORMAT))
     except (OSError, InputError):
         return None
-
-
-def _put(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
-    json_files.write(folder / f"{item.key}.json", packed(found))
-
-
-def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
-    _put(folder, item, found)
-    whole_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
 
 
 def packed(found: Mapping[str, Any]) -> str:
