@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from kcons.comparison.methods.engines import InOpenMM
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, matched_steps
 from kcons.comparison.scenes import Scene
 from kcons.comparison.scenes.openmm_host import OpenMMHost
@@ -46,7 +47,7 @@ NO_TRAJECTORY = "thermostat: a trajectory of its own, so that no error can be st
 SETTLE = "SETTLE stores its distances in single precision: water is off by up to 6e-8 of them at any tolerance."
 
 
-class _HostRun(Run):
+class _HostRun(InOpenMM):
     """A Context that is stepped to the horizon.
 
     Parameters
@@ -70,12 +71,10 @@ class _HostRun(Run):
         half_step: bool = False,
         records: int | None = RECORDS,
     ) -> None:
-        super().__init__()
         host = scene.openmm
         assert host is not None
-        self._scene, self._host, self._context, self._integrator = scene, host, context, integrator
-        self._dt, self._evaluations, self._half_step = dt, evaluations, half_step
-        self._done, self._planned = 0, round(scene.horizon / dt)
+        super().__init__(context, integrator, dt, round(scene.horizon / dt), host.length, host.speed)
+        self._evaluations, self._half_step = evaluations, half_step
         self._stride = 1 if records is None else max(1, self._planned // records)
         self._groups = integrator.getIntegrationForceGroups()
         self._end: tuple[FloatArray, FloatArray] | None = None
@@ -95,36 +94,21 @@ class _HostRun(Run):
         if self._done:
             self._spent += perf_counter() - begun
         self._done += self.steps
-        self.time = self._done * self._dt
         if self.finished and hasattr(self._integrator, "check"):
             self._integrator.check()  # what OpenMM's solvers do not tell
-
-    def march(self, steps: int) -> None:
-        self._integrator.step(steps)
-        self._done += steps
-        self.time = self._done * self._dt
 
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
         return _block(step_seconds, pass_seconds)
 
     def rewind(self) -> None:
-        self._context.setPositions(self._x)
-        self._context.setVelocities(self._v)
+        self.context.setPositions(self._x)
+        self.context.setVelocities(self._v)
 
     def settle(self) -> None:
         self._integrator.step(1)
 
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._planned
-
-    @property
-    def positions(self) -> FloatArray:
-        return (self._state()[0] if self._end is None else self._end[0]) / self._host.length
-
-    @property
-    def velocities(self) -> FloatArray:
-        return (self._state()[1] if self._end is None else self._end[1]) / self._host.speed
+    def observe(self) -> tuple[FloatArray, FloatArray]:
+        return super().observe() if self._end is None else self._end
 
     def own_energy(self) -> float | None:
         if not self._half_step:
@@ -133,9 +117,9 @@ class _HostRun(Run):
             # To ask would compute the forces that the next step is to pay for.
             return float("nan")
         # OpenMM's own integrators compute forces anew in every step. They know how to move velocities by half a step.
-        state = self._context.getState(energy=True, groups=self._groups)
+        state = self.context.getState(energy=True, groups=self._groups)
         energy = state.getKineticEnergy() + state.getPotentialEnergy()
-        return float(energy._value) / self._host.speed**2
+        return float(energy._value) / self._speed**2
 
     def own_evaluations(self) -> int:
         return self._done * self._evaluations
@@ -145,7 +129,7 @@ class _HostRun(Run):
         timed = self._planned - 1
         if not self.finished or not timed or self._spent > SHORT_STEP * timed:
             return None
-        self._end = self._state()
+        self._end = self.observe()
         if not np.isfinite(self._end[0]).all():
             return None
         size = _block(self._spent / timed, BLOCK_SECONDS)
@@ -159,15 +143,8 @@ class _HostRun(Run):
             return None
         return float(np.median(found))
 
-    def _state(self) -> tuple[FloatArray, FloatArray]:
-        state = self._context.getState(positions=True, velocities=True)
-        return (
-            np.asarray(state.getPositions(asNumpy=True)._value),
-            np.asarray(state.getVelocities(asNumpy=True)._value),
-        )
-
     def _forces(self) -> FloatArray:
-        state = self._context.getState(forces=True, groups=self._groups)
+        state = self.context.getState(forces=True, groups=self._groups)
         return np.asarray(state.getForces(asNumpy=True)._value)
 
 
