@@ -12,8 +12,7 @@ from kcons.comparison.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.comparison.hard_cases.worker import Worker
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import environment, stamp
-from kcons.comparison.study.study import Kept, Watcher, work_off
-from kcons.errors import InputError
+from kcons.comparison.study.study import Kept, Watcher, picked, work_off
 
 FORMAT = "kcons-hard-cases-1"
 #: Seconds after which a program that has not answered is given up: quick and full.
@@ -29,12 +28,7 @@ def chosen(only: Iterable[str] | None) -> dict[str, Case]:
         An unknown number; the message lists those there are.
     """
     known = all_cases()
-    if only is None:
-        return known
-    names = [name.upper() for name in only]
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise InputError(f"there is no case {unknown[0] if unknown else ''}; there are {', '.join(known)}", item="only")
+    names = picked(None if only is None else [name.upper() for name in only], known, "case", "only")
     return {name: known[name] for name in known if name in names}
 
 

@@ -267,6 +267,11 @@ def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> Constra
     return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
 
 
+def exponent(tolerance: float) -> str:
+    """'1e-5', as it is in names and titles."""
+    return f"{tolerance:.0e}".replace("e-0", "e-")
+
+
 # -- what goes wrong --------------------------------------------------------------------------------
 
 

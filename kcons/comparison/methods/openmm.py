@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from kcons.comparison.methods.engines import InOpenMM
-from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, matched_steps
+from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, exponent, matched_steps
 from kcons.comparison.scenes import Scene
 from kcons.comparison.scenes.openmm_host import OpenMMHost
 from kcons.constraints.target import FloatArray
@@ -365,11 +365,11 @@ def _built_in() -> list[OpenMMMethod]:
     for kind, (title, make) in _KINDS.items():
         for tolerance in TOLERANCES:
             plain = tolerance == DEFAULT
-            exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+            told = exponent(tolerance)
             found.append(
                 BuiltIn(
-                    kind if plain else f"{kind}-{exponent}",
-                    f"{title}, {exponent}",
+                    kind if plain else f"{kind}-{told}",
+                    f"{title}, {told}",
                     usual=kind == "openmm-verlet" or plain,
                     guest=kind == "openmm-verlet" and plain,
                     remark=HALF_STEP,
@@ -400,9 +400,9 @@ def _of_kcons() -> list[OpenMMMethod]:
         )
         found.append(projected)
     for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
-        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
-        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{exponent}"
-        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {exponent}", tolerance=tolerance))
+        told = exponent(tolerance)
+        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{told}"
+        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {told}", tolerance=tolerance))
     for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
         title = f"OpenMM + kcons {scheme}, own solver"
         found.append(Held(f"openmm-held-{scheme}", title, usual=scheme != "blanes-moan4", scheme=scheme))

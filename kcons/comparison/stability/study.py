@@ -12,7 +12,7 @@ from kcons.comparison.stability import fuzz, runs
 from kcons.comparison.stability.scenes import SCENES
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import stamp
-from kcons.comparison.study.study import Kept, Watcher, work_off
+from kcons.comparison.study.study import Kept, Watcher, picked, work_off
 from kcons.errors import InputError
 
 FORMAT = "kcons-stability-1"
@@ -49,14 +49,8 @@ def run(
     InputError
         An unknown part or scene.
     """
-    parts = list(PARTS) if only is None else list(only)
-    for part in parts:
-        if part not in PARTS:
-            raise InputError(f"there is no part {part!r}; there are {', '.join(PARTS)}", item="only")
-    chosen = list(SCENES) if scenes is None else list(scenes)
-    for scene in chosen:
-        if scene not in SCENES:
-            raise InputError(f"there is no scene {scene!r}; there are {', '.join(SCENES)}", item="scenes")
+    parts = picked(only, PARTS, "part", "only")
+    chosen = picked(scenes, SCENES, "scene", "scenes")
     file = Kept(kept, stamp(quick=quick), form=FORMAT)
     result: dict[str, Any] = {**file.head, "pieces": file.earlier().get("pieces", {})}
 

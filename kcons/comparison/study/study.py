@@ -6,7 +6,7 @@ a study ends, what is done is in its file, and its progress bars are gone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -92,6 +92,24 @@ class Kept:
         """Into the file, in one piece."""
         if self.path is not None:
             json_files.write(self.path, self.pack({**self.head, **result}))
+
+
+def picked(names: Iterable[str] | None, known: Iterable[str], what: str, item: str) -> list[str]:
+    """Names that were asked for; all that are known by default.
+
+    Raises
+    ------
+    InputError
+        None is named, or one that is not known.
+    """
+    there = list(known)
+    wanted = there if names is None else list(names)
+    if not wanted:
+        raise InputError(f"no {what} is named; there are {', '.join(there)}", item=item)
+    for name in wanted:
+        if name not in there:
+            raise InputError(f"there is no {what} {name!r}; there are {', '.join(there)}", item=item)
+    return wanted
 
 
 def work_off(

@@ -58,7 +58,7 @@ def test_a_program_that_hangs_is_given_up():
 
 
 def test_unknown_cases_are_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no case H99; there are H01, H02"):
+    with pytest.raises(InputError, match="there is no case 'H99'; there are H01, H02"):
         chosen(["H99"])
     bad = tmp_path / "x.json"
     bad.write_text("{}")

@@ -7,7 +7,8 @@ from functools import partial
 import pytest
 
 from kcons.comparison.study import json_files
-from kcons.comparison.study.study import Kept, Watcher, work_off
+from kcons.comparison.study.study import Kept, Watcher, picked, work_off
+from kcons.errors import InputError
 
 
 class Listener(Watcher):
@@ -72,3 +73,14 @@ def test_half_a_file_none_and_nowhere(tmp_path):
 def test_another_text_is_put(tmp_path):
     Kept(tmp_path / "a.json", {}, pack=lambda data: '{"packed": true}').put({"a": 1})
     assert (tmp_path / "a.json").read_text() == '{"packed": true}\n'
+
+
+def test_names_are_picked_out_of_those_there_are():
+    known = {"a": 1, "b": 2}
+    assert picked(None, known, "part", "only") == ["a", "b"]
+    assert picked(iter("b"), known, "part", "only") == ["b"]
+    with pytest.raises(InputError, match="no part is named; there are a, b"):
+        picked([], known, "part", "only")
+    with pytest.raises(InputError, match="there is no part 'c'; there are a, b") as error:
+        picked(["a", "c"], known, "part", "only")
+    assert error.value.item == "only"

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kcons.comparison.methods.method import Method, Run, Steps
+from kcons.comparison.methods.method import Method, Run, Steps, exponent
 from kcons.comparison.scenes import Scene
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -299,8 +299,8 @@ def lammps_methods() -> list[Method]:
     """Both fixes at every tolerance."""
     return [
         LammpsShake(
-            f"lammps-{fix}-{tolerance:.0e}".replace("e-0", "e-"),
-            f"LAMMPS fix {fix}, {tolerance:.0e}".replace("e-0", "e-"),
+            f"lammps-{fix}-{exponent(tolerance)}",
+            f"LAMMPS fix {fix}, {exponent(tolerance)}",
             usual=tolerance == USUAL,
             host="peer",
             guest=True,

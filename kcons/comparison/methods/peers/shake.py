@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from kcons.comparison.methods.method import Method, Run, Steps
+from kcons.comparison.methods.method import Method, Run, Steps, exponent
 from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel, kick, kick_and_drift
 from kcons.comparison.scenes import Scene
 from kcons.constraints.target import FloatArray
@@ -108,11 +108,11 @@ def shake_methods() -> list[Method]:
     """One for each tolerance."""
     found: list[Method] = []
     for tolerance in TOLERANCES:
-        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+        told = exponent(tolerance)
         found.append(
             Shake(
-                f"shake-{exponent}",
-                f"SHAKE/RATTLE sweeps, {exponent}",
+                f"shake-{told}",
+                f"SHAKE/RATTLE sweeps, {told}",
                 usual=tolerance in USUAL,
                 host="peer",
                 guest=True,
