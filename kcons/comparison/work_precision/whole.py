@@ -22,7 +22,7 @@ from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import stamp
 from kcons.comparison.study.study import Kept, Watcher
 from kcons.comparison.work_precision import whole_page
-from kcons.comparison.work_precision.measure import compare, reference_of
+from kcons.comparison.work_precision.measure import Bench, compare, reference_of
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import PLAN, Item
 from kcons.comparison.work_precision.recommendation import sharpen
@@ -170,7 +170,7 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     reasons = dict.fromkeys(left_out.values())
     remarks = [f"not run: {', '.join(n for n in left_out if left_out[n] == why)} ({why})" for why in reasons]
     found = replace(found, remarks=[*found.remarks, *remarks])
-    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher, rounds=rounds)
+    return sharpen(Bench(scene, reference, budget, watcher, rounds), found)
 
 
 def scene_of(item: Item, quick: bool) -> Scene:
