@@ -5,7 +5,7 @@ OpenMM runs by itself, several steps at a time; its Context starts where the sce
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from time import perf_counter
@@ -187,39 +187,49 @@ def _host(scene: Scene) -> OpenMMHost:
     return scene.openmm
 
 
+def only_water(scene: Scene) -> bool:
+    """Whether OpenMM's System holds nothing but rigid water."""
+    from kcons.openmm.carried.hold import take_constraints
+
+    host = _host(scene)
+    return not host.surfaces and not take_constraints(host.copy())
+
+
 # -- OpenMM's own -----------------------------------------------------------------------------------
 
 
-def verlet() -> openmm.Integrator:
-    import openmm
+@dataclass(frozen=True)
+class Own:
+    """An integrator of OpenMM.
 
-    return openmm.VerletIntegrator(0.001)
+    Attributes
+    ----------
+    name : str
+    arguments : tuple of float
+        What it takes before the time step: temperature and collisions.
+    """
+
+    name: str
+    arguments: tuple[float, ...] = ()
+
+    def __call__(self) -> Any:
+        import openmm
+
+        integrator = getattr(openmm, self.name)(*self.arguments, 0.001)
+        if self.name == "LangevinMiddleIntegrator":
+            integrator.setRandomNumberSeed(1)
+        return integrator
+
+    def code(self, dt: str) -> str:
+        """The expression that makes it."""
+        return f"{self.name}({', '.join([*(f'{a:g}' for a in self.arguments), dt])})"
 
 
-def middle() -> openmm.Integrator:
-    import openmm
-
-    return openmm.LangevinMiddleIntegrator(TEMPERATURE, 0.0, 0.001)
-
-
-def nose_hoover() -> openmm.Integrator:
-    import openmm
-
-    return openmm.NoseHooverIntegrator(0.001)
-
-
-def middle_bath() -> openmm.Integrator:
-    import openmm
-
-    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, COLLISIONS, 0.001)
-    integrator.setRandomNumberSeed(1)
-    return integrator
-
-
-def nose_hoover_bath() -> openmm.Integrator:
-    import openmm
-
-    return openmm.NoseHooverIntegrator(TEMPERATURE, COLLISIONS, 0.001)
+VERLET = Own("VerletIntegrator")
+MIDDLE = Own("LangevinMiddleIntegrator", (TEMPERATURE, 0.0))
+NOSE_HOOVER = Own("NoseHooverIntegrator")
+MIDDLE_BATH = Own("LangevinMiddleIntegrator", (TEMPERATURE, COLLISIONS))
+NOSE_HOOVER_BATH = Own("NoseHooverIntegrator", (TEMPERATURE, COLLISIONS))
 
 
 @dataclass(frozen=True)
@@ -228,11 +238,11 @@ class BuiltIn(OpenMMMethod):
 
     Attributes
     ----------
-    make : callable
+    make : Own
     tolerance : float
     """
 
-    make: Callable[[], Any] = verlet
+    make: Own = VERLET
     tolerance: float = DEFAULT
 
     def start(self, scene: Scene, setting: float) -> Run:
@@ -321,12 +331,10 @@ class Held(Projected):
 
     def start(self, scene: Scene, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator, hold
-        from kcons.openmm.carried.hold import take_constraints
 
         host, system = _host(scene), _host(scene).copy()
-        only_water = not host.surfaces and not take_constraints(host.copy())
         rows: Sequence[Any] = host.surfaces
-        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water)
+        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water(scene))
         integrator = ProjectedIntegrator(setting * host.time, self.scheme, parts=[part], tolerance=TIGHT)
         context = host.context(system, integrator)
         run = self._run(_CarriedRun, scene, context, integrator, setting)
@@ -354,9 +362,9 @@ class OnSurfaces(Projected):
 # -- by name ----------------------------------------------------------------------------------------
 
 _KINDS = {
-    "openmm-verlet": ("OpenMM Verlet", verlet),
-    "openmm-middle": ("OpenMM LangevinMiddle, no friction", middle),
-    "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", nose_hoover),
+    "openmm-verlet": ("OpenMM Verlet", VERLET),
+    "openmm-middle": ("OpenMM LangevinMiddle, no friction", MIDDLE),
+    "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", NOSE_HOOVER),
 }
 
 
@@ -378,8 +386,8 @@ def _built_in() -> list[OpenMMMethod]:
                 )
             )
     baths = (
-        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", middle_bath),
-        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", nose_hoover_bath),
+        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", MIDDLE_BATH),
+        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", NOSE_HOOVER_BATH),
     )
     found += [BuiltIn(name, title, follows=False, remark=NO_TRAJECTORY, make=make) for name, title, make in baths]
     return found

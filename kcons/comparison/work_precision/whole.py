@@ -87,7 +87,7 @@ def run(
             started = time.perf_counter()
             found = _part(item, quick, share, watching, folder, fresh)
             _kept(folder, item, quick).put(found)
-            whole_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
+            whole_page.write_part(folder, _part_of(item, read(folder, item.key) or {}))
             if "seconds" in found:
                 done += expected[item.key]
                 spent += time.perf_counter() - started
@@ -247,22 +247,21 @@ def redraw(folder: Path, into: Path | None = None) -> list[Path]:
     InputError
         There are none.
     """
-    found = [(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+    found = parts(folder)
     if not found:
         raise InputError(f"there are no results of kcons compare --all in {folder}", item="redraw")
-    made = [
-        path
-        for item, data in found
-        for path in whole_page.write_part(folder, item.key, item.heading, item.module, data)
-    ]
-    filled = [] if into is None else whole_page.fill(into, parts(folder))
+    made = [path for part in found for path in whole_page.write_part(folder, part)]
+    filled = [] if into is None else whole_page.fill(into, found)
     return [_page(folder), *made, *filled]
 
 
 def parts(folder: Path) -> list[whole_page.Part]:
     """All parts that are in a folder, in the order of the plan."""
-    found = ((item, read(folder, item.key)) for item in PLAN)
-    return [whole_page.Part(i.key, i.heading, i.module, data) for i, data in found if data is not None]
+    return [_part_of(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+
+
+def _part_of(item: Item, data: Mapping[str, Any]) -> whole_page.Part:
+    return whole_page.Part(item.key, item.heading, item.module, data)
 
 
 def _page(folder: Path) -> Path:

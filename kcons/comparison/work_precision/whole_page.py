@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -57,6 +58,11 @@ class Part:
     module: str
     data: Mapping[str, Any]
 
+    @cached_property
+    def comparison(self) -> Comparison | None:
+        """None where no methods were compared."""
+        return Comparison.from_dict(self.data["comparison"]) if "comparison" in self.data else None
+
 
 def write(path: Path, parts: Sequence[Part]) -> Path:
     """The page of all parts."""
@@ -69,24 +75,21 @@ def write(path: Path, parts: Sequence[Part]) -> Path:
     return html_page.write(path, TITLE, sections, introduction=INTRODUCTION)
 
 
-def write_part(folder: Path, key: str, heading: str, module: str, data: Mapping[str, Any]) -> list[Path]:
-    """Picture and table of one part, as far as there is something to show; the paths written."""
-    part = Part(key, heading, module, data)
+def write_part(folder: Path, part: Part) -> list[Path]:
+    """Picture and table of one part, if there is something to show; the paths written."""
     figure, table, text = shown(part)
-    written = []
-    if figure is not None:
-        figure.savefig(folder / f"{key}.png", dpi=150)
-        written.append(folder / f"{key}.png")
-    if table is not None:
-        (folder / f"{key}.txt").write_text(f"{heading}\n\n{plain_text(table)}\n{text}\n", encoding="utf-8")
-        written.append(folder / f"{key}.txt")
-    return written
+    if figure is None or table is None:
+        return []
+    picture, words = folder / f"{part.key}.png", folder / f"{part.key}.txt"
+    figure.savefig(picture, dpi=150)
+    words.write_text(f"{part.heading}\n\n{plain_text(table)}\n{text}\n", encoding="utf-8")
+    return [picture, words]
 
 
 def shown(part: Part) -> tuple[Figure | None, Table | None, str]:
     """Figure, table and explanation of a part; nothing where nothing was measured."""
-    if "comparison" in part.data:
-        found = Comparison.from_dict(part.data["comparison"])
+    found = part.comparison
+    if found is not None:
         return report.figure(found), report.page_table(found), report.explanation(found)
     if "result" in part.data and find_spec(part.module) is not None:
         module = import_module(part.module)
@@ -101,9 +104,7 @@ def _section(part: Part) -> Section:
     figure, table, text = shown(part)
     if figure is None or table is None:
         return Section(part.heading, ["this version of kcons cannot show it"])
-    notes: list[str] = []
-    if "comparison" in part.data:
-        notes = _notes(Comparison.from_dict(part.data["comparison"]))
+    notes = [] if part.comparison is None else _notes(part.comparison)
     return Section(part.heading, notes, [figure], [table], text)
 
 
@@ -171,9 +172,9 @@ def winners(parts: Sequence[Part]) -> Table:
     rows: list[list[str]] = []
     marks: list[str] = []
     for part in parts:
-        if "comparison" not in part.data:
+        found = part.comparison
+        if found is None:
             continue
-        found = Comparison.from_dict(part.data["comparison"])
         length = found.scene["units"]["length"]
         margin = found.timing.get("margin")
         for row in summary(found):
@@ -249,9 +250,7 @@ def factor(ratio: float) -> str:
 
 def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
     """Sentences on all lines of the table, and those lines in which others are close."""
-    compared = [
-        (part.heading, Comparison.from_dict(part.data["comparison"])) for part in parts if "comparison" in part.data
-    ]
+    compared = [(part.heading, part.comparison) for part in parts if part.comparison is not None]
     judged = [row for _, found in compared for row in summary(found) if row["rivals"]]
     if not judged:
         return ["No scene has both a method of kcons and another one yet."], []
