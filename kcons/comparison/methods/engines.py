@@ -13,7 +13,7 @@ import numpy as np
 from ase.constraints import FixAtoms, FixBondLengths, FixInternals
 
 from kcons import steppers
-from kcons.comparison.methods.method import Steps
+from kcons.comparison.methods.method import Run, Steps
 from kcons.constraints.target import FloatArray
 from kcons.steppers import State, Stepper, System
 
@@ -22,11 +22,25 @@ if TYPE_CHECKING:
     from ase import Atoms
 
 
-class OnArrays(Steps):
+class OfStates(Run):
+    """A run whose last `State` is known."""
+
+    _state: State
+
+    @property
+    def positions(self) -> FloatArray:
+        return self._state.positions
+
+    @property
+    def velocities(self) -> FloatArray:
+        return self._state.velocities
+
+
+class OnArrays(OfStates, Steps):
     """A stepper of kcons, arrays in and arrays out."""
 
     def __init__(self, system: System, start: State, stepper: Stepper, dt: float, steps: int) -> None:
-        super().__init__(dt, steps)
+        Steps.__init__(self, dt, steps)
         self._system, self._stepper = system, stepper
         self._start = self._state = start
 
@@ -45,14 +59,6 @@ class OnArrays(Steps):
 
     def put(self, x: FloatArray) -> None:
         self._state = replace(self._state, positions=x)
-
-    @property
-    def positions(self) -> FloatArray:
-        return self._state.positions
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self._state.velocities
 
 
 class InAse(Steps):

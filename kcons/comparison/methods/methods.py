@@ -15,7 +15,7 @@ from scipy.integrate import DOP853
 
 from kcons import steppers
 from kcons.ase import Constraints
-from kcons.comparison.methods.engines import InAse, OnArrays, ase_constraints
+from kcons.comparison.methods.engines import InAse, OfStates, OnArrays, ase_constraints
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
 from kcons.comparison.methods.openmm import OPENMM_METHODS
 from kcons.comparison.methods.peers import PEERS
@@ -151,7 +151,7 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
     return lambda dt: item()  # type: ignore[no-any-return]
 
 
-class _ExtrapolatedRun(Run):
+class _ExtrapolatedRun(OfStates):
     def __init__(self, scene: Scene, tolerance: float) -> None:
         super().__init__()
         motion = Motion(scene.constraint_set, scene.positions)
@@ -172,14 +172,6 @@ class _ExtrapolatedRun(Run):
     @property
     def finished(self) -> bool:
         return self.time == self._horizon
-
-    @property
-    def positions(self) -> FloatArray:
-        return self._state.positions
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self._state.velocities
 
 
 class Extrapolated(Method):
