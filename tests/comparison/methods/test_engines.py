@@ -98,6 +98,9 @@ def test_units_of_openmm():
         run.march(3)
     np.testing.assert_allclose(one.positions, other.positions, atol=1e-12)
     np.testing.assert_allclose(seen(other.context)[0], 0.1 * other.positions, atol=1e-15)
+    for run in (one, other):
+        run.put(X)
+    np.testing.assert_allclose(other.positions, X, atol=1e-15)
 
 
 def test_arrays_are_rewound():
