@@ -12,7 +12,6 @@ evaluations at a given error are found on the line between two points of the cur
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -23,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import ConstraintSet
-from kcons.comparison import METHODS, CoreStepper, measure, scenes
+from kcons.comparison import METHODS, CoreStepper, json_files, measure, scenes
 from kcons.constraints import Sphere
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -258,7 +257,7 @@ def main() -> None:
     options = parser.parse_args()
     console = Console(width=150)
     if options.show:
-        result = json.loads(options.show.read_text())
+        result = json_files.read(options.show)
     else:
         environment = measure.environment()
         measure.warm_up(scenes.build("butane"))
@@ -270,8 +269,7 @@ def main() -> None:
             "slopes": energy_slopes(options.full, console),
         }
     if options.out:
-        text = json.dumps(result, indent=1).replace("NaN", "null")
-        options.out.write_text(text + "\n")
+        json_files.write(options.out, result)
     if options.plot:
         plot(result, options.plot)
     show(result, console)

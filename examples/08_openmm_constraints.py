@@ -17,7 +17,6 @@ os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import argparse
 import itertools
-import json
 import time
 from collections.abc import Callable
 from functools import partial
@@ -30,8 +29,8 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons import ConstraintSet
+from kcons.comparison import json_files, ring, scripts, system_of
 from kcons.comparison import measure as compare
-from kcons.comparison import ring, scripts, system_of
 from kcons.constraints import Distance
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -474,7 +473,10 @@ def show(result: dict, console: Console) -> None:
     table = scripts.table("Hard cases: largest relative error of a distance over 500 steps", headings, headings)
     for r in result["hard"]:
         ours, theirs = r["kcons"], r["OpenMM"]
-        bad = f"NaN after {theirs['steps']} steps" if not np.isfinite(theirs["error"]) else f"{theirs['error']:.0e}"
+        error = theirs["error"]
+        # Files hold null for NaN.
+        known = error is not None and np.isfinite(error)
+        bad = f"{error:.0e}" if known else f"NaN after {theirs['steps']} steps"
         held = "refused: singular at this geometry" if "refused" in ours else f"{ours['error']:.0e}"
         table.add_row(r["name"], held, theirs["raised"] or bad)
     console.print(table)
@@ -494,7 +496,7 @@ def main() -> None:
     parser.add_argument("--steps", type=Path, help="an earlier result, in which the speed of steps is measured again")
 
     def measure(options: argparse.Namespace) -> dict:
-        return run(options.full, console, json.loads(options.steps.read_text()) if options.steps else None)
+        return run(options.full, console, json_files.read(options.steps) if options.steps else None)
 
     scripts.script(parser, measure, lambda result: show(result, console))
 

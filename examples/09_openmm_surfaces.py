@@ -11,7 +11,6 @@ thread, the two integrators in turn, medians of the processor time a step.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from pathlib import Path
@@ -25,7 +24,7 @@ from openmm import unit
 from rich.console import Console
 from rich.table import Table
 
-from kcons.comparison import measure
+from kcons.comparison import json_files, measure
 from kcons.constraints import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from kcons.openmm import SCHEMES, ExpressionSurface, SurfaceIntegrator
 
@@ -209,10 +208,10 @@ def main() -> None:
     parser.add_argument("--show", type=Path)
     arguments = parser.parse_args()
     console = Console(width=110)
-    result = json.loads(arguments.show.read_text(encoding="utf-8")) if arguments.show else run(arguments.full)
+    result = json_files.read(arguments.show) if arguments.show else run(arguments.full)
     show(result, console)
     if arguments.out:
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        json_files.write(arguments.out, result)
 
 
 if __name__ == "__main__":

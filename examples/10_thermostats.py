@@ -14,7 +14,6 @@ kinetic energy has no distribution.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -31,7 +30,7 @@ from rich.table import Table
 
 from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
-from kcons.comparison import LennardJones, Potential, PotentialCalculator, fluid
+from kcons.comparison import LennardJones, Potential, PotentialCalculator, fluid, json_files
 from kcons.comparison import measure as compare
 from kcons.constraints import Distance
 from kcons.motion import Motion
@@ -324,7 +323,7 @@ def measure(full: bool, out: Path | None) -> dict[str, Any]:
     """All that is not in `out` yet, written there run by run."""
     result: dict[str, Any] = {"machine": compare.environment(), "full": full, "parts": {}}
     if out is not None and out.exists():
-        result["parts"] = json.loads(out.read_text())["parts"]
+        result["parts"] = json_files.read(out)["parts"]
     for name, (group, job) in jobs(full).items():
         if name in result["parts"]:
             continue
@@ -333,7 +332,7 @@ def measure(full: bool, out: Path | None) -> dict[str, Any]:
         taken = {"group": group, "commit": result["machine"]["commit"], "cpu_seconds": time.process_time() - begun}
         result["parts"][name] = {**taken, **found}
         if out is not None:
-            out.write_text(json.dumps(result, indent=1) + "\n")
+            json_files.write(out, result)
         print(f"{name}: {time.process_time() - begun:.0f} s", file=sys.stderr, flush=True)
     return result
 
@@ -387,7 +386,7 @@ def main() -> None:
     options = parser.parse_args()
     console = Console(width=120)
     if options.show:
-        show(json.loads(options.show.read_text()), console)
+        show(json_files.read(options.show), console)
         return
     show(measure(options.full, options.out), console)
 

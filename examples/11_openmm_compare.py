@@ -17,7 +17,6 @@ import os
 os.environ.setdefault("OPENMM_CPU_THREADS", "1")
 
 import argparse
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ import openmm
 from rich.console import Console
 
 from kcons.cli.progress import Bars
-from kcons.comparison import Comparison, Measurement, Scene, measure, report, scenes, scripts
+from kcons.comparison import Comparison, Measurement, Scene, json_files, measure, report, scenes, scripts
 from kcons.openmm import ProjectedIntegrator, hold
 
 #: Scenes, the errors in Å that they are asked for, and steps a turn.
@@ -155,16 +154,16 @@ def main() -> None:
     chosen = parser.parse_args()
     console = Console(width=160)
     if chosen.show is not None:
-        show(json.loads(chosen.show.read_text()), console)
+        show(json_files.read(chosen.show), console)
         return
     if chosen.summary is not None:
-        print(summary(json.loads(chosen.summary.read_text())))
+        print(summary(json_files.read(chosen.summary)))
         return
     results = slim(run(chosen.full))
     show(results, console)
     print(summary(results))
     if chosen.out is not None:
-        chosen.out.write_text(json.dumps(results, indent=0, ensure_ascii=False) + "\n")
+        json_files.write(chosen.out, results, indent=0)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from blocks.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ import openmm
 from openmm import app, unit
 from rich.console import Console
 
-from kcons.comparison import measure, scripts
+from kcons.comparison import json_files, measure, scripts
 from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
@@ -204,16 +203,16 @@ def main() -> None:
     options = parser.parse_args()
     console = Console(width=120)
     if options.show:
-        show(json.loads(options.show.read_text()), console)
+        show(json_files.read(options.show), console)
         return
     result: dict[str, Any] = {"machine": measure.environment(), "full": options.full, "measurements": {}}
     if options.out and options.only and options.out.exists():
-        result["measurements"] = json.loads(options.out.read_text())["measurements"]
+        result["measurements"] = json_files.read(options.out)["measurements"]
 
     def keep(name: str, measured: dict[str, Any]) -> None:
         result["measurements"][name] = measured
         if options.out:
-            options.out.write_text(json.dumps(result, indent=1) + "\n")
+            json_files.write(options.out, result)
 
     if options.only != "sampling":
         keep("speed", speed(options.full))

@@ -8,9 +8,9 @@ python examples/14_stability.py --table F   the tables of a stability.json, for 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
+from kcons.comparison import json_files
 from kcons.comparison.stability import digest, drift, fuzz, largest_step, report, trial
 
 
@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=50, help="random molecules")
     chosen = parser.parse_args()
     if chosen.table:
-        result = json.loads(chosen.table.read_text(encoding="utf-8"))
+        result = json_files.read(chosen.table)
         result = result if "fuzz" in result else digest(result)
         print("\n\n".join(report.markdown(result).values()))
         return

@@ -8,7 +8,6 @@
 """
 
 import argparse
-import json
 from pathlib import Path
 from time import perf_counter
 
@@ -16,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from kcons import State, System, run, steppers
-from kcons.comparison import scenes
+from kcons.comparison import json_files, scenes
 from kcons.errors import ConvergenceError
 
 STEPPERS = [steppers.Rattle(), steppers.Suzuki4(), steppers.BlanesMoan4(), steppers.BlanesMoan6()]
@@ -69,8 +68,8 @@ parser.add_argument("--scene", default="dumbbells")
 parser.add_argument("--redraw", action="store_true")
 options = parser.parse_args()
 if not options.redraw:
-    RESULT.write_text(json.dumps(measure(options.scene), indent=1) + "\n")
-result = json.loads(RESULT.read_text())
+    json_files.write(RESULT, measure(options.scene))
+result = json_files.read(RESULT)
 draw(result, RESULT.with_suffix(".png"))
 for stepper, points in result["curves"].items():
     print(f"{stepper:<12}", "  ".join(f"{evaluations:4.0f}: {error:.1e}" for evaluations, _, error in points))

@@ -10,7 +10,6 @@ horizon in more and more steps, until more steps make it worse.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from kcons import State, System, run, steppers
-from kcons.comparison import METHODS, Reference, scenes
+from kcons.comparison import METHODS, Reference, json_files, scenes
 from kcons.comparison import measure as compare
 
 STEP_METHODS = ("rattle", "blanes-moan4", "blanes-moan6")
@@ -37,7 +36,7 @@ def of_steps(scene, reference) -> dict:
     for name in STEP_METHODS:
         method, points = METHODS[name], []
         for dt in sorted({dt / k for dt in method.settings(scene) for k in (1, 2, 4)}, reverse=True):
-            m = compare.measure(scene, method, dt, reference, BUDGET)
+            m = compare.Bench(scene, reference, BUDGET).measure(method, dt)
             if m.error is not None:
                 points.append([m.setting, m.error])
         found[method.title] = points
@@ -49,7 +48,7 @@ def of_tolerances(scene, dt) -> dict:
     steps = round(scene.horizon / dt)
     system = System(scene.motion, scene.potential.forces)
     exact = run(system, State(scene.positions, scene.velocities), scene.horizon / steps, steps)
-    there = Reference(exact.positions, 0.0, "RATTLE with exact constraints")
+    bench = compare.Bench(scene, Reference(exact.positions, 0.0, "RATTLE with exact constraints"), BUDGET)
     found = {}
     for solver in SOLVERS:
         points = []
@@ -57,11 +56,11 @@ def of_tolerances(scene, dt) -> dict:
             name = f"{solver}-{tolerance:.0e}".replace("e-0", "e-")
             method = METHODS[name if name in METHODS else solver]
             if method.refuses(scene) is None:
-                m = compare.measure(scene, method, scene.horizon / steps, there, BUDGET)
+                m = bench.measure(method, scene.horizon / steps)
                 points.append([tolerance, m.error, m.constraint_residual])
         if points:
             found[solver] = points
-    m = compare.measure(scene, METHODS["ase-kcons"], scene.horizon / steps, there, BUDGET)
+    m = bench.measure(METHODS["ase-kcons"], scene.horizon / steps)
     found["kcons"] = [[None, m.error, m.constraint_residual]]
     return {"step": scene.horizon / steps / scene.units.time_unit, "solvers": found}
 
@@ -183,9 +182,9 @@ def main() -> None:
     parser.add_argument("--redraw", type=Path, help="numbers of an earlier run instead of a new one")
     parser.add_argument("--plot", type=Path, help="file for the figure")
     options = parser.parse_args()
-    result = measure(options.full) if options.redraw is None else json.loads(options.redraw.read_text())
+    result = measure(options.full) if options.redraw is None else json_files.read(options.redraw)
     if options.out is not None:
-        options.out.write_text(json.dumps(result, indent=None, ensure_ascii=False) + "\n")
+        json_files.write(options.out, result, indent=None)
     if options.plot is not None:
         plot(result, options.plot)
     print(show(result))

@@ -26,7 +26,7 @@ with warnings.catch_warnings():
     import MDAnalysis as mda
 
 from kcons import __version__
-from kcons.comparison import environment
+from kcons.comparison import environment, json_files
 from kcons.constraints import Distance
 from kcons.mdanalysis import ConstraintCheck
 
@@ -194,9 +194,9 @@ def main() -> None:
                 path = str(Path(place) / f"water.{ending}")
                 results += first_checks(path, molecules, make(path, molecules, size))
         if chosen.out:
-            data = json.loads(chosen.out.read_text()) if chosen.out.exists() else {}
+            data = json_files.read(chosen.out) if chosen.out.exists() else {}
             data["cold"] = {"environment": environment() | {"mdanalysis": mda.__version__}, "cases": results}
-            chosen.out.write_text(json.dumps(data, indent=1) + "\n")
+            json_files.write(chosen.out, data)
         return
     for ending, molecules in cases:
         with tempfile.TemporaryDirectory() as folder:
@@ -239,8 +239,8 @@ def main() -> None:
         data = {"date": date.today().isoformat(), "environment": machine, "cases": results}
         if chosen.out.exists():
             # Memory of first checks is measured by itself.
-            data |= {key: value for key, value in json.loads(chosen.out.read_text()).items() if key == "cold"}
-        chosen.out.write_text(json.dumps(data, indent=1) + "\n")
+            data |= {key: value for key, value in json_files.read(chosen.out).items() if key == "cold"}
+        json_files.write(chosen.out, data)
         print(f"wrote {chosen.out}")
 
 

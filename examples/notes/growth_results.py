@@ -9,7 +9,6 @@ python examples/notes/growth_results.py --show F          the tables of an earli
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison import measure
+from kcons.comparison import json_files, measure
 from kcons.models.growth import ConstrainedHypercycle, Hypercycle, Populations, solve, solve_ensemble
 
 KINDS = ("a", "b", "c")
@@ -355,14 +354,14 @@ def main() -> None:
         "far_out": far_out if full else lambda: [],
     }
     if options.show:
-        result = json.loads(options.show.read_text(encoding="utf-8"))
+        result = json_files.read(options.show)
     elif options.part:
-        result = json.loads(options.out.read_text(encoding="utf-8"))
+        result = json_files.read(options.out)
         result[options.part] = parts[options.part]()
     else:
         result = {"machine": measure.environment(), "full": full} | {name: part() for name, part in parts.items()}
     if options.out:
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        json_files.write(options.out, result)
     show(result)
 
 

@@ -171,9 +171,9 @@ def _compare(chosen: argparse.Namespace) -> int:
     methods.chosen(chosen.methods)  # complain before any work
     _check_scene(chosen)
     with Bars() as watcher:
-        watcher.begin("building the scene" + ("" if measure.kernels_cached() else "; compiling kernels (once)"), 1)
-        scene = _scene(chosen, quick=chosen.quick)
-        watcher.end()
+        compiling = "" if measure.kernels_cached() else "; compiling kernels (once)"
+        with watcher.piece(f"building the scene{compiling}", 1):
+            scene = _scene(chosen, quick=chosen.quick)
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part

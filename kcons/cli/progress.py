@@ -8,8 +8,8 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from kcons.comparison.work_precision.measure import Watcher
-from kcons.comparison.work_precision.measurement import duration
+from kcons.comparison.study.study import Watcher
+from kcons.comparison.study.tables import duration
 
 
 class Bars(Watcher):

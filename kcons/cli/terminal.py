@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
+    from rich.console import Console, RenderableType
 
 #: Columns of a page that is no terminal.
 WIDE = 150
@@ -39,7 +38,7 @@ def names(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def show(table: Table, explained: str, console: Console) -> None:
+def show(table: RenderableType, explained: str, console: Console) -> None:
     console.print(table)
     console.print(explained, highlight=False, markup=False)
 
@@ -125,7 +124,7 @@ def patient_streams() -> Iterator[None]:
 # -- tables -----------------------------------------------------------------------------------------
 
 
-def rendered(table: Table) -> str:
+def rendered(table: RenderableType) -> str:
     """The table as plain text, wide enough for all columns."""
     from io import StringIO
 

@@ -17,7 +17,7 @@ _MODULES = {
     "averages": ("sampling",),
     "scenes": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
-    "study": ("scripts",),
+    "study": ("json_files", "scripts"),
     "work_precision": ("fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {

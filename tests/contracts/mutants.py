@@ -552,4 +552,41 @@ MUTANTS = [
         "STRAIGHT = 1e-9",
         "tests/motion/test_failures.py::test_a_run_that_ends_where_a_dihedral_is_straight_names_no_time_step",
     ),
+    # -- studies: what is kept, and what is shown --
+    (
+        "comparison/study/study.py",
+        "return found if found.get(self.under) == self.head[self.under] else {}",
+        "return found",
+        "tests/comparison/study/test_study.py::test_other_code_settings_or_formats_do_not_count",
+    ),
+    (
+        "comparison/study/study.py",
+        "            if name not in known:\n                put",
+        "            if True:\n                put",
+        "tests/comparison/study/test_study.py::test_pieces_are_done_once_and_progress_is_told",
+    ),
+    (
+        "comparison/study/json_files.py",
+        "if not math.isfinite(value):",
+        "if False:",
+        "tests/comparison/study/test_json_files.py::test_what_json_lacks_becomes_what_it_has",
+    ),
+    (
+        "comparison/study/tables.py",
+        "if table.grouped and k else shown",
+        "if table.grouped else shown",
+        "tests/comparison/study/test_tables.py::test_groups_are_named_once_and_set_apart",
+    ),
+    (
+        "comparison/study/curves.py",
+        'given: dict[str, Any] = {"transform": places[curve.along]} if curve.along else {}',
+        "given: dict[str, Any] = {}",
+        "tests/comparison/study/test_curves.py::test_marks_along_an_edge_do_not_count_as_data",
+    ),
+    (
+        "comparison/methods/engines.py",
+        "self.context.setPositions(x * self._length)",
+        "self.context.setPositions(x)",
+        "tests/comparison/methods/test_engines.py::test_units_of_openmm",
+    ),
 ]

@@ -12,7 +12,6 @@ from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.methods import methods, snippets
 from kcons.comparison.work_precision import measure, recommendation
-from kcons.comparison.work_precision.measure import Watcher
 from kcons.comparison.work_precision.measurement import Measurement
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError
@@ -147,13 +146,13 @@ def test_a_target_has_to_be_positive(chain, reference, found, target):
 def test_reach_stops_where_shorter_steps_do_not_help(chain, reference, monkeypatch):
     seen = []
 
-    def plateau(scene, method, setting, *_):
+    def plateau(bench, method, setting):
         seen.append(setting)
         return point(1e-3, setting, steps=1)
 
-    monkeypatch.setattr(recommendation, "measure", plateau)
+    monkeypatch.setattr(measure.Bench, "measure", plateau)
     prediction = recommendation.Prediction("rattle", 1.0, 2.0, 1e-3, 1.0)
-    recommendation.reach(chain, prediction, 1e-6, reference, 10.0, Watcher())
+    recommendation.reach(measure.Bench(chain, reference, 10.0), prediction, 1e-6)
     assert len(seen) == 2
 
 
@@ -162,7 +161,7 @@ def test_sharpening_tries_longer_steps_where_another_method_seems_ahead(chain, r
     plain = measure.compare(fine, methods=["blanes-moan4"], reference=reference, budget=20)
     fake = point(1e-5, 0.1, method="dop853", title="SciPy DOP853", evaluations_per_time=120.0, seconds_per_time=1e-3)
     there = replace(plain, measurements=[*plain.measurements, fake])
-    sharper = recommendation.sharpen(fine, there, reference=reference, budget=20)
+    sharper = recommendation.sharpen(measure.Bench(fine, reference, 20), there)
     longest = max(m.setting for m in sharper.of("blanes-moan4"))
     assert longest > 2 * max(m.setting for m in plain.of("blanes-moan4"))
 
@@ -196,7 +195,7 @@ def test_lines_of_code_run_to_the_end_of_the_trajectory(chain, reference, name):
     else:
         end = space["atoms"].positions
     internal = setting if method.adaptive else setting * chain.units.time_unit
-    wanted = measure.measure(chain, method, internal, reference, 20.0).error
+    wanted = measure.Bench(chain, reference, 20.0).measure(method, internal).error
     assert chain.deviation(end, reference.positions) == pytest.approx(wanted, rel=0.05, abs=1e-12)
 
 

@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.comparison.scenes.fluid import Fluid
-from kcons.comparison.work_precision.measure import Watcher, environment
+from kcons.comparison.study.machine import environment
+from kcons.comparison.study.study import Watcher, picked
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, Stepper
@@ -187,15 +188,8 @@ def chosen(names: Iterable[str] | None) -> list[Thermostat]:
     InputError
         Unknown name, or none.
     """
-    wanted = list(METHODS) if names is None else list(names)
-    if wanted == ["all"]:
-        wanted = list(METHODS)
-    if not wanted:
-        raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
-    for name in wanted:
-        if name not in METHODS:
-            raise InputError(f"there is no thermostat {name!r}; there are {', '.join(METHODS)}", item="methods")
-    return [METHODS[name] for name in wanted]
+    wanted = ["all"] if names is None else list(names)
+    return [METHODS[name] for name in picked(None if wanted == ["all"] else wanted, METHODS, "thermostat", "methods")]
 
 
 def compare(
@@ -235,19 +229,17 @@ def compare(
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
     if most is not None and most < FEWEST:
         raise InputError(f"{most} samples are too few for an error; give {FEWEST} or more", item="most")
-    picked = chosen(methods)
+    thermostats = chosen(methods)
     watching = watcher or Watcher()
-    watching.begin("Metropolis sampling", budget)
-    energy, start, moves = _metropolis(fluid, budget, most, seed, watching)
-    watching.end()
+    with watching.piece("Metropolis sampling", budget):
+        energy, start, moves = _metropolis(fluid, budget, most, seed, watching)
 
     measurements: list[Sampled] = []
     share = budget / len(fluid.time_steps)
-    for method in picked:
+    for method in thermostats:
         for dt in fluid.time_steps:
-            watching.begin(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share)
-            measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
-            watching.end()
+            with watching.piece(f"{method.title}, {dt / fluid.units.time_unit:.3g} {fluid.units.time}", share):
+                measurements.append(_measured(fluid, method, dt, start, energy, share, most, seed, watching))
     return SamplingComparison(
         scene=_described(fluid, start, seed),
         reference={
@@ -256,7 +248,7 @@ def compare(
             "standard_error": energy.error / fluid.n_molecules,
             "moves_of_each_molecule": moves,
         },
-        settings={"methods": [m.name for m in picked], "budget_seconds": budget, "most": most, **(settings or {})},
+        settings={"methods": [m.name for m in thermostats], "budget_seconds": budget, "most": most, **(settings or {})},
         environment=environment(),
         measurements=measurements,
     )

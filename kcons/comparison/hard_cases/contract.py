@@ -6,7 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from kcons.comparison.hard_cases.problem import Array, Problem
+from kcons.comparison.methods.method import Run
 from kcons.steppers import Stepper
 
 
@@ -48,10 +51,10 @@ class NotIntactError(AssertionError):
 class Course(NamedTuple):
     """How a run is made, see `Program.run`."""
 
-    every: int
-    project: bool
-    wrap: bool
-    stepper: Stepper | None
+    dt: float
+    steps: int
+    project: bool = False
+    stepper: Stepper | None = None
 
 
 class Program:
@@ -98,12 +101,41 @@ class Program:
         stepper : Stepper, optional
             For the core only.
         """
-        return self.go(problem, dt, steps, watch, Course(every, project, wrap, stepper))
+        run = self.begin(problem, Course(dt, steps, project, stepper))
 
-    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
-        """What `run` does."""
+        def frame() -> Frame:
+            x, v = run.observe()
+            return Frame(x, v, self.kinetic(problem, run, v), problem.potential(x))
+
+        if watch:
+            watch(frame())
+        done = 0
+        while done < steps:
+            block = 1 if wrap else min(every, steps - done)
+            run.march(block)
+            done += block
+            if wrap:
+                run.put(wrapped(run.positions, problem.cell))
+            if watch and done % every == 0:
+                watch(seen := frame())
+                if not np.all(np.isfinite(seen.x)):
+                    return seen
+        return frame()
+
+    def begin(self, problem: Problem, course: Course) -> Run:
+        """The engine, at the start."""
         raise NotImplementedError
+
+    def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
+        """Kinetic energy of a run, at velocities v."""
+        return problem.kinetic(v)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         """As the program counts them."""
         raise NotImplementedError
+
+
+def wrapped(x: Array, cell: Any) -> Array:
+    """Atoms put into the cell one by one; those inside are not touched."""
+    lattice = np.asarray(cell, dtype=float)
+    return np.asarray(x - np.floor(x @ np.linalg.inv(lattice)) @ lattice)

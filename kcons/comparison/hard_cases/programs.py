@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,14 @@ from kcons.comparison.hard_cases.contract import (
     Frame,
     NotIntactError,
     Program,
-    Watch,
 )
 from kcons.comparison.hard_cases.problem import Array, Problem
+from kcons.comparison.methods.engines import InAse, InOpenMM, OnArrays, ase_constraints
+from kcons.comparison.methods.method import Run
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
-from kcons.steppers import Rattle, State, System
+from kcons.steppers import Rattle, System
 
 
 class Core(Program):
@@ -42,48 +42,46 @@ class Core(Program):
             potential=(lambda x, t: problem.potential(x)) if problem.has_forces else None,
         )
 
-    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
+    def run(self, problem: Problem, *args: Any, **options: Any) -> Frame:
         given = (np.asarray(problem.positions), np.asarray(problem.masses))
         before = [a.tobytes() for a in given]
-        state: State | None = None
         try:
-            system = self.system(problem)
-            stepper = Rattle() if course.stepper is None else course.stepper
-            stepper.check(system)
-            state = system.initial_state(problem.x, problem.v, project=course.project)
-
-            def frame(state: State) -> Frame:
-                kinetic = system.kinetic_energy(state.velocities)
-                return Frame(state.positions, state.velocities, kinetic, problem.potential(state.positions))
-
-            if watch:
-                watch(frame(state))
-            for k in range(1, steps + 1):
-                x, v = state.positions, state.velocities
-                kept = (x.tobytes(), v.tobytes()) if len(x) < 100 else None
-                try:
-                    state = stepper.step(system, state, dt)
-                except KconsError as error:
-                    if kept and (x.tobytes(), v.tobytes()) != kept:
-                        raise NotIntactError(f"the state before step {k} was changed") from error
-                    raise
-                if course.wrap:
-                    state = replace(state, positions=wrapped(state.positions, problem.cell))
-                if watch and k % course.every == 0:
-                    watch(frame(state))
-            return frame(state)
+            return super().run(problem, *args, **options)
         finally:
             if [a.tobytes() for a in given] != before:
                 raise NotIntactError("input arrays were changed")
+
+    def begin(self, problem: Problem, course: Course) -> Run:
+        system = self.system(problem)
+        stepper = Rattle() if course.stepper is None else course.stepper
+        stepper.check(system)
+        start = system.initial_state(problem.x, problem.v, project=course.project)
+        return _Intact(system, start, stepper, course.dt, course.steps)
+
+    def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
+        return run.system.kinetic_energy(v)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         return self.system(problem).motion.degrees_of_freedom
 
 
-def wrapped(x: Array, cell: Any) -> Array:
-    """Atoms put into the cell one by one; those inside are not touched."""
-    lattice = np.asarray(cell, dtype=float)
-    return np.asarray(x - np.floor(x @ np.linalg.inv(lattice)) @ lattice)
+class _Intact(OnArrays):
+    """Each step by itself; one that fails must leave the state before it as it was."""
+
+    @property
+    def system(self) -> System:
+        return self._system
+
+    def march(self, steps: int) -> None:
+        for _ in range(steps):
+            x, v = self.observe()
+            kept = (x.tobytes(), v.tobytes()) if len(x) < 100 else None
+            try:
+                self.advance()
+            except KconsError as error:
+                if kept and (x.tobytes(), v.tobytes()) != kept:
+                    raise NotIntactError(f"the state before step {self._done + 1} was changed") from error
+                raise
 
 
 # -- ASE ----------------------------------------------------------------------------------------------
@@ -118,20 +116,12 @@ class PlainAse(Program):
         return atoms
 
     def hold(self, atoms: Any, problem: Problem) -> None:
-        from ase.constraints import FixAtoms, FixBondLengths, FixInternals
-
         if problem.others:
             raise CannotExpressError(f"ASE has no {', '.join(sorted({c.family for c in problem.others}))}")
-        held: list[Any] = [FixAtoms(list(problem.fixed))] if len(problem.fixed) else []
-        if len(problem.triples):
-            bonds = [[float(d), list(p)] for d, p in zip(problem.held_lengths, problem.pairs, strict=True)]
-            angles = [
-                [float(np.degrees(a)), list(t)] for a, t in zip(problem.held_angles, problem.triples, strict=True)
-            ]
-            held.append(FixInternals(bonds=bonds or None, angles_deg=angles, epsilon=1e-10))
-        elif len(problem.pairs):
-            held.append(FixBondLengths(list(problem.pairs), bondlengths=problem.held_lengths))
-        atoms.set_constraint(held)
+        degrees = np.degrees(problem.held_angles)
+        options: Any = {"epsilon": 1e-10} if len(degrees) else {}
+        rows = (problem.pairs, problem.held_lengths, problem.triples, degrees)
+        atoms.set_constraint(ase_constraints(problem.fixed, *rows, internals=bool(len(degrees)), **options))
 
     def dynamics(self, atoms: Any, dt: float) -> Any:
         """What makes steps."""
@@ -144,31 +134,23 @@ class PlainAse(Program):
         atoms.set_positions(atoms.get_positions())
         atoms.set_momenta(atoms.get_momenta())
 
-    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
+    def begin(self, problem: Problem, course: Course) -> Run:
         if course.stepper is not None:
             raise CannotExpressError("one scheme only")
         atoms = self.atoms(problem, project=course.project)
-        dynamics = self.dynamics(atoms, dt)
-
-        def frame() -> Frame:
-            x, v = atoms.get_positions(), atoms.get_velocities()
-            return Frame(x, v, problem.kinetic(v), problem.potential(x))
-
-        if watch:
-            watch(frame())
-        for k in range(1, steps + 1):
-            dynamics.run(1)
-            if course.wrap:
-                # As atoms.wrap() does it: not through the constraints.
-                atoms.arrays["positions"][:] = wrapped(atoms.arrays["positions"], problem.cell)
-            if watch and k % course.every == 0:
-                watch(seen := frame())
-                if not np.all(np.isfinite(seen.x)):
-                    return seen
-        return frame()
+        return _AsRun(atoms, self.dynamics(atoms, course.dt), course.dt, course.steps)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         return int(self.atoms(problem).get_number_of_degrees_of_freedom())
+
+
+class _AsRun(InAse):
+    """As a person does who looks at every step."""
+
+    def march(self, steps: int) -> None:
+        for _ in range(steps):
+            self._dynamics.run(1)
+        self._done += steps
 
 
 class KconsInAse(PlainAse):
@@ -293,39 +275,18 @@ class PlainOpenMM(Program):
                 back = np.zeros_like(v)
             context.setVelocities(v - back)
 
-    def go(self, problem: Problem, dt: float, steps: int, watch: Watch | None, course: Course) -> Frame:
-        from openmm import unit
-
+    def begin(self, problem: Problem, course: Course) -> Run:
         if course.stepper is not None:
             raise CannotExpressError("one scheme only")
-        if dt <= 0:
+        if course.dt <= 0:
             raise CannotExpressError("OpenMM takes no steps back and none of zero length")
-        system, integrator, part = self.build(problem, dt)
+        system, integrator, part = self.build(problem, course.dt)
         context = self.context(system, integrator)
-        self.start(problem, context, part, dt, course.project)
-        nm, speed, energy = unit.nanometer, unit.nanometer / unit.picosecond, unit.kilojoule_per_mole
+        self.start(problem, context, part, course.dt, course.project)
+        return InOpenMM(context, integrator, course.dt, course.steps)
 
-        def frame() -> Frame:
-            state = context.getState(positions=True, velocities=True, energy=True)
-            x = state.getPositions(asNumpy=True).value_in_unit(nm)
-            v = state.getVelocities(asNumpy=True).value_in_unit(speed)
-            kinetic = state.getKineticEnergy().value_in_unit(energy)
-            return Frame(np.array(x), np.array(v), kinetic, problem.potential(x))
-
-        if watch:
-            watch(frame())
-        done = 0
-        while done < steps:
-            block = 1 if course.wrap else min(course.every, steps - done)
-            integrator.step(block)
-            done += block
-            if course.wrap:
-                context.setPositions(wrapped(frame().x, problem.cell))
-            if watch and done % course.every == 0:
-                watch(seen := frame())
-                if not np.all(np.isfinite(seen.x)):
-                    return seen
-        return frame()
+    def kinetic(self, problem: Problem, run: Any, v: Array) -> float:
+        return float(run.context.getState(energy=True).getKineticEnergy()._value)
 
     def degrees_of_freedom(self, problem: Problem) -> int:
         """Three for each particle with a mass less the number of constraints, as StateDataReporter counts."""

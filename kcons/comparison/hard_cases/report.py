@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.hard_cases.case import OURS
-from kcons.comparison.study import html_page
+from kcons.comparison.study import html_page, tables
+from kcons.comparison.study.report_files import made_by
+from kcons.comparison.study.tables import Marked, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from rich.table import Table
 
 #: Colour, sign and meaning of each verdict.
 VERDICTS = {
@@ -22,7 +23,7 @@ VERDICTS = {
     "crash/NaN": ("#6a040f", "X", "NaN, a dead process, or no answer"),
     "cannot express": ("#d9d9d9", "-", "no means to state the problem"),
 }
-_RICH = {
+_STYLES = {
     "right": "green",
     "refused": "cyan",
     "silently wrong": "bold red",
@@ -33,22 +34,18 @@ _RICH = {
 
 def table(result: Mapping[str, Any]) -> Table:
     """Verdicts for the terminal: cases by programs."""
-    from rich.table import Table
-
-    shown = Table(title="Hard cases", show_lines=False)
-    for heading in ("case", "title", *result["systems"]):
-        shown.add_column(heading)
-    for name, row in _rows(result):
-        cells = [_short(row.get(system)) for system in result["systems"]]
-        shown.add_row(name, result["cases"][name]["title"], *cells)
-    return shown
+    systems = result["systems"]
+    rows = [
+        [name, result["cases"][name]["title"], *(_short(row.get(system)) for system in systems)]
+        for name, row in _rows(result)
+    ]
+    return Table(["case", "title", *systems], rows, words=range(2 + len(systems)), title="Hard cases")
 
 
 def _short(cell: Mapping[str, Any] | None) -> str:
     if cell is None:
         return ""
-    colour = _RICH[cell["verdict"]]
-    return f"[{colour}]{cell['verdict']}{'' if _in_order(cell) else ' !'}[/{colour}]"
+    return Marked(f"{cell['verdict']}{'' if _in_order(cell) else ' !'}", _STYLES[cell["verdict"]])
 
 
 def _in_order(cell: Mapping[str, Any]) -> bool:
@@ -128,7 +125,7 @@ def write(result: Mapping[str, Any], folder: Path) -> list[Path]:
     sections = [html_page.Section("All cases", figures=[figure], literal=summary(result))]
     for theme, names in by_theme.items():
         sections.append(html_page.Section(theme.replace("_", " ").capitalize(), tables=[_detail(result, names)]))
-    sections.append(html_page.Section("Made by", literal=_made_by(result)))
+    sections.append(html_page.Section("Made by", literal=made_by(result)))
     html = html_page.write(
         folder / "hard_cases.html",
         "Hard cases of constrained dynamics",
@@ -144,7 +141,7 @@ def write(result: Mapping[str, Any], folder: Path) -> list[Path]:
     return [png, html]
 
 
-def _detail(result: Mapping[str, Any], names: list[str]) -> html_page.PageTable:
+def _detail(result: Mapping[str, Any], names: list[str]) -> Table:
     rows, marks = [], []
     for name in names:
         case = result["cases"][name]
@@ -166,28 +163,17 @@ def _detail(result: Mapping[str, Any], names: list[str]) -> html_page.PageTable:
             )
             marks.append("" if cell["verdict"] == "cannot express" else ("good" if cell["met"] else "bad"))
     headings = ["case", "title", "what must be true", "program", "verdict", "number or reason", "s"]
-    return html_page.PageTable(headings, rows, text_columns=(0, 1, 2, 3, 4, 5), marks=marks)
-
-
-def _made_by(result: Mapping[str, Any]) -> str:
-    about = result["environment"]
-    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items() if version)
-    return (
-        f"{about['date']}, commit {about['commit']}, kcons {result['made_by']['version']}\n"
-        f"{about['cpu']}, {about['cores']} cores, one thread; Python {about['python']}\n{versions}\n"
-        + ("quick: shortened runs" if result["made_by"]["quick"] else "full runs")
-    )
+    return Table(headings, rows, words=range(6), marks=marks)
 
 
 def markdown(result: Mapping[str, Any]) -> str:
     """The table for the documentation."""
     systems = result["systems"]
-    lines = [f"| | | {' | '.join(systems)} |", "| --- | --- |" + " --- |" * len(systems)]
-    for name, row in _rows(result):
-        # Some checks are called |J v|.
-        cells = [_words(row.get(system)).replace("|", r"\|") for system in systems]
-        lines.append(f"| {name} | {result['cases'][name]['title']} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = [
+        [name, result["cases"][name]["title"], *(_words(row.get(system)) for system in systems)]
+        for name, row in _rows(result)
+    ]
+    return tables.markdown(Table(["", "", *systems], rows, words=range(2 + len(systems))))
 
 
 def _words(cell: Mapping[str, Any] | None) -> str:
@@ -204,5 +190,6 @@ def _words(cell: Mapping[str, Any] | None) -> str:
     checks = cell["checks"]
     bad = [c for c in checks if not c["passed"]]
     told = bad[0] if bad else max(checks, key=lambda c: c["value"] / c["limit"] if c["limit"] else 0.0)
-    number = f"{told['name']} {told['value']:.2g}"
+    # Files hold null for NaN.
+    number = f"{told['name']} {'nan' if told['value'] is None else format(told['value'], '.2g')}"
     return f"right: {number}" if cell["verdict"] == "right" else f"**{cell['verdict']}**: {number}"

@@ -8,10 +8,10 @@ from kcons.comparison.hard_cases import truths
 from kcons.comparison.hard_cases.bodies import TRIANGLE, WATER, WATER_MASSES
 from kcons.comparison.hard_cases.case import Outcome, case, outcome
 from kcons.comparison.hard_cases.chains import bonds, zigzag
-from kcons.comparison.hard_cases.contract import Frame, Program, together
+from kcons.comparison.hard_cases.contract import Frame, Program, together, wrapped
 from kcons.comparison.hard_cases.motions import worst_residual
 from kcons.comparison.hard_cases.problem import Array, Problem
-from kcons.comparison.hard_cases.programs import Core, KconsInAse, wrapped
+from kcons.comparison.hard_cases.programs import Core, KconsInAse
 
 
 def _first(program: Program, problem: Problem, steps: int = 0, dt: float = 1e-3) -> tuple[Frame, Frame]:

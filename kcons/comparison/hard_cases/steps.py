@@ -100,13 +100,8 @@ def chain_in_springs() -> tuple[Problem, float]:
 #: Residual of a run that ends without an error.
 SILENT = 1e-7
 
-STEPPERS: dict[str, Callable[[], Stepper]] = {
-    "Rattle": Rattle,
-    "Geodesic": Geodesic,
-    "Suzuki4": Suzuki4,
-    "BlanesMoan4": BlanesMoan4,
-    "KahanLi6": KahanLi6,
-    "BlanesMoan6": BlanesMoan6,
+STEPPERS: dict[str, type[Stepper]] = {
+    kind.__name__: kind for kind in (Rattle, Geodesic, Suzuki4, BlanesMoan4, KahanLi6, BlanesMoan6)
 }
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from kcons import __version__
 from kcons.comparison.hard_cases.case import SYSTEMS, Case, Cell, all_cases
 from kcons.comparison.hard_cases.worker import Worker
-from kcons.comparison.study.machine import code_digest, environment
-from kcons.comparison.work_precision.measure import Watcher
-from kcons.errors import InputError
-from kcons.steppers.files import in_one_piece
+from kcons.comparison.study import json_files
+from kcons.comparison.study.machine import environment, stamp
+from kcons.comparison.study.study import Kept, Watcher, picked, work_off
 
 FORMAT = "kcons-hard-cases-1"
 #: Seconds after which a program that has not answered is given up: quick and full.
@@ -30,12 +28,7 @@ def chosen(only: Iterable[str] | None) -> dict[str, Case]:
         An unknown number; the message lists those there are.
     """
     known = all_cases()
-    if only is None:
-        return known
-    names = [name.upper() for name in only]
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise InputError(f"there is no case {unknown[0] if unknown else ''}; there are {', '.join(known)}", item="only")
+    names = picked(None if only is None else [name.upper() for name in only], known, "case", "only")
     return {name: known[name] for name in known if name in names}
 
 
@@ -69,46 +62,44 @@ def run(
     """
     cases = chosen(only)
     systems = list(systems)
-    watcher = watcher or Watcher()
-    made_by = {"version": __version__, "code": code_digest(), "quick": quick, "versions": environment()["versions"]}
-    before = _earlier(kept, made_by)
+    settings = stamp(quick=quick, versions=environment()["versions"])
+    file = Kept(kept, settings, form=FORMAT)
     result: dict[str, Any] = {
-        "format": FORMAT,
-        "made_by": made_by,
-        "environment": environment(),
+        **file.head,
         "systems": systems,
         "cases": {name: _described(case) for name, case in cases.items()},
-        "cells": {},
+        # Cells that are not reached stay in the file.
+        "cells": file.earlier().get("cells", {}),
     }
     with Worker() as worker:
         for name, case in cases.items():
-            watcher.begin(f"{name} {case.title}", len(systems))
-            cells = result["cells"].setdefault(name, {})
-            for done, system in enumerate(systems):
-                watcher.advance(done)
-                known = before.get(name, {}).get(system)
-                if known is None:
-                    known = asdict(_cell(worker, case, system, quick))
-                cells[system] = known
-                if kept is not None:
-                    save(result, kept, before)
-            watcher.end()
+            _judge(
+                case, systems, quick, worker, result["cells"].setdefault(name, {}), lambda: file.put(result), watcher
+            )
     return result
 
 
-def _cell(worker: Worker, case: Case, system: str, quick: bool) -> Cell:
-    if system in case.cannot:
-        return Cell("cannot express", False, case.cannot[system])
-    return worker.run(case.number, system, quick, LIMITS[0 if quick else 1])
+def _judge(
+    case: Case,
+    systems: Iterable[str],
+    quick: bool,
+    worker: Worker,
+    cells: dict[str, Any],
+    keep: Callable[[], None],
+    watcher: Watcher | None,
+) -> None:
+    """All programs on one case."""
 
+    def put(system: str, cell: Cell) -> None:
+        cells[system] = json_files.plain(asdict(cell))
+        keep()
 
-def save(result: Mapping[str, Any], path: Path, before: Mapping[str, Any] | None = None) -> None:
-    """Write in one piece; cells of an earlier run that were not reached yet stay in the file."""
-    cells = {**(before or {})}
-    for name, row in result["cells"].items():
-        cells[name] = {**cells.get(name, {}), **row}
-    with in_one_piece(path) as file:
-        file.write((json.dumps({**result, "cells": cells}, indent=1) + "\n").encode())
+    def judged(system: str) -> Cell:
+        if system in case.cannot:
+            return Cell("cannot express", False, case.cannot[system])
+        return worker.run(case.number, system, quick, LIMITS[0 if quick else 1])
+
+    work_off(f"{case.number} {case.title}", {name: partial(judged, name) for name in systems}, put, cells, watcher)
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -119,23 +110,7 @@ def load(path: Path) -> dict[str, Any]:
     InputError
         The file holds none.
     """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["format"] != FORMAT:
-            raise KeyError("format")
-    except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} holds no result of kcons hardcases: {error!r}", item="file") from None
-    return dict(found)
-
-
-def _earlier(kept: Path | None, made_by: Mapping[str, Any]) -> dict[str, Any]:
-    if kept is None or not kept.is_file():
-        return {}
-    try:
-        found = load(kept)
-    except InputError:
-        return {}
-    return dict(found["cells"]) if found["made_by"] == json.loads(json.dumps(made_by)) else {}
+    return json_files.read(path, FORMAT, of="kcons hardcases")
 
 
 def _described(case: Case) -> dict[str, str]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from kcons.comparison.hard_cases.case import Case, Cell, all_cases, judge
 from kcons.comparison.hard_cases.programs import PROGRAMS, quiet
-from kcons.comparison.work_precision.measure import kernels_cached
+from kcons.comparison.study.machine import kernels_cached
 
 
 def run_cell(case: Case, program: str, quick: bool) -> Cell:

@@ -81,7 +81,6 @@ class Run(ABC):
 
     Attributes
     ----------
-    time : float
     steps : int
         Steps that the last `advance` made.
     constraints : Stopwatch
@@ -90,12 +89,16 @@ class Run(ABC):
         Whether that time can be told from the rest of a step.
     """
 
-    time: float = 0.0
     steps: int = 1
     divided: bool = True
 
     def __init__(self) -> None:
         self.constraints = Stopwatch()
+
+    @property
+    def time(self) -> float:
+        """How far it has come."""
+        raise NotImplementedError
 
     @abstractmethod
     def advance(self) -> None:
@@ -138,6 +141,14 @@ class Run(ABC):
     @abstractmethod
     def velocities(self) -> FloatArray: ...
 
+    def observe(self) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities."""
+        return self.positions, self.velocities
+
+    def put(self, x: FloatArray) -> None:
+        """Other positions, such as those wrapped into a cell, and the velocities as they are."""
+        raise NotImplementedError
+
     # -- what only a host knows that runs by itself ----------------------------------------------
 
     def own_energy(self) -> float | None:
@@ -154,6 +165,22 @@ class Run(ABC):
         Asked for at the end: the state may be spoilt by it.
         """
         return None
+
+
+class Steps(Run):
+    """A run of so many steps of one length; what advances it counts those that are done."""
+
+    def __init__(self, dt: float, steps: int) -> None:
+        super().__init__()
+        self._dt, self._done, self._planned = dt, 0, steps
+
+    @property
+    def time(self) -> float:
+        return self._done * self._dt
+
+    @property
+    def finished(self) -> bool:
+        return self._done >= self._planned
 
 
 @dataclass(frozen=True)
@@ -238,6 +265,11 @@ def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> Constra
         if len(mine):
             pieces.append(item.select(mine))
     return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
+
+
+def exponent(tolerance: float) -> str:
+    """'1e-5', as it is in names and titles."""
+    return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
 # -- what goes wrong --------------------------------------------------------------------------------

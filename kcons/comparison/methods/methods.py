@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from ase import Atoms
-from ase.constraints import FixAtoms, FixBondLengths, FixInternals
 from ase.md.verlet import VelocityVerlet
 from scipy.integrate import DOP853
 
 from kcons import steppers
 from kcons.ase import Constraints
+from kcons.comparison.methods.engines import InAse, OfStates, OnArrays, ase_constraints
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
 from kcons.comparison.methods.openmm import OPENMM_METHODS
 from kcons.comparison.methods.peers import PEERS
@@ -55,54 +55,18 @@ ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribut
 # -- kcons ------------------------------------------------------------------------------------------
 
 
-class _StateRun(Run):
-    """A run of `State`s."""
-
-    _state: State
-
-    @property
-    def positions(self) -> FloatArray:
-        return self._state.positions
-
-    @property
-    def velocities(self) -> FloatArray:
-        return self._state.velocities
-
-
-class _CoreRun(_StateRun):
+class _CoreRun(OnArrays):
     def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
-        super().__init__()
-        self.constraints.watch(motion, ENGINE_CALLS)
         stepper.check(system := System(motion, scene.potential.forces, friction=scene.friction))
-        self._system = system
-        self._stepper = stepper
-        self._start = self._system.with_forces(State(scene.positions, scene.velocities))
-        self._state = self._start
+        start = system.with_forces(State(scene.positions, scene.velocities))
+        super().__init__(system, start, stepper, dt, round(scene.horizon / dt))
+        self.constraints.watch(motion, ENGINE_CALLS)
         self._potential = scene.potential
-        self._dt = dt
-        self._done = 0
-        self._steps = round(scene.horizon / dt)
-
-    def advance(self) -> None:
-        self._state = self._stepper.step(self._system, self._state, self._dt)
-        self._done += 1
-        self.time = self._done * self._dt
-        # Rigid water and few distances take a step in kernels that do not call the engine.
-        self.divided = self.constraints.seconds > 0.0
-
-    def march(self, steps: int) -> None:
-        self._state = steppers.run(self._system, self._state, self._dt, steps, stepper=self._stepper)
-        self._done += steps
-        self.time = self._done * self._dt
 
     def rewind(self) -> None:
-        self._state = self._start
+        super().rewind()
         # The end of the last step is no longer the last point known.
         self._potential.forces(self._start.positions)
-
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._steps
 
 
 @dataclass(frozen=True)
@@ -187,7 +151,7 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
     return lambda dt: item()  # type: ignore[no-any-return]
 
 
-class _ExtrapolatedRun(_StateRun):
+class _ExtrapolatedRun(OfStates):
     def __init__(self, scene: Scene, tolerance: float) -> None:
         super().__init__()
         motion = Motion(scene.constraint_set, scene.positions)
@@ -199,8 +163,11 @@ class _ExtrapolatedRun(_StateRun):
 
     def advance(self) -> None:
         self._state = next(self._states)
-        self.time = self._state.time
         self.divided = self.constraints.seconds > 0.0
+
+    @property
+    def time(self) -> float:
+        return self._state.time
 
     @property
     def finished(self) -> bool:
@@ -217,51 +184,22 @@ class Extrapolated(Method):
 # -- ASE --------------------------------------------------------------------------------------------
 
 
-class _AseRun(Run):
+class _AseRun(InAse):
     def __init__(self, scene: Scene, dt: float, *constraints: Any) -> None:
-        super().__init__()
-        self._scene = scene
-        self._atoms = scene.atoms()
-        self._momenta = self._atoms.get_momenta()
-        self._atoms.set_constraint(constraints)
+        atoms = scene.atoms()
+        self._scene, self._momenta = scene, atoms.get_momenta()
+        atoms.set_constraint(constraints)
+        super().__init__(atoms, VelocityVerlet(atoms, timestep=dt), dt, round(scene.horizon / dt))
         # set_constraint keeps the objects themselves, so that their hooks can be timed.
-        for item in self._atoms.constraints:
+        for item in atoms.constraints:
             self.constraints.watch(item, ASE_HOOKS)
-        self._dynamics = VelocityVerlet(self._atoms, timestep=dt)
-        self._dt = dt
-        self._done = 0
-        self._steps = round(scene.horizon / dt)
-        scene.potential.forces(self._atoms.positions)
-
-    def advance(self) -> None:
-        self._dynamics.step()
-        self._done += 1
-        self.time = self._done * self._dt
-
-    def march(self, steps: int) -> None:
-        step = self._dynamics.step  # as ASE's own loop calls it
-        for _ in range(steps):
-            step()
-        self._done += steps
-        self.time = self._done * self._dt
+        scene.potential.forces(atoms.positions)
 
     def rewind(self) -> None:
         self._atoms.positions[:] = self._scene.positions
         # Constraints would change them by what rounding leaves.
         self._atoms.set_momenta(self._momenta, apply_constraint=False)
         self._scene.potential.forces(self._scene.positions)
-
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._steps
-
-    @property
-    def positions(self) -> FloatArray:
-        return np.asarray(self._atoms.get_positions())
-
-    @property
-    def velocities(self) -> FloatArray:
-        return np.asarray(self._atoms.get_velocities())
 
 
 class AseMethod(Method):
@@ -294,7 +232,7 @@ class AseBonds(AseMethod):
     def start(self, scene: Scene, setting: float) -> Run:
         assert scene.bonds is not None
         lengths = _distances(scene.atoms(), scene.bonds)
-        return _AseRun(scene, setting, *_fixed(scene), FixBondLengths(scene.bonds, bondlengths=lengths))
+        return _AseRun(scene, setting, *ase_constraints(scene.fixed, scene.bonds, lengths, internals=False))
 
 
 class AseInternals(AseMethod):
@@ -308,13 +246,9 @@ class AseInternals(AseMethod):
         assert bonds is not None
         atoms = scene.atoms()
         lengths = _distances(atoms, bonds)
-        pairs = [[float(d), [int(i), int(j)]] for d, (i, j) in zip(lengths, bonds, strict=True)]
-        triples = [[float(atoms.get_angle(*t)), [int(a) for a in t]] for t in scene.angles]
-        return _AseRun(scene, setting, *_fixed(scene), FixInternals(bonds=pairs, angles_deg=triples or None))
-
-
-def _fixed(scene: Scene) -> list[FixAtoms]:
-    return [FixAtoms(scene.fixed)] if len(scene.fixed) else []
+        degrees = [atoms.get_angle(*triple) for triple in scene.angles]
+        held = ase_constraints(scene.fixed, bonds, lengths, scene.angles, degrees, internals=True)
+        return _AseRun(scene, setting, *held)
 
 
 def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
@@ -352,9 +286,12 @@ class _OdeRun(Run):
         message = self._solver.step()
         if self._solver.status == "failed":
             raise KconsError(f"DOP853 gave up at t = {self._solver.t:g}: {message}")
-        self.time = float(self._solver.t)
         if self._project:
             self._land()
+
+    @property
+    def time(self) -> float:
+        return float(self._solver.t)
 
     def _land(self) -> None:
         """Back onto the constraints, by less than the tolerance: the force known there need not be computed again."""

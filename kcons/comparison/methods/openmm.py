@@ -5,7 +5,7 @@ OpenMM runs by itself, several steps at a time; its Context starts where the sce
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from time import perf_counter
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, matched_steps
+from kcons.comparison.methods.engines import InOpenMM
+from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, exponent, matched_steps
 from kcons.comparison.scenes import Scene
 from kcons.comparison.scenes.openmm_host import OpenMMHost
 from kcons.constraints.target import FloatArray
@@ -46,7 +47,7 @@ NO_TRAJECTORY = "thermostat: a trajectory of its own, so that no error can be st
 SETTLE = "SETTLE stores its distances in single precision: water is off by up to 6e-8 of them at any tolerance."
 
 
-class _HostRun(Run):
+class _HostRun(InOpenMM):
     """A Context that is stepped to the horizon.
 
     Parameters
@@ -70,12 +71,10 @@ class _HostRun(Run):
         half_step: bool = False,
         records: int | None = RECORDS,
     ) -> None:
-        super().__init__()
         host = scene.openmm
         assert host is not None
-        self._scene, self._host, self._context, self._integrator = scene, host, context, integrator
-        self._dt, self._evaluations, self._half_step = dt, evaluations, half_step
-        self._done, self._planned = 0, round(scene.horizon / dt)
+        super().__init__(context, integrator, dt, round(scene.horizon / dt), host.length, host.speed)
+        self._evaluations, self._half_step = evaluations, half_step
         self._stride = 1 if records is None else max(1, self._planned // records)
         self._groups = integrator.getIntegrationForceGroups()
         self._end: tuple[FloatArray, FloatArray] | None = None
@@ -95,36 +94,21 @@ class _HostRun(Run):
         if self._done:
             self._spent += perf_counter() - begun
         self._done += self.steps
-        self.time = self._done * self._dt
         if self.finished and hasattr(self._integrator, "check"):
             self._integrator.check()  # what OpenMM's solvers do not tell
-
-    def march(self, steps: int) -> None:
-        self._integrator.step(steps)
-        self._done += steps
-        self.time = self._done * self._dt
 
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
         return _block(step_seconds, pass_seconds)
 
     def rewind(self) -> None:
-        self._context.setPositions(self._x)
-        self._context.setVelocities(self._v)
+        self.context.setPositions(self._x)
+        self.context.setVelocities(self._v)
 
     def settle(self) -> None:
         self._integrator.step(1)
 
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._planned
-
-    @property
-    def positions(self) -> FloatArray:
-        return (self._state()[0] if self._end is None else self._end[0]) / self._host.length
-
-    @property
-    def velocities(self) -> FloatArray:
-        return (self._state()[1] if self._end is None else self._end[1]) / self._host.speed
+    def observe(self) -> tuple[FloatArray, FloatArray]:
+        return super().observe() if self._end is None else self._end
 
     def own_energy(self) -> float | None:
         if not self._half_step:
@@ -133,9 +117,9 @@ class _HostRun(Run):
             # To ask would compute the forces that the next step is to pay for.
             return float("nan")
         # OpenMM's own integrators compute forces anew in every step. They know how to move velocities by half a step.
-        state = self._context.getState(energy=True, groups=self._groups)
+        state = self.context.getState(energy=True, groups=self._groups)
         energy = state.getKineticEnergy() + state.getPotentialEnergy()
-        return float(energy._value) / self._host.speed**2
+        return float(energy._value) / self._speed**2
 
     def own_evaluations(self) -> int:
         return self._done * self._evaluations
@@ -145,7 +129,7 @@ class _HostRun(Run):
         timed = self._planned - 1
         if not self.finished or not timed or self._spent > SHORT_STEP * timed:
             return None
-        self._end = self._state()
+        self._end = self.observe()
         if not np.isfinite(self._end[0]).all():
             return None
         size = _block(self._spent / timed, BLOCK_SECONDS)
@@ -159,15 +143,8 @@ class _HostRun(Run):
             return None
         return float(np.median(found))
 
-    def _state(self) -> tuple[FloatArray, FloatArray]:
-        state = self._context.getState(positions=True, velocities=True)
-        return (
-            np.asarray(state.getPositions(asNumpy=True)._value),
-            np.asarray(state.getVelocities(asNumpy=True)._value),
-        )
-
     def _forces(self) -> FloatArray:
-        state = self._context.getState(forces=True, groups=self._groups)
+        state = self.context.getState(forces=True, groups=self._groups)
         return np.asarray(state.getForces(asNumpy=True)._value)
 
 
@@ -210,39 +187,49 @@ def _host(scene: Scene) -> OpenMMHost:
     return scene.openmm
 
 
+def only_water(scene: Scene) -> bool:
+    """Whether OpenMM's System holds nothing but rigid water."""
+    from kcons.openmm.carried.hold import take_constraints
+
+    host = _host(scene)
+    return not host.surfaces and not take_constraints(host.copy())
+
+
 # -- OpenMM's own -----------------------------------------------------------------------------------
 
 
-def verlet() -> openmm.Integrator:
-    import openmm
+@dataclass(frozen=True)
+class Own:
+    """An integrator of OpenMM.
 
-    return openmm.VerletIntegrator(0.001)
+    Attributes
+    ----------
+    name : str
+    arguments : tuple of float
+        What it takes before the time step: temperature and collisions.
+    """
+
+    name: str
+    arguments: tuple[float, ...] = ()
+
+    def __call__(self) -> Any:
+        import openmm
+
+        integrator = getattr(openmm, self.name)(*self.arguments, 0.001)
+        if self.name == "LangevinMiddleIntegrator":
+            integrator.setRandomNumberSeed(1)
+        return integrator
+
+    def code(self, dt: str) -> str:
+        """The expression that makes it."""
+        return f"{self.name}({', '.join([*(f'{a:g}' for a in self.arguments), dt])})"
 
 
-def middle() -> openmm.Integrator:
-    import openmm
-
-    return openmm.LangevinMiddleIntegrator(TEMPERATURE, 0.0, 0.001)
-
-
-def nose_hoover() -> openmm.Integrator:
-    import openmm
-
-    return openmm.NoseHooverIntegrator(0.001)
-
-
-def middle_bath() -> openmm.Integrator:
-    import openmm
-
-    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, COLLISIONS, 0.001)
-    integrator.setRandomNumberSeed(1)
-    return integrator
-
-
-def nose_hoover_bath() -> openmm.Integrator:
-    import openmm
-
-    return openmm.NoseHooverIntegrator(TEMPERATURE, COLLISIONS, 0.001)
+VERLET = Own("VerletIntegrator")
+MIDDLE = Own("LangevinMiddleIntegrator", (TEMPERATURE, 0.0))
+NOSE_HOOVER = Own("NoseHooverIntegrator")
+MIDDLE_BATH = Own("LangevinMiddleIntegrator", (TEMPERATURE, COLLISIONS))
+NOSE_HOOVER_BATH = Own("NoseHooverIntegrator", (TEMPERATURE, COLLISIONS))
 
 
 @dataclass(frozen=True)
@@ -251,11 +238,11 @@ class BuiltIn(OpenMMMethod):
 
     Attributes
     ----------
-    make : callable
+    make : Own
     tolerance : float
     """
 
-    make: Callable[[], Any] = verlet
+    make: Own = VERLET
     tolerance: float = DEFAULT
 
     def start(self, scene: Scene, setting: float) -> Run:
@@ -344,12 +331,10 @@ class Held(Projected):
 
     def start(self, scene: Scene, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator, hold
-        from kcons.openmm.carried.hold import take_constraints
 
         host, system = _host(scene), _host(scene).copy()
-        only_water = not host.surfaces and not take_constraints(host.copy())
         rows: Sequence[Any] = host.surfaces
-        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water)
+        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water(scene))
         integrator = ProjectedIntegrator(setting * host.time, self.scheme, parts=[part], tolerance=TIGHT)
         context = host.context(system, integrator)
         run = self._run(_CarriedRun, scene, context, integrator, setting)
@@ -377,9 +362,9 @@ class OnSurfaces(Projected):
 # -- by name ----------------------------------------------------------------------------------------
 
 _KINDS = {
-    "openmm-verlet": ("OpenMM Verlet", verlet),
-    "openmm-middle": ("OpenMM LangevinMiddle, no friction", middle),
-    "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", nose_hoover),
+    "openmm-verlet": ("OpenMM Verlet", VERLET),
+    "openmm-middle": ("OpenMM LangevinMiddle, no friction", MIDDLE),
+    "openmm-nose-hoover": ("OpenMM NoseHoover, no bath", NOSE_HOOVER),
 }
 
 
@@ -388,11 +373,11 @@ def _built_in() -> list[OpenMMMethod]:
     for kind, (title, make) in _KINDS.items():
         for tolerance in TOLERANCES:
             plain = tolerance == DEFAULT
-            exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+            told = exponent(tolerance)
             found.append(
                 BuiltIn(
-                    kind if plain else f"{kind}-{exponent}",
-                    f"{title}, {exponent}",
+                    kind if plain else f"{kind}-{told}",
+                    f"{title}, {told}",
                     usual=kind == "openmm-verlet" or plain,
                     guest=kind == "openmm-verlet" and plain,
                     remark=HALF_STEP,
@@ -401,8 +386,8 @@ def _built_in() -> list[OpenMMMethod]:
                 )
             )
     baths = (
-        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", middle_bath),
-        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", nose_hoover_bath),
+        ("openmm-middle-bath", "OpenMM LangevinMiddle, 300 K", MIDDLE_BATH),
+        ("openmm-nose-hoover-bath", "OpenMM NoseHoover, 300 K", NOSE_HOOVER_BATH),
     )
     found += [BuiltIn(name, title, follows=False, remark=NO_TRAJECTORY, make=make) for name, title, make in baths]
     return found
@@ -423,9 +408,9 @@ def _of_kcons() -> list[OpenMMMethod]:
         )
         found.append(projected)
     for tolerance in (1e-4, DEFAULT, 1e-6, TIGHT):
-        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
-        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{exponent}"
-        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {exponent}", tolerance=tolerance))
+        told = exponent(tolerance)
+        name = "openmm-rattle" if tolerance == TIGHT else f"openmm-rattle-{told}"
+        found.append(Compiled(name, f"OpenMM + kcons compiled RATTLE, {told}", tolerance=tolerance))
     for scheme in ("rattle", "blanes-moan4", "blanes-moan6"):
         title = f"OpenMM + kcons {scheme}, own solver"
         found.append(Held(f"openmm-held-{scheme}", title, usual=scheme != "blanes-moan4", scheme=scheme))

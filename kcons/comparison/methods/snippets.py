@@ -10,26 +10,9 @@ import inspect
 
 from kcons.comparison.methods.method import Method
 from kcons.comparison.methods.methods import METHODS, AseBonds, AseKcons, CoreStepper, Extrapolated, ProjectedOde
-from kcons.comparison.methods.openmm import (
-    TIGHT,
-    BuiltIn,
-    Compiled,
-    Held,
-    OnSurfaces,
-    Projected,
-    middle,
-    nose_hoover,
-    verlet,
-)
+from kcons.comparison.methods.openmm import TIGHT, BuiltIn, Compiled, Held, OnSurfaces, Projected, only_water
 from kcons.comparison.scenes import Scene
 from kcons.errors import InputError
-
-_OPENMM_KINDS = {
-    verlet: "VerletIntegrator({dt})",
-    middle: "LangevinMiddleIntegrator(300, 0, {dt})",
-    nose_hoover: "NoseHooverIntegrator({dt})",
-}
-
 
 _ON_ARRAYS = (
     "scene = SCENE",
@@ -81,7 +64,7 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
     elif isinstance(found, BuiltIn | Compiled | Projected) and not isinstance(found, OnSurfaces):
         assert scene.openmm is not None
         step = repr(float(f"{setting * scene.units.time_unit * scene.openmm.time:.15g}"))
-        lines = _openmm(found, step, steps, keep_water=not _only_water(scene))
+        lines = _openmm(found, step, steps, keep_water=not only_water(scene))
     else:
         lines = _any(method, setting if found.adaptive else setting * scene.units.time_unit)
     return "\n".join(lines).replace("SCENE", made_by) + "\n"
@@ -187,21 +170,15 @@ def _scipy(rtol: float) -> list[str]:
     ]
 
 
-def _only_water(scene: Scene) -> bool:
-    """Whether OpenMM's System holds nothing but rigid water."""
-    from kcons.openmm.carried.hold import take_constraints
-
-    assert scene.openmm is not None
-    return not scene.openmm.surfaces and not take_constraints(scene.openmm.copy())
-
-
 def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str]:
     lines = ["from kcons.comparison import scenes"]
     made = ["scene = SCENE", "host = scene.openmm", "system = host.system  # yours, with its constraints"]
     if isinstance(found, BuiltIn):
         lines = ["import openmm", "", *lines]
-        kind = _OPENMM_KINDS[found.make].format(dt=dt)
-        made += [f"integrator = openmm.{kind}", f"integrator.setConstraintTolerance({found.tolerance:g})"]
+        made += [
+            f"integrator = openmm.{found.make.code(dt)}",
+            f"integrator.setConstraintTolerance({found.tolerance:g})",
+        ]
     elif isinstance(found, Held):
         lines += ["from kcons.openmm import ProjectedIntegrator, hold"]
         made[-1] = "system = host.copy()  # yours; its constraints move to kcons"

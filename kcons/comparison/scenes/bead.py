@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kcons.comparison.scenes.minimal import integrated, single
-from kcons.comparison.scenes.potential import Evaluate, Potential
+from kcons.comparison.scenes.potential import Potential, uniform_field
 from kcons.comparison.scenes.scene import BARE, Reference, Scene
 from kcons.constraints import Ellipsoid, ImplicitSurface, Plane, Torus
 from kcons.constraints.constraint import Constraint
@@ -74,7 +74,7 @@ def _on_ellipse(omega: float) -> Scene:
         constraint_set=ConstraintSet(held, x, [mass]),
         positions=x,
         velocities=v,
-        potential=Potential(_weight(mass), "uniform field"),
+        potential=Potential(uniform_field(np.array([mass]), GRAVITY), "uniform field"),
         refusals=refusals,
         solution=lambda time: along_ellipse(angle, rate, omega, time),
         **_COMMON,
@@ -166,12 +166,3 @@ _COMMON: dict[str, Any] = dict(
     tolerances=(1e-3, 1e-6, 1e-9),
     units=BARE,
 )
-
-
-def _weight(mass: float) -> Evaluate:
-    force = np.array([[0.0, 0.0, -mass * GRAVITY]])
-
-    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        return -float(np.sum(force * x)), force
-
-    return evaluate

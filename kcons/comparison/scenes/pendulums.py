@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ellipj
 
 from kcons.comparison.scenes.minimal import integrated, single
-from kcons.comparison.scenes.potential import Evaluate, Potential
+from kcons.comparison.scenes.potential import Potential, uniform_field
 from kcons.comparison.scenes.scene import BARE, Reference, Scene
 from kcons.constraints import Distance, Sphere
 from kcons.constraints.constraint import Constraint
@@ -91,7 +91,7 @@ def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> Scene:
         constraint_set=ConstraintSet(held, x, masses),
         positions=x,
         velocities=chosen.velocities(angles, rates),
-        potential=Potential(_weight(masses), "uniform field"),
+        potential=Potential(uniform_field(masses, GRAVITY), "uniform field"),
         symbols=["X"] * links,
         horizon=chosen.horizon,
         time_steps=tuple(chosen.horizon / n for n in (200, 400, 800, 1600)),
@@ -141,12 +141,3 @@ def _angles(chosen: Pendulum, time: float) -> Reference:
 
     start = np.array(chosen.angles + chosen.rates)
     return integrated(rate, start, time, lambda y: chosen.places(y[:count]), "Lagrange's equations of the angles")
-
-
-def _weight(masses: FloatArray) -> Evaluate:
-    force = np.outer(masses, [0.0, 0.0, -GRAVITY])
-
-    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        return -float(np.sum(force * x)), force
-
-    return evaluate

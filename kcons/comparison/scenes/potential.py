@@ -78,6 +78,16 @@ class Potential:
         self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
 
 
+def uniform_field(masses: FloatArray, gravity: float = 1.0) -> Evaluate:
+    """Weights along -z."""
+    force = np.outer(masses, [0.0, 0.0, -gravity])
+
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
+        return -float(np.sum(force * x)), force
+
+    return evaluate
+
+
 class PotentialCalculator:
     """A `Potential` as an ASE calculator.
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
-from kcons.comparison.scenes.potential import Evaluate, Potential
+from kcons.comparison.scenes.potential import Potential, uniform_field
 from kcons.comparison.scenes.scene import REDUCED, Reference, Scene
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
@@ -83,7 +83,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool
         constraint_set=ConstraintSet(spheres, x, masses),
         positions=x,
         velocities=v,
-        potential=Potential(_weight(gravity), "uniform field" if gravity else "no forces"),
+        potential=Potential(uniform_field(masses, gravity), "uniform field" if gravity else "no forces"),
         symbols=["X"] * size,
         horizon=8.0 if near_top else 4.0,
         time_steps=(0.2, 0.1, 0.05, 0.025),
@@ -108,15 +108,6 @@ def swing(x: FloatArray, v: FloatArray, gravity: float, time: float, *, rtol: fl
 
     end = solve_ivp(rate, (0.0, time), np.concatenate([x, v]), method="DOP853", rtol=rtol, atol=1e-15).y[:3, -1]
     return np.asarray(end * (np.linalg.norm(x) / np.linalg.norm(end)))
-
-
-def _weight(gravity: float) -> Evaluate:
-    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        f = np.zeros_like(x)
-        f[:, 2] = -gravity
-        return gravity * float(x[:, 2].sum()), f
-
-    return evaluate
 
 
 def _system(masses: FloatArray, gravity: float) -> Any:

@@ -20,6 +20,7 @@ import numpy as np
 from ase import Atoms
 from ase.constraints import FixBondLengths
 
+from kcons.comparison.methods.engines import seen
 from kcons.comparison.methods.peers import lammps_shake
 from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
 from kcons.comparison.solvers_alone.bare_systems import STEP, BareSystem
@@ -149,18 +150,13 @@ class OpenMMSolver(BareSolver):
         if stage == "P":
             start = 0.1 * system.moved
             seconds = sampled(lambda: context.applyConstraints(self.tolerance), lambda: context.setPositions(start))
-            return Timing(seconds, system.stretch(10.0 * self._state("positions")))
+            return Timing(seconds, system.stretch(10.0 * seen(context)[0]))
         context.setPositions(0.1 * system.positions)
         start = 100.0 * system.thermal
         seconds = sampled(
             lambda: context.applyVelocityConstraints(self.tolerance), lambda: context.setVelocities(start)
         )
-        return Timing(seconds, system.departure(system.positions, 0.01 * self._state("velocities")))
-
-    def _state(self, what: str) -> FloatArray:
-        state = self.context.getState(**{what: True})
-        found = state.getPositions(asNumpy=True) if what == "positions" else state.getVelocities(asNumpy=True)
-        return np.asarray(found._value)
+        return Timing(seconds, system.departure(system.positions, 0.01 * seen(context)[1]))
 
 
 @lru_cache(maxsize=1)

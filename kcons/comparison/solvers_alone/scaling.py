@@ -11,8 +11,9 @@ import os
 import selectors
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +21,10 @@ import numpy as np
 
 from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES, STAGES
 from kcons.comparison.solvers_alone.bare_systems import BareSystem, chain, water
-from kcons.comparison.solvers_alone.solver_precision import COLORS, MARKERS
-from kcons.comparison.study.html_page import PageTable
-from kcons.comparison.work_precision.measure import Watcher
+from kcons.comparison.solvers_alone.solver_precision import LOOKS
+from kcons.comparison.study.curves import Curve, Panel, draw
+from kcons.comparison.study.study import Watcher, work_off
+from kcons.comparison.study.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,22 +83,20 @@ def measure(
         Plain data for JSON: 'points', each with kind, size, rows, solver, status ('ok', 'stopped', 'failed', 'not
         run') and the fields of `GROWING` and `MEMORY`.
     """
-    watching = watcher or Watcher()
     wanted = dict(sizes or {kind: small if quick else large for kind, (_, _, large, small) in KINDS.items()})
     names = list(solvers or (QUICK_SOLVERS if quick else [candidate.name for candidate in CANDIDATES]))
     patience = patience or (QUICK_PATIENCE if quick else PATIENCE)
-    found: dict[str, Any] = {"format": FORMAT, "quick": quick, "patience": patience, "points": []}
-    if earlier is not None and earlier.get("format") == FORMAT and earlier.get("quick") == quick:
-        found["points"] = list(earlier["points"])
+    before = earlier if earlier and earlier["quick"] == quick else {}
+    found = {"format": FORMAT, "quick": quick, "patience": patience, "points": [], **before}
     done = {(point["kind"], point["solver"]) for point in found["points"]}
-    missing = [(kind, name) for kind in wanted for name in names if (kind, name) not in done]
-    watching.begin("scaling", max(len(missing), 1))
-    for count, (kind, name) in enumerate(missing, 1):
-        found["points"] += list(_grown(kind, name, wanted[kind], patience))
-        watching.advance(count)
+
+    def put(_: tuple[str, str], new: Iterable[dict[str, Any]]) -> None:
+        found["points"] = [*found["points"], *new]
         if keep is not None:
             keep(found)
-    watching.end()
+
+    work = {(kind, name): partial(_grown, kind, name, wanted[kind], patience) for kind in wanted for name in names}
+    work_off("scaling", work, put, done, watcher)
     return found
 
 
@@ -202,33 +202,26 @@ def exponents(result: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
 
 def figure(result: Mapping[str, Any]) -> Figure:
     """Seconds of P and V, and memory, against size; exponents in the legends."""
-    from matplotlib.figure import Figure
-
     kinds = [kind for kind in KINDS if any(p["kind"] == kind for p in result["points"])]
     fields = {"p_seconds": "positions, s", "v_seconds": "velocities, s", MEMORY: "memory, bytes"}
     fitted = exponents(result)
-    page = Figure(figsize=(13.0, 3.6 * max(len(kinds), 1)), layout="constrained")
-    panels = page.subplots(max(len(kinds), 1), len(fields), squeeze=False)
-    for row, kind in enumerate(kinds):
-        for column, (field, label) in enumerate(fields.items()):
-            axes = panels[row, column]
-            for candidate in CANDIDATES:
-                points = [p for p in _of(result, kind, candidate.name) if p.get(field)]
-                if not points:
-                    continue
+
+    def panel(kind: str, field: str, label: str) -> Panel:
+        curves = []
+        for candidate in CANDIDATES:
+            points = [p for p in _of(result, kind, candidate.name) if p.get(field)]
+            if points:
                 power = fitted.get((kind, candidate.name, field))
                 text = candidate.title + ("" if power is None else f", $N^{{{power:.2f}}}$")
-                style = dict(color=COLORS[candidate.name], marker=MARKERS[candidate.name])
-                axes.loglog([p["size"] for p in points], [p[field] for p in points], label=text, **style)
-            axes.set_xlabel(KINDS[kind][1])
-            axes.set_ylabel(label)
-            axes.grid(alpha=0.3)
-            if axes.lines:
-                axes.legend(fontsize="x-small")
-    return page
+                sizes, costs = [p["size"] for p in points], [p[field] for p in points]
+                curves.append(Curve(sizes, costs, text, LOOKS[candidate.name]))
+        return Panel(curves, KINDS[kind][1], label, legend="x-small")
+
+    panels = [[panel(kind, field, label) for field, label in fields.items()] for kind in kinds]
+    return draw(panels or [[Panel([])] * len(fields)], (13.0, 3.6 * max(len(kinds), 1)))
 
 
-def table(result: Mapping[str, Any]) -> PageTable:
+def table(result: Mapping[str, Any]) -> Table:
     """All points, and under each solver its exponents."""
     titles = {candidate.name: candidate.title for candidate in CANDIDATES}
     headings = ("system", "size", "solver", "P, s", "V, s", "set-up, s", "memory, MB", "note")
@@ -248,7 +241,7 @@ def table(result: Mapping[str, Any]) -> PageTable:
                 shown = ["" if power is None else f"N^{power:.2f}" for power in powers]
                 rows.append([what, "exponent", titles[candidate.name], *shown, f"from {FIT_FROM:,} on"])
                 marks.append("")
-    return PageTable(headings, rows, text_columns=(0, 2, 7), marks=marks)
+    return Table(headings, rows, words=(0, 2, 7), marks=marks)
 
 
 def _of(result: Mapping[str, Any], kind: str, solver: str) -> list[Mapping[str, Any]]:

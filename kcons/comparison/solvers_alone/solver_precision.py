@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +12,9 @@ import numpy as np
 
 from kcons.comparison.solvers_alone.bare_solvers import CANDIDATES, STAGES, Candidate
 from kcons.comparison.solvers_alone.bare_systems import BareSystem, chain, methyl, protein, water
-from kcons.comparison.study.html_page import PageTable
-from kcons.comparison.work_precision.measure import Watcher
+from kcons.comparison.study.curves import Curve, Panel, draw
+from kcons.comparison.study.study import Watcher, work_off
+from kcons.comparison.study.tables import Table
 from kcons.errors import UnsupportedError
 
 if TYPE_CHECKING:
@@ -35,8 +38,14 @@ PATIENCE, QUICK_PATIENCE = 20.0, 1.0
 BOTH = "P and V"
 #: Below this there is nothing but rounding.
 FLOOR = 1e-17
-COLORS = {"kcons": "#0072B2", "sweeps": "#a6611a", "ase": "#D55E00", "openmm": "#009E73", "lammps": "#6a51a3"}
-MARKERS = {"kcons": "o", "sweeps": "v", "ase": "^", "openmm": "s", "lammps": "D"}
+#: Colour and marker of each solver.
+LOOKS: Mapping[str, Mapping[str, str]] = {
+    "kcons": {"color": "#0072B2", "marker": "o"},
+    "sweeps": {"color": "#a6611a", "marker": "v"},
+    "ase": {"color": "#D55E00", "marker": "^"},
+    "openmm": {"color": "#009E73", "marker": "s"},
+    "lammps": {"color": "#6a51a3", "marker": "D"},
+}
 
 
 def measure(
@@ -67,25 +76,25 @@ def measure(
         Plain data for JSON: 'points', each with system, solver, tolerance, stage ('P' or 'V'), status ('ok',
         'failed' or 'not run'), seconds, ns_per_row and residual.
     """
-    watching = watcher or Watcher()
     names = list(systems or [name for name, (_, small) in SYSTEMS.items() if small == quick])
-    found: dict[str, Any] = {"format": FORMAT, "quick": quick, "systems": {}, "points": []}
-    if earlier is not None and earlier.get("format") == FORMAT and earlier.get("quick") == quick:
-        found["systems"], found["points"] = dict(earlier["systems"]), list(earlier["points"])
+    before = earlier if earlier and earlier["quick"] == quick else {}
+    found = {"format": FORMAT, "quick": quick, "systems": {}, "points": [], **before}
     done = {(point["system"], point["solver"]) for point in found["points"]}
-    missing = [(name, candidate) for name in names for candidate in CANDIDATES if (name, candidate.name) not in done]
-    watching.begin("constraint solvers alone", max(len(missing), 1))
-    built: tuple[str, BareSystem] | None = None
-    for count, (name, candidate) in enumerate(missing, 1):
-        if built is None or built[0] != name:
-            built = (name, SYSTEMS[name][0]())
-            system = built[1]
-            found["systems"][name] = {"title": system.name, "atoms": len(system.positions), "rows": system.n_rows}
-        found["points"] += _points(name, built[1], candidate, QUICK_PATIENCE if quick else PATIENCE)
-        watching.advance(count)
+    built = lru_cache(maxsize=1)(lambda name: SYSTEMS[name][0]())
+
+    def points(name: str, candidate: Candidate) -> list[dict[str, Any]]:
+        system: BareSystem = built(name)
+        about = {"title": system.name, "atoms": len(system.positions), "rows": system.n_rows}
+        found["systems"] = {**found["systems"], name: about}
+        return _points(name, system, candidate, QUICK_PATIENCE if quick else PATIENCE)
+
+    def put(_: tuple[str, str], new: list[dict[str, Any]]) -> None:
+        found["points"] = found["points"] + new
         if keep is not None:
             keep(found)
-    watching.end()
+
+    work = {(name, candidate.name): partial(points, name, candidate) for name in names for candidate in CANDIDATES}
+    work_off("constraint solvers alone", work, put, done, watcher)
     return found
 
 
@@ -130,31 +139,25 @@ def _points(name: str, system: BareSystem, candidate: Candidate, patience: float
 
 def figure(result: Mapping[str, Any]) -> Figure:
     """Residual against time a constraint, one panel a system and stage."""
-    from matplotlib.figure import Figure
-
-    names = list(result["systems"])
-    page = Figure(figsize=(10.0, 3.2 * max(len(names), 1)), layout="constrained")
-    panels = page.subplots(max(len(names), 1), 2, squeeze=False)
-    for row, name in enumerate(names):
-        for column, stage in enumerate(STAGES):
-            axes = panels[row, column]
-            for candidate in CANDIDATES:
-                points = [p for p in _of(result, name, candidate.name, stage) if p["status"] == "ok"]
-                cost = [p["ns_per_row"] for p in points]
-                left = [max(p["residual"], FLOOR) for p in points]
-                if points:
-                    style = dict(color=COLORS[candidate.name], marker=MARKERS[candidate.name])
-                    axes.loglog(cost, left, label=candidate.title, **style)
-            axes.set_title(f"{result['systems'][name]['title']}: {'positions' if stage == 'P' else 'velocities'}")
-            axes.set_xlabel("time a constraint, ns")
-            axes.set_ylabel("max |r/d - 1|" if stage == "P" else "max |Av|/v_rms")
-            axes.grid(alpha=0.3)
-    if names:
-        panels[0, 0].legend(fontsize="small")
-    return page
+    panels = [[_panel(result, name, stage) for stage in STAGES] for name in result["systems"]]
+    if panels:
+        panels[0][0] = replace(panels[0][0], legend="small")
+    return draw(panels or [[Panel([])] * 2], (10.0, 3.2 * max(len(panels), 1)))
 
 
-def table(result: Mapping[str, Any]) -> PageTable:
+def _panel(result: Mapping[str, Any], name: str, stage: str) -> Panel:
+    curves = []
+    for candidate in CANDIDATES:
+        points = [p for p in _of(result, name, candidate.name, stage) if p["status"] == "ok"]
+        if points:
+            cost = [p["ns_per_row"] for p in points]
+            left = [max(p["residual"], FLOOR) for p in points]
+            curves.append(Curve(cost, left, candidate.title, LOOKS[candidate.name]))
+    what, residual = ("positions", "max |r/d - 1|") if stage == "P" else ("velocities", "max |Av|/v_rms")
+    return Panel(curves, "time a constraint, ns", residual, f"{result['systems'][name]['title']}: {what}")
+
+
+def table(result: Mapping[str, Any]) -> Table:
     """All points; marked where kcons is ('good'), and where something failed ('bad')."""
     headings = ("system", "solver", "tolerance", "P, ns", "P, left", "V, ns", "V, left", "note")
     titles = {candidate.name: candidate.title for candidate in CANDIDATES}
@@ -176,7 +179,7 @@ def table(result: Mapping[str, Any]) -> PageTable:
                 rows.append([system["title"], titles[candidate.name], shown, *cells, "; ".join(notes)])
                 bad = any(p["status"] == "failed" for p in points)
                 marks.append("bad" if bad else "good" if candidate.name == "kcons" else "")
-    return PageTable(headings, rows, text_columns=(0, 1, 7), marks=marks)
+    return Table(headings, rows, words=(0, 1, 7), marks=marks)
 
 
 def _cells(point: Mapping[str, Any] | None) -> list[str]:

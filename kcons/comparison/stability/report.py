@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.stability.fuzz import FAULTS
 from kcons.comparison.stability.runs import METHODS
 from kcons.comparison.stability.scenes import SCENES
-from kcons.comparison.study import html_page
+from kcons.comparison.study import html_page, tables
+from kcons.comparison.study.html_page import Section
+from kcons.comparison.study.report_files import made_by
+from kcons.comparison.study.tables import Table
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,14 +25,15 @@ def _piece(result: Mapping[str, Any], *name: str) -> Mapping[str, Any] | None:
     return found
 
 
-def steps_table(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+def steps_table(result: Mapping[str, Any]) -> Table:
     """Largest stable step by scene and method; what ends it."""
-    rows = []
-    for method in METHODS:
-        cells = [_largest(_piece(result, "steps", scene, method)) for scene in SCENES]
-        if any(cells):
-            rows.append([method, *cells])
-    return ["method", *SCENES], rows
+    return _by_method(result, "steps", _largest)
+
+
+def _by_method(result: Mapping[str, Any], part: str, told: Callable[[Mapping[str, Any] | None], str]) -> Table:
+    """A row a method, a column a scene; methods without any piece are left out."""
+    rows = [[method, *(told(_piece(result, part, scene, method)) for scene in SCENES)] for method in METHODS]
+    return Table(["method", *SCENES], [row for row in rows if any(row[1:])])
 
 
 def _largest(piece: Mapping[str, Any] | None) -> str:
@@ -52,7 +56,7 @@ _END = {
 }
 
 
-def drift_table(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+def drift_table(result: Mapping[str, Any]) -> Table:
     """Slope of the energy per unit time, with its standard error over the seeds."""
     rows = []
     for scene in SCENES:
@@ -70,17 +74,12 @@ def drift_table(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
                     f"{piece['residual']:.1e}",
                 ]
             )
-    return ["scene", "step", "steps", "seeds", "slope per unit time", "rms", "residual"], rows
+    return Table(["scene", "step", "steps", "seeds", "slope per unit time", "rms", "residual"], rows)
 
 
-def reversal_table(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+def reversal_table(result: Mapping[str, Any]) -> Table:
     """By how much the start is missed after going forth and back."""
-    rows = []
-    for method in METHODS:
-        cells = [_missed(_piece(result, "reversal", scene, method)) for scene in SCENES]
-        if any(cells):
-            rows.append([method, *cells])
-    return ["method", *SCENES], rows
+    return _by_method(result, "reversal", _missed)
 
 
 def _missed(piece: Mapping[str, Any] | None) -> str:
@@ -107,17 +106,12 @@ def fuzz_words(result: Mapping[str, Any]) -> str:
     )
 
 
-def _markdown(headings: list[str], rows: list[list[str]]) -> str:
-    lines = [f"| {' | '.join(headings)} |", "| --- |" + " ---: |" * (len(headings) - 1)]
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
-
-
 def markdown(result: Mapping[str, Any]) -> dict[str, str]:
     """The tables for the documentation, by part."""
     return {
-        "steps": _markdown(*steps_table(result)) + _lengths(result, "steps", "Steps in a run"),
-        "drift": _markdown(*drift_table(result)),
-        "reversal": _markdown(*reversal_table(result)) + _lengths(result, "reversal", "Steps forth"),
+        "steps": tables.markdown(steps_table(result)) + _lengths(result, "steps", "Steps in a run"),
+        "drift": tables.markdown(drift_table(result)),
+        "reversal": tables.markdown(reversal_table(result)) + _lengths(result, "reversal", "Steps forth"),
         "fuzz": fuzz_words(result),
     }
 
@@ -147,10 +141,16 @@ def failures(result: Mapping[str, Any]) -> list[str]:
         for name, piece in result["pieces"].items()
         if name.startswith("steps/")
         and name.rsplit("/", 1)[1] not in ("ASE", "OpenMM")
-        and (piece.get("how") == "silent" or not piece.get("silent_residual", 0.0) <= 1e-9)
+        and (piece.get("how") == "silent" or not _silent(piece) <= 1e-9)
     ]
     outcomes = result.get("fuzz", {}).get("outcomes", {})
     return found + [f"fuzz: {outcomes[name]} {name}" for name in FAULTS if outcomes.get(name)]
+
+
+def _silent(piece: Mapping[str, Any]) -> float:
+    """Largest residual of runs that no error ended; NaN, which files hold as null, counts."""
+    residual = piece.get("silent_residual", 0.0)
+    return math.nan if residual is None else float(residual)
 
 
 def picture(result: Mapping[str, Any]) -> Figure:
@@ -181,27 +181,19 @@ def write(result: Mapping[str, Any], folder: Path) -> list[Path]:
     figure = picture(result)
     png = folder / "stability.png"
     figure.savefig(png, dpi=110)
-    tables = {
+    shown = {
         "Largest stable steps": steps_table(result),
         "Drift of the energy": drift_table(result),
         "Reversibility": reversal_table(result),
     }
     sections = [
-        html_page.Section(
-            heading,
-            figures=[figure] if heading.startswith("Largest") else [],
-            tables=[html_page.PageTable(headings, rows)],
-        )
-        for heading, (headings, rows) in tables.items()
-        if rows
+        Section(heading, figures=[figure] if heading.startswith("Largest") else [], tables=[table])
+        for heading, table in shown.items()
+        if table.rows
     ]
     if result.get("fuzz"):
-        sections.append(html_page.Section("Random molecules", literal=fuzz_words(result)))
-    about = result["environment"]
-    made = f"{about['date']}, commit {about['commit']}\n{about['cpu']}, {about['cores']} cores, one thread"
-    sections.append(
-        html_page.Section("Made by", literal=made + ("\nquick" if result["made_by"]["quick"] else "\nfull"))
-    )
+        sections.append(Section("Random molecules", literal=fuzz_words(result)))
+    sections.append(Section("Made by", literal=made_by(result)))
     return [png, html_page.write(folder / "stability.html", "Stability of constrained dynamics", sections)]
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from kcons import steppers
 from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, NotIntactError, Program
 from kcons.comparison.hard_cases.long_runs import secular_drift
 from kcons.comparison.hard_cases.problem import Array, Problem
@@ -16,34 +18,15 @@ from kcons.comparison.stability.scenes import SCENES
 from kcons.constraints import Constraint, Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion.motion import Motion
-from kcons.steppers import (
-    BlanesMoan4,
-    BlanesMoan6,
-    BlanesMoan6a,
-    Geodesic,
-    KahanLi6,
-    ProjectedRungeKutta4,
-    ProjectedVerlet,
-    Rattle,
-    State,
-    Stepper,
-    Suzuki4,
-    System,
-    Yoshida4,
-)
-from kcons.steppers import run as take_steps
+from kcons.steppers import State, Stepper, System
 
-STEPPERS: dict[str, Callable[[], Stepper]] = {
-    "Rattle": Rattle,
-    "Geodesic": Geodesic,
-    "Suzuki4": Suzuki4,
-    "Yoshida4": Yoshida4,
-    "BlanesMoan4": BlanesMoan4,
-    "KahanLi6": KahanLi6,
-    "BlanesMoan6": BlanesMoan6,
-    "BlanesMoan6a": BlanesMoan6a,
-    "ProjectedVerlet": lambda: ProjectedVerlet(project=True),
-    "ProjectedRungeKutta4": lambda: ProjectedRungeKutta4(project=True),
+_NAMES = (
+    *("Rattle", "Geodesic", "Suzuki4", "Yoshida4", "BlanesMoan4", "KahanLi6", "BlanesMoan6", "BlanesMoan6a"),
+    *("ProjectedVerlet", "ProjectedRungeKutta4"),
+)
+STEPPERS: Mapping[str, Callable[[], Stepper]] = {
+    name: partial(getattr(steppers, name), **({"project": True} if name.startswith("Projected") else {}))
+    for name in _NAMES
 }
 PEERS: dict[str, Callable[[], Program]] = {"ASE": PlainAse, "OpenMM": PlainOpenMM}
 METHODS = (*STEPPERS, *PEERS)
@@ -121,29 +104,28 @@ def largest_step(method: str, scene: str, quick: bool) -> dict[str, Any]:
     (`Core.run` compares it bit for bit).
     """
     steps = (100 if quick else 2000) // (10 if method == "ASE" else 1)
+    stable, failing, end, silent = 0.0, 0.0, "", 0.0
+
+    def holds(dt: float) -> bool:
+        nonlocal stable, failing, end, silent
+        found, residual = attempt(method, scene, dt, steps)
+        silent = _silent(silent, found, residual)
+        if found == "stable":
+            stable = dt
+        else:
+            failing, end = dt, found
+        return found == "stable"
+
     try:
-        stable, failing, end, silent = 0.0, 0.0, "", 0.0
         dt = 0.05
         while not failing and dt < 1e3:
-            found, residual = attempt(method, scene, dt, steps)
-            silent = _silent(silent, found, residual)
-            if found == "stable":
-                stable = dt
+            if holds(dt):
                 dt *= 2
-            else:
-                failing, end = dt, found
-                if stable == 0.0 and dt > 1e-4:
-                    failing, dt = 0.0, dt / 8
-        for _ in range(3 if quick else 6):
-            if not failing:
-                break
-            dt = 0.5 * (stable + failing)
-            found, residual = attempt(method, scene, dt, steps)
-            silent = _silent(silent, found, residual)
-            if found == "stable":
-                stable = dt
-            else:
-                failing, end = dt, found
+            elif stable == 0.0 and dt > 1e-4:
+                failing, dt = 0.0, dt / 8
+        if failing:
+            for _ in range(3 if quick else 6):
+                holds(0.5 * (stable + failing))
     except CannotExpressError as error:
         return {"cannot": str(error)}
     result = {
@@ -190,7 +172,7 @@ def drift(scene: str, seeds: int, steps: int, every: int = 20) -> dict[str, Any]
         energies.append(copies.energies(state.positions, state.velocities)[0])
         residual = max(residual, copies.residual(state.positions))
 
-    take_steps(system, state, dt, steps, observers=[observe], every=every)
+    steppers.run(system, state, dt, steps, observers=[observe], every=every)
     e = np.array(energies) / kinetic
     slopes = [secular_drift(column) / (0.5 * steps * dt) for column in e.T]
     return {

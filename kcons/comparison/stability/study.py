@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from kcons import __version__
 from kcons.comparison.stability import fuzz, runs
 from kcons.comparison.stability.scenes import SCENES
-from kcons.comparison.study.machine import code_digest, environment
-from kcons.comparison.work_precision.measure import Watcher
+from kcons.comparison.study import json_files
+from kcons.comparison.study.machine import stamp
+from kcons.comparison.study.study import Kept, Watcher, picked, work_off
 from kcons.errors import InputError
-from kcons.steppers.files import in_one_piece
 
 FORMAT = "kcons-stability-1"
 PARTS = ("steps", "drift", "reversal", "fuzz")
@@ -50,58 +49,35 @@ def run(
     InputError
         An unknown part or scene.
     """
-    parts = list(PARTS) if only is None else list(only)
-    for part in parts:
-        if part not in PARTS:
-            raise InputError(f"there is no part {part!r}; there are {', '.join(PARTS)}", item="only")
-    chosen = list(SCENES) if scenes is None else list(scenes)
-    for scene in chosen:
-        if scene not in SCENES:
-            raise InputError(f"there is no scene {scene!r}; there are {', '.join(SCENES)}", item="scenes")
-    made_by = {"version": __version__, "code": code_digest(), "quick": quick}
-    result: dict[str, Any] = {"format": FORMAT, "made_by": made_by, "environment": environment(), "pieces": {}}
-    if kept is not None and kept.is_file():
-        before = json.loads(kept.read_text(encoding="utf-8"))
-        if before.get("format") == FORMAT and before["made_by"] == made_by:
-            result["pieces"] = before["pieces"]
-    watcher = watcher or Watcher()
-    work = [piece for part in parts for piece in _pieces(part, quick, chosen)]
-    watcher.begin("stability", len(work))
-    for done, (name, call) in enumerate(work):
-        watcher.advance(done)
-        if name not in result["pieces"]:
-            result["pieces"][name] = call()
-            if kept is not None:
-                save(result, kept)
-    watcher.end()
+    parts = picked(only, PARTS, "part", "only")
+    chosen = picked(scenes, SCENES, "scene", "scenes")
+    file = Kept(kept, stamp(quick=quick), form=FORMAT)
+    result: dict[str, Any] = {**file.head, "pieces": file.earlier().get("pieces", {})}
+
+    def put(name: str, found: Any) -> None:
+        result["pieces"][name] = found
+        file.put(result)
+
+    work = {name: piece for part in parts for name, piece in _pieces(part, quick, chosen).items()}
+    work_off("stability", work, put, result["pieces"], watcher)
     return result
 
 
-def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> list[tuple[str, Callable[[], Any]]]:
+def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> dict[str, Callable[[], Any]]:
     both = [(method, scene) for scene in scenes for method in runs.METHODS]
     if part == "steps":
-        return [(f"steps/{s}/{m}", lambda m=m, s=s: runs.largest_step(m, s, quick)) for m, s in both]  # type: ignore[misc]
+        return {f"steps/{s}/{m}": partial(runs.largest_step, m, s, quick) for m, s in both}
     if part == "drift":
-        seeds, steps = (8, 10_000) if quick else (8, 1_000_000)
-        return [(f"drift/{s}", lambda s=s: runs.drift(s, seeds, steps)) for s in scenes]  # type: ignore[misc]
+        return {f"drift/{s}": partial(runs.drift, s, 8, 10_000 if quick else 1_000_000) for s in scenes}
     if part == "reversal":
         steps = 200 if quick else 2000
-        return [
-            (f"reversal/{s}/{m}", lambda m=m, s=s: runs.reversal(m, s, steps // (10 if m == "ASE" else 1)))  # type: ignore[misc]
-            for m, s in both
-        ]
+        return {f"reversal/{s}/{m}": partial(runs.reversal, m, s, steps // (10 if m == "ASE" else 1)) for m, s in both}
     trials = 300 if quick else 10_000
-    batch = min(BATCH, trials)
-    return [
-        (f"fuzz/{k}", lambda k=k: [asdict(fuzz.trial(seed)) for seed in range(k, min(k + batch, trials))])  # type: ignore[misc]
-        for k in range(0, trials, batch)
-    ]
+    return {f"fuzz/{k}": partial(_trials, k, min(k + BATCH, trials)) for k in range(0, trials, BATCH)}
 
 
-def save(result: dict[str, Any], path: Path) -> None:
-    """Write in one piece."""
-    with in_one_piece(path) as file:
-        file.write((json.dumps(result, indent=1) + "\n").encode())
+def _trials(first: int, end: int) -> list[dict[str, Any]]:
+    return [asdict(fuzz.trial(seed)) for seed in range(first, end)]
 
 
 def digest(result: dict[str, Any]) -> dict[str, Any]:
@@ -130,17 +106,15 @@ def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[s
     """
     if result["made_by"]["quick"]:
         raise InputError("these results are quick ones; run without --quick", item="into")
-    before: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if before.get("format") != FORMAT:
-        raise InputError(f"{path} has no results of the stability study", item="into")
+    before = json_files.read(path, FORMAT, of="kcons stability")
     made = {"made_by": result["made_by"], "environment": result["environment"]}
     names = [name for name in result["pieces"] if not name.startswith("fuzz/")]
     summed = {"fuzz": result["fuzz"]} if "fuzz" in result else {}
-    after = {
-        **before,
+    added = {
         **summed,
         "pieces": {**before["pieces"], **{name: result["pieces"][name] for name in names}},
         "added": {**before.get("added", {}), **dict.fromkeys([*names, *summed], made)},
     }
-    save(after, path)
+    after = json_files.plain({**before, **added})
+    json_files.write(path, after)
     return before, after

@@ -10,6 +10,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kcons.comparison.study.tables import Table
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -36,34 +38,13 @@ LONG = 40
 
 
 @dataclass(frozen=True)
-class PageTable:
-    """A table of plain text.
-
-    Attributes
-    ----------
-    headings : sequence of str
-    rows : sequence of sequence of str
-        Cells, as many as headings.
-    text_columns : sequence of int
-        Columns that are words, set to the left; all others are numbers.
-    marks : sequence of str
-        'good', 'bad' or '' for each row; empty for none.
-    """
-
-    headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    text_columns: Sequence[int] = (0,)
-    marks: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class Section:
     """A heading, and under it paragraphs, pictures and tables in this order; `literal` is set as it is."""
 
     heading: str
     paragraphs: Sequence[str] = ()
     figures: Sequence[Figure] = ()
-    tables: Sequence[PageTable] = ()
+    tables: Sequence[Table] = ()
     literal: str = ""
 
 
@@ -112,13 +93,13 @@ def _paragraphs(paragraphs: Sequence[str]) -> str:
     return "".join(f"<p>{escape(paragraph)}</p>" for paragraph in paragraphs)
 
 
-def _table(table: PageTable) -> str:
+def _table(table: Table) -> str:
     def row(cells: Sequence[str], tag: str, mark: str = "") -> str:
         shown = "".join(f"<{tag}{_kind(n, cell)}>{escape(cell)}</{tag}>" for n, cell in enumerate(cells))
         return f'<tr class="{mark}">{shown}</tr>' if mark else f"<tr>{shown}</tr>"
 
     def _kind(column: int, cell: str) -> str:
-        kinds = ["text"] * (column in table.text_columns) + ["long"] * (len(cell) > LONG)
+        kinds = ["text"] * (column in table.words) + ["long"] * (len(cell) > LONG)
         return f' class="{" ".join(kinds)}"' if kinds else ""
 
     marks = table.marks or [""] * len(table.rows)

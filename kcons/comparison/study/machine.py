@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import kcons
+from kcons import __version__
+from kcons.comparison.study.json_files import plain
 
 PACKAGE = Path(kcons.__file__).parent
 #: Packages whose versions go into a result.
@@ -71,6 +73,11 @@ def _commit() -> str | None:
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def stamp(**settings: Any) -> dict[str, Any]:
+    """What a result depends on: version and code of the package, and settings, as they come back from a file."""
+    return {"version": __version__, "code": code_digest(), **plain(settings)}
 
 
 @cache

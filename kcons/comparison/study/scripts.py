@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import process_time
@@ -11,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kcons.comparison.study.machine import environment
+from kcons.comparison.study import json_files
+from kcons.comparison.study.machine import stamp
+from kcons.comparison.study.study import Kept
+from kcons.comparison.study.tables import Table, terminal
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.table import Table as RichTable
 
 
 def in_turn(
@@ -61,7 +63,7 @@ def speeds(seconds: Mapping[str, Sequence[float]], steps: int) -> dict[str, dict
 
 def table(
     title: str, headings: Sequence[str], words: Collection[str] = (), rows: Iterable[Sequence[str]] = ()
-) -> Table:
+) -> RichTable:
     """A table whose columns are numbers, but for those whose headings are in `words`.
 
     Parameters
@@ -71,14 +73,8 @@ def table(
     words : collection of str, optional
     rows : iterable of sequence of str, optional
     """
-    from rich.table import Table
-
-    made = Table(title=title)
-    for heading in headings:
-        made.add_column(heading, justify="left" if heading in words else "right")
-    for row in rows:
-        made.add_row(*row)
-    return made
+    columns = [k for k, heading in enumerate(headings) if heading in words]
+    return terminal(Table(headings, list(rows), columns, title=title))
 
 
 def options(about: str | None, *, full: str) -> argparse.ArgumentParser:
@@ -110,16 +106,18 @@ def script(
     """
     chosen = parser.parse_args(arguments)
     if chosen.show:
-        show(json.loads(chosen.show.read_text(encoding="utf-8")))
+        show(json_files.read(chosen.show))
         return
     result = measure(chosen)
     if chosen.out:
-        chosen.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        json_files.write(chosen.out, result)
     show(result)
 
 
 def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick: bool) -> dict[str, Any]:
     """A measurement that goes on from what the file `out` has, and is written to it after each of its parts.
+
+    What other code measured, or with other settings, is not gone on from.
 
     Parameters
     ----------
@@ -129,10 +127,6 @@ def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick
         Gets `quick`, `keep`, which takes what has been measured so far, and `earlier`, what the file has or None.
     quick : bool
     """
-
-    def keep(result: dict[str, Any]) -> None:
-        if out:
-            out.write_text(json.dumps({**result, "environment": environment()}, indent=1) + "\n", encoding="utf-8")
-
-    earlier = json.loads(out.read_text(encoding="utf-8")) if out and out.exists() else None
-    return measure(quick=quick, keep=keep, earlier=earlier)
+    kept = Kept(out, stamp(quick=quick))
+    earlier = {name: value for name, value in kept.earlier().items() if name not in kept.head}
+    return measure(quick=quick, keep=kept.put, earlier=earlier or None)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -21,8 +21,10 @@ from kcons.comparison.methods.methods import METHODS, chosen
 from kcons.comparison.scenes import Reference, Scene
 from kcons.comparison.scenes.potential import Potential
 from kcons.comparison.study.machine import environment, kernels_cached
+from kcons.comparison.study.study import Watcher
+from kcons.comparison.study.tables import duration
 from kcons.comparison.work_precision import timing_rounds
-from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status, duration
+from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
@@ -37,22 +39,6 @@ FORCE_POINTS, FORCE_SECONDS = 15, 0.5
 
 #: A host is interrupted within a step after so many budgets.
 PATIENCE = 3
-
-
-class Watcher:
-    """Told what is going on. This one keeps silent; the command line shows progress bars."""
-
-    def begin(self, what: str, total: float) -> None:
-        """A piece of work of `total` units starts."""
-
-    def advance(self, done: float) -> None:
-        """So much of it is done."""
-
-    def end(self) -> None:
-        """It is over."""
-
-    def overall(self, what: str, done: float, total: float) -> None:
-        """A part of something larger starts; of its `total` expected seconds `done` are over."""
 
 
 def compare(
@@ -97,22 +83,14 @@ def compare(
     if scene.openmm is not None:
         scene.openmm.patience = budget
     watching = watcher or Watcher()
-    watching.begin("loading kernels" if kernels_cached() else "compiling kernels (once)", 1)
-    warm_up(scene, picked)
-    watching.advance(1)
-    watching.end()
+    with watching.piece("loading kernels" if kernels_cached() else "compiling kernels (once)", 1):
+        warm_up(scene, picked)
 
     if reference is None:
         reference = reference_of(scene, watching)
 
-    measurements: list[Measurement] = []
-    for method in picked:
-        reason = method.refuses(scene)
-        if reason is not None:
-            measurements.append(Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason))
-            continue
-        measurements += _all_settings(scene, method, reference, budget, watching)
-    measurements, margin = timed_again(scene, measurements, reference, budget, rounds, watching)
+    bench = Bench(scene, reference, budget, watching, rounds)
+    measurements, margin = bench.timed_again([m for method in picked for m in bench.all_settings(method)])
     unit = scene.units.time_unit
     return Comparison(
         scene={
@@ -147,11 +125,8 @@ def compare(
 
 def reference_of(scene: Scene, watcher: Watcher) -> Reference:
     """The reference solution, with its progress shown."""
-    watcher.begin("reference solution", 1)
-    try:
+    with watcher.piece("reference solution", 1):
         return scene.reference(lambda done, total: watcher.advance(done / total))
-    finally:
-        watcher.end()
 
 
 def force_seconds(scene: Scene) -> float:
@@ -177,89 +152,6 @@ def force_seconds(scene: Scene) -> float:
     return max(0.0, float(np.median(found)))
 
 
-def measure(
-    scene: Scene,
-    method: Method,
-    setting: float,
-    reference: Reference,
-    budget: float,
-    watcher: Watcher | None = None,
-    *,
-    watched: bool = True,
-) -> Measurement:
-    """One method at one setting, a time step in internal units or a tolerance; `warm_up` comes first.
-
-    Parameters
-    ----------
-    scene : Scene
-    method : Method
-    setting : float
-    reference : Reference
-    budget : float
-        Seconds.
-    watcher : Watcher, optional
-    watched : bool
-        Whether the constraints' part is timed, which costs a little.
-    """
-    watching = watcher or Watcher()
-    shown = setting if method.adaptive else setting / scene.units.time_unit
-    planned = None if method.adaptive else round(scene.horizon / setting)
-    common: dict[str, Any] = dict(
-        method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
-    )
-    watching.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
-    try:
-        return _measure(scene, method, setting, reference, budget, perf_counter() + budget, watching, common, watched)
-    finally:
-        watching.end()
-
-
-def timed_again(
-    scene: Scene,
-    measurements: list[Measurement],
-    reference: Reference,
-    budget: float,
-    rounds: Rounds | None,
-    watcher: Watcher | None = None,
-) -> tuple[list[Measurement], float | None]:
-    """Times of short runs from rounds that nobody observes, and how well they repeat (`work_precision.timing_rounds`).
-
-    Parameters
-    ----------
-    scene : Scene
-    measurements : list of Measurement
-    reference : Reference
-    budget : float
-        Seconds for each method.
-    rounds : Rounds or None
-        None: everything stays as it is.
-    watcher : Watcher, optional
-
-    Returns
-    -------
-    measurements : list of Measurement
-    margin : float or None
-        See `kcons.comparison.work_precision.timing_rounds.margin`.
-    """
-    if rounds is None:
-        return measurements, None
-    watching = watcher or Watcher()
-    watching.begin("times of short runs, in rounds", rounds.most)
-    try:
-        return timing_rounds.timed(
-            scene,
-            measurements,
-            METHODS,
-            rounds,
-            limit=min(REPEAT_SHARE * budget, REPEAT_SECONDS),
-            patience=PATIENCE * budget,
-            whole=lambda method, setting: measure(scene, method, setting, reference, budget, watched=False),
-            told=watching.advance,
-        )
-    finally:
-        watching.end()
-
-
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
     """Compile or load every kernel that the scene and these methods need, outside of any timing."""
     motion = scene.motion
@@ -274,43 +166,141 @@ def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
                 method.warm_up(scene)
 
 
-# -- one method -------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Bench:
+    """Where the methods that run one scene are measured; `warm_up` comes first.
 
+    Attributes
+    ----------
+    scene : Scene
+    reference : Reference
+    budget : float
+        Seconds for each method.
+    watcher : Watcher
+    rounds : Rounds or None
+        In which short runs are timed again; None: times stay as they were observed.
+    """
 
-def _all_settings(
-    scene: Scene, method: Method, reference: Reference, budget: float, watcher: Watcher
-) -> list[Measurement]:
-    found: list[Measurement] = []
-    begun = perf_counter()
-    given_up: Measurement | None = None
-    for setting in method.settings(scene):
-        shown = setting if method.adaptive else setting / scene.units.time_unit
-        planned = None if method.adaptive else round(scene.horizon / setting)
-        common: dict[str, Any] = dict(
-            method=method.name, title=method.title, setting=shown, adaptive=method.adaptive, steps_planned=planned
-        )
-        if found and perf_counter() - begun > budget:
-            note = f"the budget of {budget:g} s is used up"
-            found.append(Measurement(status="not run", note=note, **common))
-            continue
-        last = given_up or (found[-1] if found else None)
-        if last is not None and last.step_seconds is not None:
-            # A tighter tolerance takes at least as many steps as a looser one.
-            left = budget - (perf_counter() - begun)
-            if given_up is not None or last.step_seconds * (planned or last.steps) > left:
-                given_up = last
-                found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
+    scene: Scene
+    reference: Reference
+    budget: float
+    watcher: Watcher = field(default_factory=Watcher)
+    rounds: Rounds | None = None
+
+    def all_settings(self, method: Method) -> list[Measurement]:
+        """One method at all its settings, as far as the budget goes."""
+        reason = method.refuses(self.scene)
+        if reason is not None:
+            return [Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason)]
+        found: list[Measurement] = []
+        budget, begun = self.budget, perf_counter()
+        given_up: Measurement | None = None
+        for setting in method.settings(self.scene):
+            common = _about(self.scene, method, setting)
+            if found and perf_counter() - begun > budget:
+                note = f"the budget of {budget:g} s is used up"
+                found.append(Measurement(status="not run", note=note, **common))
                 continue
-        watcher.begin(f"{method.title}, {'rtol' if method.adaptive else 'dt'} {shown:g}", scene.horizon)
-        found.append(_measure(scene, method, setting, reference, budget, begun + budget, watcher, common))
-        watcher.end()
-        if found[-1].status == "not run":  # it cannot run this scene at any step
-            break
-        if found[-1].status == "partial":
-            given_up = found[-1]
-            if given_up.step_seconds is None:  # not one step was done: no use in trying shorter ones
+            last = given_up or (found[-1] if found else None)
+            if last is not None and last.step_seconds is not None:
+                # A tighter tolerance takes at least as many steps as a looser one.
+                left = budget - (perf_counter() - begun)
+                if given_up is not None or last.step_seconds * (common["steps_planned"] or last.steps) > left:
+                    given_up = last
+                    found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
+                    continue
+            found.append(self.measure(method, setting, begun=begun))
+            if found[-1].status == "not run":  # it cannot run this scene at any step
                 break
-    return found
+            if found[-1].status == "partial":
+                given_up = found[-1]
+                if given_up.step_seconds is None:  # not one step was done: no use in trying shorter ones
+                    break
+        return found
+
+    def timed_again(self, measurements: list[Measurement]) -> tuple[list[Measurement], float | None]:
+        """Times of short runs from rounds that nobody observes, and how well they repeat.
+
+        See `kcons.comparison.work_precision.timing_rounds.timed` and `margin` there.
+        """
+        if self.rounds is None:
+            return measurements, None
+        with self.watcher.piece("times of short runs, in rounds", self.rounds.most):
+            return timing_rounds.timed(
+                self.scene,
+                measurements,
+                METHODS,
+                self.rounds,
+                limit=min(REPEAT_SHARE * self.budget, REPEAT_SECONDS),
+                patience=PATIENCE * self.budget,
+                whole=lambda method, setting: replace(self, watcher=Watcher()).measure(method, setting, watched=False),
+                told=self.watcher.advance,
+            )
+
+    def measure(
+        self, method: Method, setting: float, *, begun: float | None = None, watched: bool = True
+    ) -> Measurement:
+        """One method at one setting.
+
+        Parameters
+        ----------
+        method : Method
+        setting : float
+            A time step in internal units, or a tolerance.
+        begun : float, optional
+            When the budget began to run, on the clock of `perf_counter`; now by default.
+        watched : bool
+            Whether the constraints' part is timed, which costs a little.
+        """
+        scene, budget = self.scene, self.budget
+        log = _Log()
+        common = _about(scene, method, setting)
+        what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {common['setting']:g}"
+        note = ""
+        status: Status = "ok"
+        run: Run | None = None
+        now = perf_counter()
+        deadline = (now if begun is None else begun) + budget
+        setup = None
+        scene.potential.forget()
+        try:
+            with (
+                self.watcher.piece(what, scene.horizon),
+                interrupted_after(PATIENCE * budget),
+                np.errstate(all="ignore"),
+            ):
+                run = method.start(scene, setting)
+                setup = perf_counter() - now
+                if not watched:
+                    run.constraints.release()
+                note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, self.watcher)
+                status = "partial" if note else "ok"
+        except OverBudgetError:
+            status = "partial"
+            note = f"step {log.steps + 1} was not done after {duration(perf_counter() - now)}"
+        except UnsupportedError as error:
+            return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
+        except Exception as error:  # whatever a peer raises is a result, and is shown
+            status = "failed"
+            note = f"step {log.steps + 1}: {first_line(error)}"
+        common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
+        if run is None or not log.seconds:
+            return Measurement(status=status, note=note, **common)
+        return _judged(scene, method, run, log, self.reference, status, note, common)
+
+
+# -- one run ----------------------------------------------------------------------------------------
+
+
+def _about(scene: Scene, method: Method, setting: float) -> dict[str, Any]:
+    """What is known of a measurement before it."""
+    return {
+        "method": method.name,
+        "title": method.title,
+        "setting": setting if method.adaptive else setting / scene.units.time_unit,
+        "adaptive": method.adaptive,
+        "steps_planned": None if method.adaptive else round(scene.horizon / setting),
+    }
 
 
 @dataclass
@@ -325,43 +315,17 @@ class _Log:
     steps: int = 0
 
 
-def _measure(
+def _judged(
     scene: Scene,
     method: Method,
-    setting: float,
+    run: Run,
+    log: _Log,
     reference: Reference,
-    budget: float,
-    deadline: float,
-    watcher: Watcher,
+    status: Status,
+    note: str,
     common: dict[str, Any],
-    watched: bool = True,
 ) -> Measurement:
-    log = _Log()
-    note = ""
-    status: Status = "ok"
-    run: Run | None = None
-    begun = perf_counter()
-    setup = None
-    scene.potential.forget()
-    try:
-        with interrupted_after(PATIENCE * budget), np.errstate(all="ignore"):
-            run = method.start(scene, setting)
-            setup = perf_counter() - begun
-            if not watched:
-                run.constraints.release()
-            note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, watcher)
-            status = "partial" if note else "ok"
-    except OverBudgetError:
-        status = "partial"
-        note = f"step {log.steps + 1} was not done after {duration(perf_counter() - begun)}"
-    except UnsupportedError as error:
-        return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
-    except Exception as error:  # whatever a peer raises is a result, and is shown
-        status = "failed"
-        note = f"step {log.steps + 1}: {first_line(error)}"
-    common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
-    if run is None or not log.seconds:
-        return Measurement(status=status, note=note, **common)
+    """What a run that made steps says of its method."""
     if not method.holds:
         return Measurement(status="floor" if status == "ok" else status, note=note, **common)
     x, v = run.positions, run.velocities

@@ -16,9 +16,11 @@ from kcons.comparison.methods.method import Method
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.methods.snippets import code
 from kcons.comparison.scenes import Reference, Scene
+from kcons.comparison.study.study import Watcher
+from kcons.comparison.study.tables import duration
 from kcons.comparison.work_precision.fronts import COSTS, EVERY_HOST, Cost, cost_of, floor_of, host_of, is_ours, verdict
-from kcons.comparison.work_precision.measure import Watcher, measure, timed_again, warm_up
-from kcons.comparison.work_precision.measurement import Comparison, Measurement, duration
+from kcons.comparison.work_precision.measure import Bench, warm_up
+from kcons.comparison.work_precision.measurement import Comparison, Measurement
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError
 
@@ -144,7 +146,7 @@ def recommend(
     """
     if not (math.isfinite(target) and target > 0):
         raise InputError(f"the target error is {target}; give a positive number", item="target_error")
-    watching = watcher or Watcher()
+    bench = Bench(scene, reference, budget, watcher or Watcher(), rounds)
     decides = verdict(comparison).decides
     floor = floor_of(comparison)
     curves = _curves(comparison)
@@ -158,15 +160,15 @@ def recommend(
         for prediction in promising[:FINALISTS]:
             limit = min((cost_of(m, decides) for m in found if _reaches(m, target)), default=math.inf)
             if prediction.cost(decides) < 1.5 * limit:
-                found += reach(scene, prediction, target, reference, budget, watching)
-    found, _ = timed_again(scene, found, reference, budget, rounds, watching)
+                found += reach(bench, prediction, target)
+    found, _ = bench.timed_again(found)
     everything = [*(m for curve in curves.values() for m in curve), *found]
     able = [m for m in everything if target >= floor and _reaches(m, target)]
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
         best = min(able, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
         entry |= {**_facts(best), "code": code(scene, best.method, best.setting, made_by)}
-        default, more = _default(scene, comparison, best, target, reference, budget, watching, rounds)
+        default, more = _default(bench, comparison, best, target)
         entry["default"] = default
         found += more
     else:
@@ -178,15 +180,7 @@ def recommend(
     return replace(comparison, measurements=_sorted(measurements), recommendation=entry)
 
 
-def sharpen(
-    scene: Scene,
-    comparison: Comparison,
-    *,
-    reference: Reference,
-    budget: float,
-    watcher: Watcher | None = None,
-    rounds: Rounds | None = None,
-) -> Comparison:
+def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
     """Where another method seems to be ahead of kcons: the step of kcons that makes the same error is tried.
 
     Steps of a scene are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
@@ -194,8 +188,9 @@ def sharpen(
 
     Parameters
     ----------
-    scene, comparison, reference, budget, watcher, rounds
-        As for `recommend`.
+    bench : Bench
+        That of the comparison.
+    comparison : Comparison
     """
     floor = floor_of(comparison)
     curves = _curves(comparison)
@@ -211,36 +206,31 @@ def sharpen(
             best = min(predictions, key=lambda p: p.cost(standing.cost), default=None)
             if best is not None and (best.method, target) not in tried:
                 tried.add((best.method, target))
-                warm_up(scene, [METHODS[best.method]])
-                found += reach(scene, best, target, reference, budget, watcher or Watcher())
-    found, _ = timed_again(scene, found, reference, budget, rounds, watcher)
+                warm_up(bench.scene, [METHODS[best.method]])
+                found += reach(bench, best, target)
+    found, _ = bench.timed_again(found)
     return replace(comparison, measurements=_sorted([*comparison.measurements, *found]))
 
 
-def reach(
-    scene: Scene, prediction: Prediction, target: float, reference: Reference, budget: float, watcher: Watcher
-) -> list[Measurement]:
+def reach(bench: Bench, prediction: Prediction, target: float) -> list[Measurement]:
     """Run one method at the predicted step, and near it, until its longest step that makes the error is known.
 
     Parameters
     ----------
-    scene : Scene
+    bench : Bench
+        A run that would take longer than its budget is not made.
     prediction : Prediction
     target : float
-    reference : Reference
-    budget : float
-        Seconds for a run; one that would take longer is not made.
-    watcher : Watcher
 
     Returns
     -------
     found : list of Measurement
         All runs that were made.
     """
-    method = METHODS[prediction.method]
+    scene, method = bench.scene, METHODS[prediction.method]
     seconds = prediction.wall * scene.horizon / scene.units.long_time_unit
     found: list[Measurement] = []
-    if seconds > budget:
+    if seconds > bench.budget:
         return found
     setting = prediction.setting
     good, bad = 0.0, math.inf  # the longest step that reaches the error, the shortest that does not
@@ -250,7 +240,7 @@ def reach(
         if setting <= good or setting >= bad:
             break
         internal = setting if method.adaptive else setting * scene.units.time_unit
-        m = measure(scene, method, internal, reference, budget, watcher)
+        m = bench.measure(method, internal)
         found.append(m)
         if m.status not in ("ok", "failed"):
             break
@@ -298,16 +288,10 @@ def _facts(m: Measurement) -> dict[str, Any]:
 
 
 def _default(
-    scene: Scene,
-    comparison: Comparison,
-    best: Measurement,
-    target: float,
-    reference: Reference,
-    budget: float,
-    watcher: Watcher,
-    rounds: Rounds | None,
+    bench: Bench, comparison: Comparison, best: Measurement, target: float
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
     """What the host of the best method does unless told otherwise: at its usual step, and at this error."""
+    scene = bench.scene
     name = default_method(scene, METHODS[best.method].host)
     if name is None:
         return None, []
@@ -322,17 +306,14 @@ def _default(
     if first is None:
         warm_up(scene, [method])
         internal = setting if method.adaptive else setting * scene.units.time_unit
-        (first,), _ = timed_again(
-            scene, [measure(scene, method, internal, reference, budget, watcher)], reference, budget, rounds, watcher
-        )
+        (first,), _ = bench.timed_again([bench.measure(method, internal)])
         found.append(first)
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
     points = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
     reached = [m for m in points if _reaches(m, target)]
     prediction = predicted(points, SAFETY * target, floor_of(comparison))
     if prediction is not None:
-        more = reach(scene, prediction, target, reference, budget, watcher)
-        more, _ = timed_again(scene, more, reference, budget, rounds, watcher)
+        more, _ = bench.timed_again(reach(bench, prediction, target))
         found += more
         reached += [m for m in more if _reaches(m, target)]
     if reached:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich import box
+import numpy as np
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from kcons.comparison.methods.methods import METHODS
-from kcons.comparison.study.html_page import PageTable
-from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_HOST, Cost, Standing, verdict
-from kcons.comparison.work_precision.measurement import Comparison, Measurement, duration
+from kcons.comparison.study import report_files
+from kcons.comparison.study.curves import Curve, Panel, draw, say
+from kcons.comparison.study.tables import Table, duration, footnotes, numbered, verdict
+from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_HOST, Cost, Standing, cost_of
+from kcons.comparison.work_precision.fronts import verdict as judge
+from kcons.comparison.work_precision.measurement import Comparison, Measurement
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Colour-blind safe (Okabe and Ito), and a marker each; 6 is matplotlib's upward caret.
@@ -125,19 +124,13 @@ def table(comparison: Comparison, *, narrow: bool = False) -> Table:
         "wall": f"a {long_time}",
     }
     kept = [name for name in headers if not (narrow and name in DISPENSABLE)]
-    shown = Table(title=comparison.scene["title"], title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1))
-    shown.add_column("method", no_wrap=True)
-    for name in kept:
-        shown.add_column(f"{name}\n{headers[name]}", justify="right", no_wrap=True)
-    notes = _note_numbers(comparison)
-    previous = ""
+    notes = numbered(m.note for m in comparison.measurements)
+    rows = []
     for m in comparison.measurements:
-        if m.method != previous and previous:
-            shown.add_section()
         cells = _cells(m, notes.get(m.note))
-        shown.add_row(m.title if m.method != previous else "", *(cells[name] for name in kept))
-        previous = m.method
-    return shown
+        rows.append([m.title, *(cells[name] for name in kept)])
+    headings = ["method", *(f"{name}\n{headers[name]}" for name in kept)]
+    return Table(headings, rows, title=comparison.scene["title"], grouped=True)
 
 
 def fits(comparison: Comparison, width: int) -> bool:
@@ -145,14 +138,14 @@ def fits(comparison: Comparison, width: int) -> bool:
     return Console(width=1000).measure(table(comparison)).maximum <= width
 
 
-def _cells(m: Measurement, note: int | None) -> dict[str, str | Text]:
+def _cells(m: Measurement, note: int | None) -> dict[str, str]:
     slope = "" if m.energy_slope is None else f"{m.energy_slope:.1e}"
     if m.energy_slope is not None and abs(m.energy_slope) < 2 * (m.energy_slope_error or 0.0):
         slope = f"({slope})"
     setting = "" if m.setting == 0 else f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:.4g}"
     return {
         "step": setting,
-        "error": _verdict(m, note),
+        "error": _error(m, note),
         "max |σ|": "" if m.constraint_residual is None else f"{m.constraint_residual:.0e}",
         "max |Av|": "" if m.velocity_residual is None else f"{m.velocity_residual:.0e}",
         "slope": slope,
@@ -163,23 +156,18 @@ def _cells(m: Measurement, note: int | None) -> dict[str, str | Text]:
     }
 
 
-def _verdict(m: Measurement, note: int | None) -> str | Text:
+def _error(m: Measurement, note: int | None) -> str:
     """The error, or in a word why there is none and which note tells more."""
     if m.status == "ok":
         return "" if m.error is None else f"{m.error:.2e}"
     if m.status in ("floor", "thermostat"):
         return "-"
     word = f"{m.steps} step{'s' if m.steps > 1 else ''} only" if m.status == "partial" and m.steps else m.status
-    return Text(f"{word} [{note}]" if note else word, style="red" if m.status == "failed" else "yellow")
+    return verdict(m.status, word, note)
 
 
 def _count(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
-
-
-def _note_numbers(comparison: Comparison) -> dict[str, int]:
-    """Notes in the order of their first appearance, numbered from 1."""
-    return {note: k for k, note in enumerate(dict.fromkeys(m.note for m in comparison.measurements if m.note), 1)}
 
 
 def explanation(comparison: Comparison) -> str:
@@ -194,7 +182,7 @@ def explanation(comparison: Comparison) -> str:
         **units,
     }
     lines = [*(line.format(**known) for line in EXPLANATION), *comparison.remarks]
-    lines[:0] = [f"[{number}] {note}" for note, number in _note_numbers(comparison).items()]
+    lines[:0] = footnotes(numbered(m.note for m in comparison.measurements))
     orders = []
     for name, title in {m.method: m.title for m in comparison.measurements}.items():
         order = comparison.observed_order(name)
@@ -212,95 +200,74 @@ def plot(comparison: Comparison, path: Path) -> None:
 
 def figure(comparison: Comparison) -> Figure:
     """Error against force evaluations and against wall time, all axes logarithmic, the fronts of each host marked."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    units = comparison.scene["units"]
+    units, environment = comparison.scene["units"], comparison.environment
+    standings = judge(comparison).standings
     names = len({m.method for m in comparison.measurements})
-    figure = Figure(figsize=(11, 5.0 + 0.22 * math.ceil(max(names, 3) / 3)), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, sharey=True)
-    for axes, cost in ((left, "evaluations_per_time"), (right, "seconds_per_time")):
-        for name in dict.fromkeys(m.method for m in comparison.measurements):
-            colour, marker = style(name)
-            done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and getattr(m, cost)]
-            if done:
-                axes.plot(
-                    [getattr(m, cost) for m in done],
-                    [m.error for m in done],
-                    color=colour,
-                    marker=marker,
-                    # Where two methods do the same, both stay visible.
-                    markerfacecolor="none" if name != "rattle" else colour,
-                    markersize=6 if name == "rattle" else 9,
-                    markeredgewidth=1.6,
-                    label=done[0].title,
-                )
-        if _reference_in_sight(comparison):
-            axes.axhline(comparison.reference["error"], color="black", linewidth=0.8, linestyle=":")
-    standings = verdict(comparison).standings
-    _mark_fronts(left, standings, "evaluations")
-    _mark_fronts(right, standings, "wall")
-    _mark_costs_without_error(right, comparison)
-    for axes in (left, right):
-        if not standings:
-            axes.text(0.5, 0.5, "no method reached the horizon", transform=axes.transAxes, ha="center")
-            if not any(len(line.get_xdata()) for line in axes.lines):
-                axes.set_xlim(1.0, 1000.0)
-            axes.set_ylim(1e-6, 1.0)
-        axes.set(xscale="log", yscale="log")
-        low, high = axes.get_xlim()
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 2e3 * low else (1.0,)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    left.set_xlabel(f"force evaluations per simulated {units['long_time']}")
-    right.set_xlabel(f"wall time per simulated {units['long_time']} / s")
-    left.set_ylabel(f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}")
-    for axes in (left, right):
-        axes.grid(True, which="major", linewidth=0.5, alpha=0.5)
+    grid = {"which": "major", "linewidth": 0.5, "alpha": 0.5}
+    left = Panel(
+        _errors(comparison, standings, "evaluations"),
+        f"force evaluations per simulated {units['long_time']}",
+        f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}",
+        plain="x",
+        grid=grid,
+    )
+    right = Panel(
+        [*_errors(comparison, standings, "wall"), *_costs_without_error(comparison)],
+        f"wall time per simulated {units['long_time']} / s",
+        notes=("", f"{environment['cpu']}, 1 thread; {environment['date']}"),
+        plain="x",
+        grid=grid,
+    )
+    size = (11, 5.0 + 0.22 * math.ceil(max(names, 3) / 3))
+    drawn = draw([[left, right]], size, title=comparison.scene["title"], same_y=True, legend=3)
+    for axes in drawn.axes if not standings else ():
+        say(axes, "no method reached the horizon")
+        if not any(np.size(line.get_xdata()) for line in axes.lines):
+            axes.set_xlim(1.0, 1000.0)
+        axes.set_ylim(1e-6, 1.0)
     if _reference_in_sight(comparison):
-        left.text(
-            0.02,
-            comparison.reference["error"],
-            "error of the reference",
-            transform=left.get_yaxis_transform(),
-            fontsize=8,
-            va="bottom",
-        )
-    handles, labels = right.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
-    environment = comparison.environment
-    figure.suptitle(comparison.scene["title"], fontsize=11)
-    right.set_title(f"{environment['cpu']}, 1 thread; {environment['date']}", fontsize=8, loc="right")
-    return figure
+        axes, words = drawn.axes[0], "error of the reference"
+        at = comparison.reference["error"]
+        axes.text(0.02, at, words, transform=axes.get_yaxis_transform(), fontsize=8, va="bottom")
+    return drawn
 
 
 #: Bands behind the curves, one a host.
 FRONT_STYLES = {ARRAYS: "#999999", "ASE": "#D9B38C", "OpenMM": "#B3A2C7"}
+BAND: Mapping[str, Any] = {
+    "linewidth": 9,
+    "alpha": 0.45,
+    "zorder": 0,
+    "solid_capstyle": "round",
+    "marker": "o",
+    "markersize": 8,
+}
 
 
-def _mark_fronts(axes: Axes, standings: Sequence[Standing], cost: Cost) -> None:
-    """A broad pale band through the points that no other of the same host dominates."""
-    from kcons.comparison.work_precision.fronts import cost_of
-
+def _errors(comparison: Comparison, standings: Sequence[Standing], cost: Cost) -> list[Curve]:
+    """Error against a cost: a curve for each method, and a broad pale band along the front of each host."""
+    found = []
+    for name in dict.fromkeys(m.method for m in comparison.measurements):
+        colour, marker = style(name)
+        done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and cost_of(m, cost) > 0]
+        if done:
+            # Where two methods do the same, both stay visible.
+            plain = name == "rattle"
+            face, size = (colour, 6) if plain else ("none", 9)
+            look: dict[str, Any] = {"color": colour, "marker": marker, "markerfacecolor": face, "markersize": size}
+            found.append(_curve(done, cost, done[0].title, {**look, "markeredgewidth": 1.6}))
+    if _reference_in_sight(comparison):
+        at = comparison.reference["error"]
+        found.append(Curve([0, 1], [at, at], style={"color": "black", "linewidth": 0.8, "linestyle": ":"}, along="y"))
     for standing in standings:
-        if standing.cost != cost or standing.host == EVERY_HOST or not standing.front:
-            continue
-        axes.plot(
-            [cost_of(m, cost) for m in standing.front],
-            [float(m.error or 0.0) for m in standing.front],
-            color=FRONT_STYLES.get(standing.host, "#999999"),
-            linewidth=9,
-            alpha=0.45,
-            zorder=0,
-            solid_capstyle="round",
-            marker="o",
-            markersize=8,
-            markeredgewidth=0,
-            label=f"front, {standing.host}",
-        )
+        if standing.cost == cost and standing.host != EVERY_HOST and standing.front:
+            look = {**BAND, "color": FRONT_STYLES.get(standing.host, "#999999"), "markeredgewidth": 0}
+            found.append(_curve(standing.front, cost, f"front, {standing.host}", look))
+    return found
+
+
+def _curve(done: Sequence[Measurement], cost: Cost, label: str, look: Mapping[str, Any]) -> Curve:
+    return Curve([cost_of(m, cost) for m in done], [float(m.error or 0.0) for m in done], label, look)
 
 
 def _reference_in_sight(comparison: Comparison) -> bool:
@@ -309,61 +276,41 @@ def _reference_in_sight(comparison: Comparison) -> bool:
     return bool(errors) and 0 < min(errors) < 100 * float(comparison.reference["error"])
 
 
-def _mark_costs_without_error(axes: Axes, comparison: Comparison) -> None:
-    """Floors: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line.
+def _costs_without_error(comparison: Comparison) -> list[Curve]:
+    """Baselines: ticks along the lower edge, one a time step. Methods stopped for the budget: a vertical line.
 
     Runs that failed: crosses along the upper edge, at the cost they had until then.
     """
+    found = []
+
+    def mark(measured: Sequence[Measurement], height: float, label: str, **look: Any) -> None:
+        at = [float(m.seconds_per_time) for m in measured if m.seconds_per_time]
+        look = {"linestyle": "none", "color": style(measured[0].method)[0], **look}
+        found.append(Curve(at, [height] * len(at), f"{measured[0].title} ({label})", look, along="x"))
+
     for name in dict.fromkeys(m.method for m in comparison.measurements):
         colour, marker = style(name)
         floors = [m for m in comparison.of(name, "floor") if m.seconds_per_time]
         if floors:
-            axes.plot(
-                [float(m.seconds_per_time or 0.0) for m in floors],
-                [0.03] * len(floors),
-                transform=axes.get_xaxis_transform(),
-                linestyle="none",
-                marker=marker,
-                color=colour,
-                markersize=7,
-                label=f"{floors[0].title} (cost only)",
-            )
+            mark(floors, 0.03, "cost only", marker=marker, markersize=7)
         for m in comparison.of(name, "partial")[:1]:
             if m.seconds_per_time:
                 label = f"{m.title} (stopped for the budget, cost only)"
-                axes.axvline(m.seconds_per_time, color=colour, linestyle="--", linewidth=1.2, label=label)
+                look = {"color": colour, "linestyle": "--", "linewidth": 1.2}
+                found.append(Curve([m.seconds_per_time] * 2, [0, 1], label, look, along="x"))
         failed = comparison.of(name, "failed")
         if failed:
-            known = [float(m.seconds_per_time) for m in failed if m.seconds_per_time]
-            axes.plot(
-                known,
-                [0.97] * len(known),
-                transform=axes.get_xaxis_transform(),
-                linestyle="none",
-                marker="x",
-                color=colour,
-                markersize=8,
-                markeredgewidth=2,
-                label=f"{failed[0].title} (failed at {len(failed)} of its settings)",
-            )
+            label = f"failed at {len(failed)} of its settings"
+            mark(failed, 0.97, label, marker="x", markersize=8, markeredgewidth=2)
+    return found
 
 
 def write(comparison: Comparison, folder: Path, *, tables: Sequence[str] = ()) -> list[Path]:
     """Put compare.json, compare.png and, if given, the table as text into `folder`; the paths written."""
-    folder.mkdir(parents=True, exist_ok=True)
-    data, picture, text = folder / "compare.json", folder / "compare.png", folder / "compare.txt"
-    data.write_text(
-        json.dumps(plain(comparison.to_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    plot(comparison, picture)
-    written = [data, picture]
-    if tables:
-        text.write_text("\n".join(tables) + "\n", encoding="utf-8")
-        written.append(text)
-    return written
+    return report_files.write(folder, "compare", comparison.to_dict(), figure(comparison), tables)
 
 
-def page_table(comparison: Comparison) -> PageTable:
+def page_table(comparison: Comparison) -> Table:
     """All measurements as a table of a page: those on a front are good rows, those that failed bad ones."""
     units = comparison.scene["units"]
     rank = max(int(comparison.scene["rank"]), 1)
@@ -374,12 +321,12 @@ def page_table(comparison: Comparison) -> PageTable:
         *(f"wall a {units['long_time']}", "what happened"),
     ]
     on_front: dict[int, list[str]] = {}
-    for standing in verdict(comparison).standings:
+    for standing in judge(comparison).standings:
         for m in standing.front if standing.host != EVERY_HOST else ():
             on_front.setdefault(id(m), []).append("wall" if standing.cost == "wall" else "forces")
     rows, marks = [], []
     for m in comparison.measurements:
-        cells = {name: str(cell) for name, cell in _cells(m, None).items()}
+        cells = _cells(m, None)
         each = m.constraint_seconds / rank if m.constraint_seconds is not None and m.status != "floor" else None
         front = on_front.get(id(m), [])
         rows.append(
@@ -390,15 +337,4 @@ def page_table(comparison: Comparison) -> PageTable:
             ]
         )
         marks.append("good" if front else "bad" if m.status == "failed" else "")
-    return PageTable(headings, rows, text_columns=(0, 3, len(headings) - 1), marks=marks)
-
-
-def plain(value: Any) -> Any:
-    """JSON has no NaN: it becomes null."""
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return Table(headings, rows, words=(0, 3, len(headings) - 1), marks=marks)

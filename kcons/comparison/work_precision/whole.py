@@ -7,7 +7,6 @@ an interrupted run goes on where it stopped.
 from __future__ import annotations
 
 import gc
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -16,13 +15,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from kcons import __version__
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.scenes import Scene
-from kcons.comparison.study.machine import code_digest, environment
+from kcons.comparison.study import json_files
+from kcons.comparison.study.machine import stamp
+from kcons.comparison.study.study import Kept, Watcher
 from kcons.comparison.work_precision import whole_page
-from kcons.comparison.work_precision.measure import Watcher, compare, reference_of
+from kcons.comparison.work_precision.measure import Bench, compare, reference_of
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import PLAN, Item
 from kcons.comparison.work_precision.recommendation import sharpen
@@ -30,6 +30,8 @@ from kcons.comparison.work_precision.timing_rounds import FULL_ROUNDS, QUICK_ROU
 from kcons.errors import InputError, KconsError
 
 FORMAT = "kcons-report-1"
+#: Digits that go to files.
+DIGITS = 4
 #: A quick run is to be over after so many seconds; near the end, budgets shrink and then parts are left out.
 QUICK_SECONDS = 280.0
 
@@ -68,9 +70,8 @@ def run(
     expected = {item.key: item.quick_seconds if quick else item.seconds for item in items}
     pending = []
     for item in items:
-        old = read(folder, item.key)
-        unfinished = old is None or "failed" in old or "unfinished" in old
-        if not fresh and old is not None and old["key"] == key_of(item, quick) and not unfinished:
+        old = _kept(folder, item, quick).earlier()
+        if not fresh and old and not {"failed", "unfinished"} & set(old):
             watching.overall(f"{item.key}: measured already", 0.0, sum(expected.values()))
             expected.pop(item.key)
         else:
@@ -85,7 +86,8 @@ def run(
             share = 1.0 if limit is None or not left else max(0.0, min(1.0, (limit - elapsed) / left))
             started = time.perf_counter()
             found = _part(item, quick, share, watching, folder, fresh)
-            _write(folder, item, {"format": FORMAT, "key": key_of(item, quick), **found})
+            _kept(folder, item, quick).put(found)
+            whole_page.write_part(folder, _part_of(item, read(folder, item.key) or {}))
             if "seconds" in found:
                 done += expected[item.key]
                 spent += time.perf_counter() - started
@@ -98,17 +100,21 @@ def run(
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
     """What a measurement depends on: code, scene, settings."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(item)))
+    part = asdict(item)
     for name in ("heading", "seconds", "quick_seconds"):
-        plain.pop(name)
-    return {"version": __version__, "code": code_digest(), "quick": quick, "part": plain}
+        part.pop(name)
+    return stamp(quick=quick, part=part)
+
+
+def _kept(folder: Path, item: Item, quick: bool) -> Kept:
+    return Kept(folder / f"{item.key}.json", key_of(item, quick), form=FORMAT, under="key", pack=packed)
 
 
 def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
     """Measure one part; what keeps it from being measured is its result."""
     reason = _excluded(item, quick) or ("the time of a quick run was over" if share < 0.05 else "")
     if reason:
-        return {"not run": reason, "environment": environment()}
+        return {"not run": reason}
     begun = time.perf_counter()
     try:
         if item.module:
@@ -116,21 +122,18 @@ def _part(item: Item, quick: bool, share: float, watcher: Watcher, folder: Path,
         else:
             found = {"comparison": _compared(item, quick, share, watcher).to_dict()}
     except (KconsError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
-        return {"failed": f"{type(error).__name__}: {error}", "environment": environment()}
-    return {**found, "seconds": time.perf_counter() - begun, "environment": environment()}
+        return {"failed": f"{type(error).__name__}: {error}"}
+    return {**found, "seconds": time.perf_counter() - begun}
 
 
 def _by_module(item: Item, quick: bool, watcher: Watcher, folder: Path, fresh: bool) -> dict[str, Any]:
     """A part with a module of its own; what it has measured is kept from time to time."""
-    head = {"format": FORMAT, "key": key_of(item, quick), "unfinished": True}
-    old = None if fresh else read(folder, item.key)
-    earlier = old["result"] if old is not None and "result" in old and old["key"] == head["key"] else None
-
-    def keep(result: dict[str, Any]) -> None:
-        _put(folder, item, {**head, "result": result, "environment": environment()})
-
+    kept = _kept(folder, item, quick)
     result: dict[str, Any] = import_module(item.module).measure(
-        quick=quick, keep=keep, watcher=watcher, earlier=earlier
+        quick=quick,
+        keep=lambda result: kept.put({"unfinished": True, "result": result}),
+        watcher=watcher,
+        earlier=None if fresh else kept.earlier().get("result"),
     )
     return result
 
@@ -149,9 +152,8 @@ def _excluded(item: Item, quick: bool) -> str:
 
 
 def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
-    watcher.begin("building the scene", 1)
-    scene = scene_of(item, quick)
-    watcher.end()
+    with watcher.piece("building the scene", 1):
+        scene = scene_of(item, quick)
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
     names, left_out = methods_of(item, scene, quick)
     reference = reference_of(scene, watcher)
@@ -168,7 +170,7 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     reasons = dict.fromkeys(left_out.values())
     remarks = [f"not run: {', '.join(n for n in left_out if left_out[n] == why)} ({why})" for why in reasons]
     found = replace(found, remarks=[*found.remarks, *remarks])
-    return sharpen(scene, found, reference=reference, budget=budget, watcher=watcher, rounds=rounds)
+    return sharpen(Bench(scene, reference, budget, watcher, rounds), found)
 
 
 def scene_of(item: Item, quick: bool) -> Scene:
@@ -207,37 +209,21 @@ def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[s
 def read(folder: Path, key: str) -> dict[str, Any] | None:
     """What was measured of a part; None where there is nothing that can be read."""
     try:
-        data: dict[str, Any] = json.loads((folder / f"{key}.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return unpacked(json_files.read(folder / f"{key}.json", FORMAT))
+    except (OSError, InputError):
         return None
-    return unpacked(data) if data.get("format") == FORMAT else None
-
-
-def _put(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
-    # Aside and then into place: a run that is interrupted leaves no half of a file.
-    path = folder / f"{item.key}.json"
-    beside = path.with_suffix(".part")
-    beside.write_text(packed(found), encoding="utf-8")
-    beside.replace(path)
-
-
-def _write(folder: Path, item: Item, found: Mapping[str, Any]) -> None:
-    _put(folder, item, found)
-    whole_page.write_part(folder, item.key, item.heading, item.module, read(folder, item.key) or {})
 
 
 def packed(found: Mapping[str, Any]) -> str:
     """JSON, four digits, measurements one a line under the names of their columns."""
-    data = _slim(found)
+    data = json_files.plain(found, DIGITS)
     lines: list[str] = []
     if "comparison" in data:
-        measurements = found["comparison"]["measurements"]
+        measurements = data["comparison"]["measurements"]
         columns = list(measurements[0]) if measurements else []
-        rows = [[_slim(m[name]) for name in columns] for m in measurements]
-        lines = [json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows]
+        lines = [json_files.text([m[name] for name in columns], indent=None) for m in measurements]
         data["comparison"] = {**data["comparison"], "columns": columns, "measurements": "ROWS"}
-    text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
-    return text.replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]") + "\n"
+    return json_files.text(data).replace('"ROWS"', "[\n" + ",\n".join(lines) + "\n]")
 
 
 def unpacked(data: dict[str, Any]) -> dict[str, Any]:
@@ -253,17 +239,6 @@ def unpacked(data: dict[str, Any]) -> dict[str, Any]:
     return {**data, "comparison": comparison}
 
 
-def _slim(value: Any) -> Any:
-    from kcons.comparison.work_precision.report import plain
-
-    value = plain(value)
-    if isinstance(value, dict):
-        return {key: _slim(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_slim(item) for item in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
-
-
 def redraw(folder: Path, into: Path | None = None) -> list[Path]:
     """Pictures, tables and the page from the numbers in a folder; the table of winners goes `into` a page, too.
 
@@ -272,22 +247,21 @@ def redraw(folder: Path, into: Path | None = None) -> list[Path]:
     InputError
         There are none.
     """
-    found = [(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+    found = parts(folder)
     if not found:
         raise InputError(f"there are no results of kcons compare --all in {folder}", item="redraw")
-    made = [
-        path
-        for item, data in found
-        for path in whole_page.write_part(folder, item.key, item.heading, item.module, data)
-    ]
-    filled = [] if into is None else whole_page.fill(into, parts(folder))
+    made = [path for part in found for path in whole_page.write_part(folder, part)]
+    filled = [] if into is None else whole_page.fill(into, found)
     return [_page(folder), *made, *filled]
 
 
 def parts(folder: Path) -> list[whole_page.Part]:
     """All parts that are in a folder, in the order of the plan."""
-    found = ((item, read(folder, item.key)) for item in PLAN)
-    return [whole_page.Part(i.key, i.heading, i.module, data) for i, data in found if data is not None]
+    return [_part_of(item, data) for item in PLAN if (data := read(folder, item.key)) is not None]
+
+
+def _part_of(item: Item, data: Mapping[str, Any]) -> whole_page.Part:
+    return whole_page.Part(item.key, item.heading, item.module, data)
 
 
 def _page(folder: Path) -> Path:

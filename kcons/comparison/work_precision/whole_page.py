@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.study import html_page
-from kcons.comparison.study.html_page import PageTable, Section
+from kcons.comparison.study.html_page import Section
+from kcons.comparison.study.tables import Table, duration, markdown, plain_text
 from kcons.comparison.work_precision import report
 from kcons.comparison.work_precision.fronts import (
     COSTS,
@@ -21,7 +23,7 @@ from kcons.comparison.work_precision.fronts import (
     summary,
     verdict,
 )
-from kcons.comparison.work_precision.measurement import Comparison, duration
+from kcons.comparison.work_precision.measurement import Comparison
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +58,11 @@ class Part:
     module: str
     data: Mapping[str, Any]
 
+    @cached_property
+    def comparison(self) -> Comparison | None:
+        """None where no methods were compared."""
+        return Comparison.from_dict(self.data["comparison"]) if "comparison" in self.data else None
+
 
 def write(path: Path, parts: Sequence[Part]) -> Path:
     """The page of all parts."""
@@ -68,24 +75,21 @@ def write(path: Path, parts: Sequence[Part]) -> Path:
     return html_page.write(path, TITLE, sections, introduction=INTRODUCTION)
 
 
-def write_part(folder: Path, key: str, heading: str, module: str, data: Mapping[str, Any]) -> list[Path]:
-    """Picture and table of one part, as far as there is something to show; the paths written."""
-    part = Part(key, heading, module, data)
+def write_part(folder: Path, part: Part) -> list[Path]:
+    """Picture and table of one part, if there is something to show; the paths written."""
     figure, table, text = shown(part)
-    written = []
-    if figure is not None:
-        figure.savefig(folder / f"{key}.png", dpi=150)
-        written.append(folder / f"{key}.png")
-    if table is not None:
-        (folder / f"{key}.txt").write_text(f"{heading}\n\n{plain_text(table)}\n{text}\n", encoding="utf-8")
-        written.append(folder / f"{key}.txt")
-    return written
+    if figure is None or table is None:
+        return []
+    picture, words = folder / f"{part.key}.png", folder / f"{part.key}.txt"
+    figure.savefig(picture, dpi=150)
+    words.write_text(f"{part.heading}\n\n{plain_text(table)}\n{text}\n", encoding="utf-8")
+    return [picture, words]
 
 
-def shown(part: Part) -> tuple[Figure | None, PageTable | None, str]:
+def shown(part: Part) -> tuple[Figure | None, Table | None, str]:
     """Figure, table and explanation of a part; nothing where nothing was measured."""
-    if "comparison" in part.data:
-        found = Comparison.from_dict(part.data["comparison"])
+    found = part.comparison
+    if found is not None:
         return report.figure(found), report.page_table(found), report.explanation(found)
     if "result" in part.data and find_spec(part.module) is not None:
         module = import_module(part.module)
@@ -100,9 +104,7 @@ def _section(part: Part) -> Section:
     figure, table, text = shown(part)
     if figure is None or table is None:
         return Section(part.heading, ["this version of kcons cannot show it"])
-    notes: list[str] = []
-    if "comparison" in part.data:
-        notes = _notes(Comparison.from_dict(part.data["comparison"]))
+    notes = [] if part.comparison is None else _notes(part.comparison)
     return Section(part.heading, notes, [figure], [table], text)
 
 
@@ -135,7 +137,7 @@ def _notes(found: Comparison) -> list[str]:
     return lines
 
 
-def _machines(parts: Sequence[Part]) -> PageTable:
+def _machines(parts: Sequence[Part]) -> Table:
     """Every machine, version and commit that measured a part, as a rule one."""
     rows: dict[tuple[str, ...], list[str]] = {}
     for part in parts:
@@ -150,10 +152,10 @@ def _machines(parts: Sequence[Part]) -> PageTable:
         rows.setdefault(row, []).append(environment["date"])
     headings = ["processor", "system", "versions", "commit", "run", "parts", "from", "to"]
     cells = [[*row, str(len(dates)), min(dates), max(dates)] for row, dates in rows.items()]
-    return PageTable(headings, cells, text_columns=(0, 1, 2, 3, 4, 6, 7))
+    return Table(headings, cells, words=(0, 1, 2, 3, 4, 6, 7))
 
 
-def winners(parts: Sequence[Part]) -> PageTable:
+def winners(parts: Sequence[Part]) -> Table:
     """Who wins where: a line for each scene and host with a method of kcons and another one."""
     headings = [
         "scene",
@@ -170,9 +172,9 @@ def winners(parts: Sequence[Part]) -> PageTable:
     rows: list[list[str]] = []
     marks: list[str] = []
     for part in parts:
-        if "comparison" not in part.data:
+        found = part.comparison
+        if found is None:
             continue
-        found = Comparison.from_dict(part.data["comparison"])
         length = found.scene["units"]["length"]
         margin = found.timing.get("margin")
         for row in summary(found):
@@ -193,7 +195,7 @@ def winners(parts: Sequence[Part]) -> PageTable:
                 ]
             )
             marks.append("bad" if row["losses"] else "good")
-    return PageTable(headings, rows, text_columns=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
+    return Table(headings, rows, words=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
 
 
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
@@ -238,7 +240,7 @@ def results(parts: Sequence[Part]) -> str:
     where = [f"{row[0]}; {row[2]}; commit {row[3]}; {row[4]} run, {row[6]} to {row[7]}." for row in machines.rows]
     sentences, close = _lost_and_won(parts)
     listed = ["\n".join(f"- {line}" for line in close)] if close else []
-    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts), SHORT), ""])
+    return "\n\n".join([*where, *sentences, *listed, markdown(winners(parts).of(SHORT)), ""])
 
 
 def factor(ratio: float) -> str:
@@ -248,9 +250,7 @@ def factor(ratio: float) -> str:
 
 def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
     """Sentences on all lines of the table, and those lines in which others are close."""
-    compared = [
-        (part.heading, Comparison.from_dict(part.data["comparison"])) for part in parts if "comparison" in part.data
-    ]
+    compared = [(part.heading, part.comparison) for part in parts if part.comparison is not None]
     judged = [row for _, found in compared for row in summary(found) if row["rivals"]]
     if not judged:
         return ["No scene has both a method of kcons and another one yet."], []
@@ -275,26 +275,3 @@ def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
 def _at_least_margin(found: Comparison) -> Comparison:
     """The same, as if times repeated to within `LEAST_MARGIN`."""
     return replace(found, timing={**found.timing, "margin": None})
-
-
-def plain_text(table: PageTable) -> str:
-    """The table in columns of characters."""
-    rows = [list(table.headings), *[list(row) for row in table.rows]]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(table.headings))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (
-            cell.ljust(width) if k in table.text_columns else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        return "  ".join(padded).rstrip()
-
-    return "\n".join(line(row) for row in rows)
-
-
-def markdown(table: PageTable, columns: Sequence[int]) -> str:
-    """Some columns of a table as a table of Markdown, for the documentation."""
-    heads = [table.headings[k] for k in columns]
-    ruler = ["---" if k in table.text_columns else "---:" for k in columns]
-    lines = [heads, ruler, *([row[k].replace("|", "\\|") for k in columns] for row in table.rows)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

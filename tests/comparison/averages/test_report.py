@@ -110,7 +110,7 @@ def test_files(tmp_path):
 
 
 def test_plot_without_anything_to_show(tmp_path):
-    report.plot(comparison(ROWS[2]), tmp_path / "a.png")
+    report.figure(comparison(ROWS[2])).savefig(tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 

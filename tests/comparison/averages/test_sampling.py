@@ -129,7 +129,7 @@ def test_water():
 def test_bad_input(dumbbells):
     with pytest.raises(InputError, match="there is no thermostat 'rattle'; there are isokinetic"):
         sampling.compare(dumbbells, methods=["rattle"])
-    with pytest.raises(InputError, match="no method is named"):
+    with pytest.raises(InputError, match="no thermostat is named"):
         sampling.compare(dumbbells, methods=[])
     with pytest.raises(InputError, match="give a positive number of seconds"):
         sampling.compare(dumbbells, budget=0)

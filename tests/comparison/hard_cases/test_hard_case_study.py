@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from kcons.cli import main
 from kcons.comparison.hard_cases import chosen, load, report, run
 from kcons.comparison.hard_cases.worker import Worker
+from kcons.comparison.study import json_files
 from kcons.errors import InputError
 
 
@@ -22,7 +22,7 @@ def result(tmp_path_factory):
 def test_cells_are_kept(result):
     found, kept = result
     stored = load(kept)
-    assert stored["cells"] == json.loads(json.dumps(found["cells"]))
+    assert stored["cells"] == json_files.plain(found["cells"])
     assert list(stored["cells"]) == ["H02", "H22", "X06"]
     assert stored["cells"]["H02"]["kcons"]["verdict"] == "refused"
     assert stored["cells"]["H22"]["ASE"]["verdict"] == "cannot express"
@@ -58,7 +58,7 @@ def test_a_program_that_hangs_is_given_up():
 
 
 def test_unknown_cases_are_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no case H99; there are H01, H02"):
+    with pytest.raises(InputError, match="there is no case 'H99'; there are H01, H02"):
         chosen(["H99"])
     bad = tmp_path / "x.json"
     bad.write_text("{}")

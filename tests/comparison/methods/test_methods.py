@@ -143,7 +143,7 @@ def test_registered_stepper_is_compared(monkeypatch, pendulum, tmp_path):
         assert high.evaluations_per_time == pytest.approx(3 / high.setting)
         assert high.evaluations_per_time == pytest.approx(plain.evaluations_per_time, rel=0.02)
     assert result.of("triple")[-1].error < 0.1 * result.of("rattle")[-1].error
-    report.plot(result, tmp_path / "x.png")
+    report.figure(result).savefig(tmp_path / "x.png")
 
 
 def test_onlookers_do_not_save_a_stepper_its_evaluations(monkeypatch, pendulum):

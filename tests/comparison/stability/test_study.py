@@ -22,6 +22,7 @@ from kcons.comparison.stability import (
     trial,
 )
 from kcons.comparison.stability.runs import Copies
+from kcons.comparison.study import json_files
 from kcons.errors import InputError
 
 ROOT = Path(__file__).parents[3]
@@ -113,14 +114,14 @@ def test_command(tmp_path, capsys, monkeypatch):
 
 
 def test_page_shows_the_committed_results():
-    result = json.loads(RESULTS.read_text(encoding="utf-8"))
+    result = json_files.read(RESULTS)
     shown = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
     for part, words in report.markdown(result).items():
         assert words in shown, part
 
 
 def test_committed_results_have_no_faults():
-    result = json.loads(RESULTS.read_text(encoding="utf-8"))
+    result = json_files.read(RESULTS)
     assert result["environment"]["commit"]
     assert report.failures(result) == []
     assert result["fuzz"]["faults"] == []
@@ -131,13 +132,11 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
     """As the command does it; results from before stay what they are."""
     page, numbers = tmp_path / "stability.md", tmp_path / "stability.json"
     page.write_text((ROOT / "docs" / "stability.md").read_text(encoding="utf-8"), encoding="utf-8")
-    stored = json.loads(RESULTS.read_text(encoding="utf-8"))
+    stored = json_files.read(RESULTS)
     stored["pieces"].pop("drift/butane", None)
     before_it = report.markdown(stored)["drift"]
     page.write_text(
-        page.read_text(encoding="utf-8").replace(
-            report.markdown(json.loads(RESULTS.read_text(encoding="utf-8")))["drift"], before_it
-        ),
+        page.read_text(encoding="utf-8").replace(report.markdown(json_files.read(RESULTS))["drift"], before_it),
         encoding="utf-8",
     )
     numbers.write_text(json.dumps(stored), encoding="utf-8")

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from kcons.comparison.study import html_page
+from kcons.comparison.study.tables import Table
 
 VOID = {"meta", "link", "img", "br"}
 
@@ -36,7 +37,7 @@ class Reader(HTMLParser):
 def read(tmp_path: Path) -> Reader:
     figure = Figure()
     figure.subplots().plot([1, 2], [3, 4])
-    table = html_page.PageTable(["method", "error"], [["a < b & c", "1e-6"], ["plain", "2"]], marks=["good", ""])
+    table = Table(["method", "error"], [["a < b & c", "1e-6"], ["plain", "2"]], marks=["good", ""])
     sections = [
         html_page.Section("First", ["<script>text</script>"], [figure], [table]),
         html_page.Section("Last", literal="x"),
@@ -61,6 +62,6 @@ def test_text_is_shown_as_it_is(read):
 
 
 def test_a_row_of_the_wrong_length_of_marks_is_an_error(tmp_path):
-    table = html_page.PageTable(["a"], [["1"], ["2"]], marks=["good"])
+    table = Table(["a"], [["1"], ["2"]], marks=["good"])
     with pytest.raises(ValueError):
         html_page.write(tmp_path / "p.html", "t", [html_page.Section("s", tables=[table])])

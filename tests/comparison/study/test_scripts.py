@@ -56,7 +56,9 @@ def test_script_measures_writes_and_shows(tmp_path: Path) -> None:
 def test_measurements_are_continued(tmp_path: Path, there: bool) -> None:
     out = tmp_path / "result.json"
     if there:
-        out.write_text('{"parts": [1]}')
+        scripts.continued(out, lambda **given: given["keep"]({"parts": [1]}), quick=True)
+    # Of a full run there is nothing yet.
+    assert scripts.continued(out, lambda **given: {"none": given["earlier"]}, quick=False) == {"none": None}
 
     def measure(*, quick, keep, earlier) -> dict:
         assert quick and (earlier == {"parts": [1]} if there else earlier is None)

@@ -331,20 +331,3 @@ def test_watcher_hears_of_everything(chain):
     assert "kernels" in listener.heard[0]
     assert listener.heard[1] == "reference solution"
     assert len(listener.heard) == 2 + len(chain.time_steps)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0, "0.00 ns"),
-        (1.5e-8, "15.0 ns"),
-        (9.999e-4, "1.00 ms"),
-        (1.234e-3, "1.23 ms"),
-        (0.5, "500 ms"),
-        (12.5, "12.5 s"),
-        (1200.0, "20 min"),
-        (36000.0, "10.0 h"),
-    ],
-)
-def test_duration(seconds, text):
-    assert measure.duration(seconds) == text

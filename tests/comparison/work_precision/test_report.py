@@ -158,14 +158,9 @@ def test_not_a_number_becomes_null(tmp_path):
     assert json.loads(path.read_text())["measurements"][0]["error"] is None
 
 
-def test_plot_has_both_panels_with_units(tmp_path, monkeypatch):
-    from matplotlib.figure import Figure
-
-    figures = []
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), save(self, *a, **k))[1])
-    report.plot(comparison(*ROWS), tmp_path / "x.png")
-    left, right = figures[0].axes
+def test_plot_has_both_panels_with_units():
+    figure = report.figure(comparison(*ROWS))
+    left, right = figure.axes
     assert (left.get_xscale(), left.get_yscale(), right.get_xscale()) == ("log", "log", "log")
     assert left.get_xlabel() == "force evaluations per simulated ps"
     assert right.get_xlabel() == "wall time per simulated ps / s"
@@ -173,7 +168,7 @@ def test_plot_has_both_panels_with_units(tmp_path, monkeypatch):
     curves = {line.get_label(): line for line in left.lines}
     assert list(curves["kcons RATTLE"].get_xdata()) == [500.0, 1000.0]
     assert list(curves["kcons RATTLE"].get_ydata()) == [1.25e-3, 3.126e-4]
-    labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "scipy" in labels
     assert any(label.startswith("floor") for label in labels)
     assert any("stopped for the budget" in label for label in labels)
@@ -201,7 +196,8 @@ def test_methods_differ_in_colour_and_marker(monkeypatch):
 
 def test_plot_without_any_error(tmp_path):
     # All peers failed: still a picture, no warning.
-    report.plot(comparison(measured(status="failed", error=None, step_seconds=None)), tmp_path / "x.png")
+    nothing = report.figure(comparison(measured(status="failed", error=None, step_seconds=None)))
+    nothing.savefig(tmp_path / "x.png")
     assert (tmp_path / "x.png").stat().st_size > 1000
 
 

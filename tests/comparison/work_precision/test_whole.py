@@ -13,8 +13,9 @@ import pytest
 from kcons.cli import main
 from kcons.comparison import scenes
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
+from kcons.comparison.study import machine, tables
+from kcons.comparison.study.study import Watcher
 from kcons.comparison.work_precision import parts_of_the_whole, timing_rounds, whole, whole_page
-from kcons.comparison.work_precision.measure import Watcher
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import Item
 from kcons.errors import InputError
@@ -44,7 +45,7 @@ def tiny(monkeypatch):
     for module in (parts_of_the_whole, whole):
         monkeypatch.setattr(module, "PLAN", TINY)
     monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
-    monkeypatch.setattr(whole, "code_digest", lambda: "digest")
+    monkeypatch.setattr(machine, "code_digest", lambda: "digest")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def finished(tmp_path_factory):
         for module in (parts_of_the_whole, whole):
             patch.setattr(module, "PLAN", TINY)
         patch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
-        patch.setattr(whole, "code_digest", lambda: "digest")
+        patch.setattr(machine, "code_digest", lambda: "digest")
         whole.run(TINY, folder)
     return folder
 
@@ -64,7 +65,7 @@ def test_files_of_every_part(finished):
     assert names >= {"index.html", "gone.json", "later.json"}
     for key in ("chain-3", "sphere"):
         assert names >= {f"{key}.json", f"{key}.png", f"{key}.txt"}
-    assert not [name for name in names if name.endswith(".part")]
+    assert not [name for name in names if name.endswith(".unfinished")]
     assert "kcons RATTLE" in (finished / "sphere.txt").read_text(encoding="utf-8")
 
 
@@ -158,7 +159,7 @@ def test_winners_name_host_and_gain(finished):
         by_time = row["decided by"] == "wall time"
         assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
     assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
-    text = whole_page.markdown(table, (0, 1, 4))
+    text = tables.markdown(table.of((0, 1, 4)))
     assert text.splitlines()[0] == "| scene | host | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
@@ -213,7 +214,7 @@ def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
     assert key == whole.key_of(item, False)
     assert key != whole.key_of(item, True)
     assert key != whole.key_of(Item("chain-3", "Chain of 3 bonds", "chain", 4, budget=5), False)
-    monkeypatch.setattr(whole, "code_digest", lambda: "another")
+    monkeypatch.setattr(machine, "code_digest", lambda: "another")
     assert key != whole.key_of(item, False)
 
 

@@ -107,7 +107,7 @@ class _DaeRun(Run):
 
     def __init__(self, scene: Scene, equations: _Equations) -> None:
         super().__init__()
-        self._equations, self._horizon = equations, scene.horizon
+        self._equations, self._horizon, self._t = equations, scene.horizon, 0.0
         self._y, self._rate = equations.start()
 
     def advance(self) -> None:
@@ -120,6 +120,10 @@ class _DaeRun(Run):
     @abstractmethod
     def _step(self) -> None:
         """One step of the solver."""
+
+    @property
+    def time(self) -> float:
+        return self._t
 
     @property
     def finished(self) -> bool:
@@ -152,7 +156,7 @@ class _RadauRun(_DaeRun):
         message = self._solver.step()
         if self._solver.status == "failed":
             raise KconsError(f"Radau gave up at t = {self._solver.t:g}: {message}")
-        self.time, self._y = float(self._solver.t), self._solver.y
+        self._t, self._y = float(self._solver.t), self._solver.y
 
 
 class _IdaRun(_DaeRun):
@@ -179,7 +183,7 @@ class _IdaRun(_DaeRun):
         found = self._solver.step(self._horizon, method="onestep", tstop=self._horizon)
         if not found.success:
             raise KconsError(f"IDA gave up at t = {self.time:g}: {found.message}")
-        self.time, self._y = float(np.ravel(found.t)[-1]), np.ravel(found.y)
+        self._t, self._y = float(np.ravel(found.t)[-1]), np.ravel(found.y)
 
 
 @dataclass(frozen=True)

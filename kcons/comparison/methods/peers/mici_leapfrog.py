@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from kcons.comparison.methods.method import Method, Run
+from kcons.comparison.methods.method import Method, Run, Steps
 from kcons.comparison.methods.peers.smallness import dense_rows, one_thread, plain_set, too_much
 from kcons.comparison.scenes import Scene
 from kcons.constraints.target import FloatArray
@@ -21,13 +21,13 @@ TIGHT = {"constraint_tol": 1e-13, "position_tol": 1e-12}
 SOLVES = ("projection_solver", "_project_onto_cotangent_space")
 
 
-class _MiciRun(Run):
+class _MiciRun(Steps):
     def __init__(self, scene: Scene, dt: float, tolerances: dict[str, float]) -> None:
         from mici.integrators import ConstrainedLeapfrogIntegrator
         from mici.states import ChainState
         from mici.systems import DenseConstrainedEuclideanMetricSystem
 
-        super().__init__()
+        super().__init__(dt, round(scene.horizon / dt))
         one_thread("mici")
         potential, shape = scene.potential, scene.positions.shape
         value, jacobian = dense_rows(plain_set(scene))
@@ -43,9 +43,8 @@ class _MiciRun(Run):
         self.constraints.watch(self._integrator, SOLVES)
         momenta = self._weights * scene.velocities.ravel()
         self._state: Any = ChainState(pos=scene.positions.ravel().copy(), mom=momenta, dir=1)
-        self._shape, self._dt = shape, dt
+        self._shape = shape
         self._share = math.exp(-0.5 * scene.friction * dt)
-        self._done, self._steps = 0, round(scene.horizon / dt)
         self._scene, self._system, self._start = scene, system, self._state.copy()
         potential.forces(scene.positions)
 
@@ -56,7 +55,6 @@ class _MiciRun(Run):
         if self._share != 1.0:
             self._state.mom = self._share * self._state.mom
         self._done += 1
-        self.time = self._done * self._dt
 
     def march(self, steps: int) -> None:
         if self._share != 1.0:
@@ -67,7 +65,6 @@ class _MiciRun(Run):
             state = step(state)
         self._state = state
         self._done += steps
-        self.time = self._done * self._dt
 
     def rewind(self) -> None:
         self._scene.potential.forces(self._scene.positions)
@@ -75,10 +72,6 @@ class _MiciRun(Run):
         self._system.grad_neg_log_dens(self._start)
         self._system.inv_gram(self._start)
         self._state = self._start.copy()
-
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._steps
 
     @property
     def positions(self) -> FloatArray:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from kcons.comparison.methods.method import Method, Run
+from kcons.comparison.methods.method import Method, Run, Steps, exponent
 from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel, kick, kick_and_drift
 from kcons.comparison.scenes import Scene
 from kcons.constraints.target import FloatArray
@@ -17,15 +17,14 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 USUAL = (1e-4, 1e-8)
 
 
-class _ShakeRun(Run):
+class _ShakeRun(Steps):
     def __init__(self, scene: Scene, sweeps: GaussSeidel, dt: float) -> None:
-        super().__init__()
-        self._scene, self._sweeps, self._dt = scene, sweeps, dt
+        super().__init__(dt, round(scene.horizon / dt))
+        self._scene, self._sweeps = scene, sweeps
         self.constraints.watch(sweeps, ("positions", "velocities"))
         self._x, self._v = scene.positions.copy(), scene.velocities.copy()
         self._old = np.empty_like(self._x)
         self._f = self._first = scene.potential.forces(self._x)
-        self._done, self._steps = 0, round(scene.horizon / dt)
 
     def advance(self) -> None:
         x, v, dt, w = self._x, self._v, self._dt, self._sweeps.inverse_masses
@@ -35,22 +34,16 @@ class _ShakeRun(Run):
         kick(v, self._f, w, dt)
         self._sweeps.velocities(x, v, dt)
         self._done += 1
-        self.time = self._done * dt
 
     def march(self, steps: int) -> None:
         forces = self._scene.potential.forces
         self._f = self._sweeps.march(self._x, self._v, self._f, self._dt, steps, forces, self._old)
         self._done += steps
-        self.time = self._done * self._dt
 
     def rewind(self) -> None:
         self._x[:], self._v[:], self._f = self._scene.positions, self._scene.velocities, self._first
         # The end of the last step is no longer the last point known.
         self._scene.potential.forces(self._x)
-
-    @property
-    def finished(self) -> bool:
-        return self._done >= self._steps
 
     @property
     def positions(self) -> FloatArray:
@@ -115,11 +108,11 @@ def shake_methods() -> list[Method]:
     """One for each tolerance."""
     found: list[Method] = []
     for tolerance in TOLERANCES:
-        exponent = f"{tolerance:.0e}".replace("e-0", "e-")
+        told = exponent(tolerance)
         found.append(
             Shake(
-                f"shake-{exponent}",
-                f"SHAKE/RATTLE sweeps, {exponent}",
+                f"shake-{told}",
+                f"SHAKE/RATTLE sweeps, {told}",
                 usual=tolerance in USUAL,
                 host="peer",
                 guest=True,
