@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import as_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
+from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
 from kcons.steppers.files import in_one_piece
-from kcons.steppers.stages.compensated_steps import all_finite, beyond
+from kcons.steppers.stages.compensated_steps import beyond, check_finite
 from kcons.steppers.stages.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.stages.friction import Friction
 from kcons.steppers.stages.fused_stages import Flights
@@ -512,17 +512,3 @@ class System:
 def _fixed_atoms(motion: Motion) -> IntArray:
     held = [c.atoms.ravel() for c in motion.constraint_set.constraints if c.family == "FixedAtoms"]
     return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
-
-
-def check_finite(values: FloatArray, item: str, step: int) -> None:
-    """Raise `NonFiniteError` unless every number is finite."""
-    if all_finite(values):
-        return
-    atom = int(np.argmax(~np.isfinite(values).all(axis=1)))
-    raise NonFiniteError(
-        f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
-        "check the geometry and the force function there, or use a smaller time step",
-        item=item,
-        atom=atom,
-        step=step,
-    )

@@ -11,8 +11,9 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
+from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
-from kcons.steppers.stepper import stays
+from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import (
     Momentum,
     carried,
@@ -27,7 +28,7 @@ _SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 FRACTIONS = (_SHARE, _SHARE, 1.0 - 4.0 * _SHARE, _SHARE, _SHARE)
 
 
-class NoseHooverChain:
+class NoseHooverChain(Listed):
     """Canonical dynamics without noise: half a step of the chain, a step on the constraints, half a step of the chain.
 
     The chain scales velocities, which stay tangent to rows that rest. Degrees of freedom are counted by rank, less
@@ -92,6 +93,9 @@ class NoseHooverChain:
 
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return Chain(0.5), *self.stepper.operations(system), Chain(0.5)
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
