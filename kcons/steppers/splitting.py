@@ -68,12 +68,11 @@ class Splitting(Listed):
             damped = friction is not None
             # With rates of its own for each atom, friction and flight are only composed as RATTLE flights are.
             whole = exact and (friction is None or friction.uniform)
-        found = self._made.get((exact, whole, settled, damped))
-        if found is None:
+        kind = exact, whole, settled, damped
+        if kind not in self._made:
             flight = (1.0,) if whole else self.flight
-            found = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
-            self._made[exact, whole, settled, damped] = found
-        return found
+            self._made[kind] = splitting(self.kicks, self.drifts, flight, exact=exact, settled=settled, damped=damped)
+        return self._made[kind]
 
     def _circles(self, system: System) -> bool:
         """Whether drifts follow great circles."""

@@ -6,12 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import SEEK_END, BytesIO
 from os import PathLike
 from pathlib import Path
-from struct import Struct
 from typing import Any, BinaryIO
-from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +19,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
-from kcons.steppers.files import in_one_piece
+from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.stages.compensated_steps import beyond, check_finite
 from kcons.steppers.stages.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.stages.friction import Friction
@@ -39,8 +36,6 @@ START_TOLERANCE = 1e-9
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
-#: The record at the end of an archive without comment; the fifth number is how many files there are.
-_LAST_RECORD = Struct("<4s4H2LH")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -138,7 +133,7 @@ class State:
             with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            return cls(**_checked(_stored(file)))
+            return cls(**_checked(stored_arrays(file)))
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
@@ -167,25 +162,6 @@ class _Shown(State):
 
 def _lent(array: FloatArray | None) -> FloatArray | None:
     return None if array is None else lent(array)
-
-
-def _stored(file: BinaryIO) -> dict[str, Any]:
-    """The arrays of an archive, each with its checksum compared."""
-    found: dict[str, Any] = {}
-    with ZipFile(file) as archive:
-        # A damaged entry of the directory may hide the next one; its last record says how many there are.
-        file.seek(-_LAST_RECORD.size, SEEK_END)
-        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
-        if count != len(archive.namelist()):
-            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
-        for name in archive.namelist():
-            # Read whole: what `numpy.load` does not look at, it does not check either.
-            content = BytesIO(archive.read(name))
-            array = np.lib.format.read_array(content, allow_pickle=False)
-            if content.read(1):
-                raise ValueError(f"{name} is longer than what it holds")
-            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
-    return found
 
 
 def _checked(values: dict[str, Any]) -> dict[str, Any]:

@@ -74,12 +74,13 @@ class ArrayStep:
         system = self.system
         circles = system.great_circles if operation.exact else None
         flight = system.drift if circles is None else circles
-        point = Point(self.x, self.v, system.weights, exact=len(operation.flights) > 1 or circles is not None)
+        x, now = self.x, self.now
+        point = Point(x, self.v, system.weights, exact=len(operation.flights) > 1 or circles is not None)
         for h, end in self.pieces(operation):
-            then, self.now = self.now, end
-            flight.move(point, np.empty_like(self.x), then, end, h)
+            flight.move(point, np.empty(x.shape), now, end, h)
+            now = end
         point.land()
-        self.x, self.v = point.x, point.v
+        self.x, self.v, self.now = point.x, point.v, now
 
     def evaluate(self, operation: Operation) -> None:
         """Forces where the step is now."""
@@ -126,7 +127,7 @@ class SplittingStep(ArrayStep):
 
     def fly(self, operation: Fly) -> None:
         dt, point, friction = self.dt, self.point, self.system.friction
-        self.out = out = np.empty_like(point.x)
+        self.out = out = np.empty(point.x.shape)
         self.stale = True
         if self.flights is not None:
             fractions = operation.lengths
@@ -136,12 +137,13 @@ class SplittingStep(ArrayStep):
             self.flights.move(point, fractions, dt, out, self.now, self.number, self.tables)
             return
         left = len(operation.ends)
-        for h, end in self.pieces(operation):
-            then, self.now = self.now, end
+        for fraction, end in zip(operation.flights, operation.ends, strict=True):
+            then, self.now, h = self.now, self.frame.at(end), fraction * dt
             left -= 1
             length = h if friction is None else friction.flight(h)
-            self.flight.move(point, point.work[2] if left % 2 else out, then, end, length)
-        self.refuse_unsound()
+            self.flight.move(point, point.work[2] if left % 2 else out, then, self.now, length)
+        if not point.sound:
+            self.refuse_unsound()
 
     def damp(self, operation: Damp) -> None:
         point, friction = self.point, self.system.friction

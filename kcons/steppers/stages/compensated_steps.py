@@ -67,10 +67,10 @@ class Point:
         if self.x_low is None:
             before = self.v
             if self.fresh:
-                self.v = self.push = np.empty_like(before)
+                self.v = self.push = np.empty(before.shape)
             sound = fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
         elif self.fresh:
-            before, self.v = self.v, np.empty_like(self.v)
+            before, self.v = self.v, np.empty(self.v.shape)
             sound = fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
         else:
             sound = fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)

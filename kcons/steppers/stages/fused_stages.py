@@ -157,7 +157,7 @@ class Flights(Tables):
         kick, force = point.take_kick()
         x, before, fresh = point.x, point.v, point.fresh
         if fresh:
-            point.v = np.empty_like(before)
+            point.v = np.empty(before.shape)
             if point.x_low is None:
                 point.push = point.v
             point.fresh = False
