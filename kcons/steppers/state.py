@@ -305,9 +305,9 @@ class System:
         """
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
-        x = self._array(positions, "positions")
+        x = _finite_array(positions, self.n_atoms, "positions")
         given = velocities is not None
-        v = self._array(velocities, "velocities") if given else np.zeros_like(x)
+        v = _finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
             return State(x, v, time)
@@ -474,15 +474,16 @@ class System:
         atoms = self._free_of_origin
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
-    def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
-        array: FloatArray = np.array(numbers(values, item), order="C")
-        if array.shape != (self.n_atoms, 3):
-            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
-        bad = ~np.isfinite(array).all(axis=1)
-        if bad.any():
-            atom = int(np.argmax(bad))
-            raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
-        return array
+
+def _finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
+    array: FloatArray = np.array(numbers(values, item), order="C")
+    if array.shape != (n_atoms, 3):
+        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
+    return array
 
 
 def _fixed_atoms(motion: Motion) -> IntArray:
