@@ -26,6 +26,8 @@ from kcons.thermostats.freedom import (
 #: Suzuki's fractions of order 4 for the motion of the chain.
 _SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 FRACTIONS = (_SHARE, _SHARE, 1.0 - 4.0 * _SHARE, _SHARE, _SHARE)
+#: What comes before a step on the constraints, and after it.
+HALF = Chain(0.5)
 
 
 class NoseHooverChain(Listed):
@@ -95,7 +97,7 @@ class NoseHooverChain(Listed):
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
-        return Chain(0.5), *self.stepper.operations(system), Chain(0.5)
+        return HALF, *self.stepper.operations(system), HALF
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
@@ -156,7 +158,9 @@ class NoseHooverChain(Listed):
         assert thermostat is not None
         chain = thermostat.copy()
         masses = self._masses(float(chain[-1]))
-        scale = _advance(chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, 0.5 * dt, FRACTIONS)
+        scale = _advance(
+            chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, HALF.fraction * dt, FRACTIONS
+        )
         if not math.isfinite(scale):
             raise OverflowError
         return v * scale, chain
