@@ -3,8 +3,10 @@
 A stepper never changes its input. Where it raises, nothing has happened.
 
 - `state`, `files`: where a system is, and what acts on it
+- `operations`: a time step as data
 - `stepper`: what a stepper is
 - `stages`: what steps are made of
+- `executors`: who makes the operations
 - `splitting`: kicks and drifts in turn
 - `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
 - `extrapolation`: steps that choose their own size

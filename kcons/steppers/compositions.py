@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 
 from kcons.errors import InputError
+from kcons.steppers.operations import mirrored
 from kcons.steppers.splitting import Splitting
 
 _P = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
@@ -22,13 +23,8 @@ _Y = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
 YOSHIDA_4 = (_Y, 1.0 - 2.0 * _Y, _Y)
 
 
-def _palindrome(half: Sequence[float]) -> tuple[float, ...]:
-    """The fractions up to the middle, mirrored; the middle makes their sum 1."""
-    return (*half, math.fsum([1.0, *(-2.0 * g for g in half)]), *reversed(half))
-
-
 #: Order 6 with nine stages, of Kahan and Li (their s9odr6a).
-KAHAN_LI_6 = _palindrome(
+KAHAN_LI_6 = mirrored(
     (
         0.39216144400731413927925056,
         0.33259913678935943859974864,

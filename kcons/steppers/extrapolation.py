@@ -21,9 +21,11 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
+from kcons.steppers.executors.frame import Frame
 from kcons.steppers.geodesic import Geodesic
-from kcons.steppers.state import State, System, check_finite
-from kcons.steppers.stepper import Stepper
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.state import State, System
+from kcons.steppers.stepper import Stepper, retold
 
 #: Columns of the table: order 2 k - 1 of the estimate. Each one nearly doubles what rounding adds.
 FEWEST, MOST = 3, 9
@@ -203,28 +205,19 @@ class Extrapolation:
 
     def _landed(self, system: System, start: State, table: _Table, until: float | None) -> State:
         """The extrapolated point, brought onto the constraints."""
-        number = start.step + 1
-        time, time_remainder = (until, 0.0) if until is not None else start.later(table.size)
-        shift = None
-        x = start.positions
-        if start.remainder is not None:
-            shift = x[system.anchor]
-            x = (x - shift) + start.remainder
-        x = x + table.best[0]
-        v = start.velocities + table.best[1]
+        frame = Frame(system, start, table.size)
+        if until is not None:
+            frame.time, frame.left_over = until, 0.0
+        number, time = frame.number, frame.time
+        x = frame.x + table.best[0]
+        v = frame.v + table.best[1]
         check_finite(x, "position", number)
         check_finite(v, "velocity", number)
         motion = system.motion
         x = motion.project_positions(x, x, time=time, reference_time=time)
         v = motion.project_velocities(x, v, time=time)
-        positions, remainder = x, None
-        if shift is not None:
-            positions = x + shift
-            remainder = x - (positions - shift)
-        elif system.is_far(x):
-            remainder = np.zeros_like(x)
-        f = system.forces(positions, v, time, number)
-        return State(positions, v, time, f, number, remainder, time_remainder)
+        low = np.zeros_like(x) if frame.shift is None and system.is_far(x) else None
+        return frame.closed(x, v, system.forces(frame.whole(x), v, time, number), low=low)
 
 
 class _Table:
@@ -348,15 +341,9 @@ def _given_up(
             step=number,
         )
     if isinstance(error, ConvergenceError):
-        return type(error)(
+        message = (
             f"{where}: no solution. Targets that jump or cannot be met, or a start off the constraints (use "
-            f"System.initial_state): {error.__cause__ or error}",
-            residual=error.residual,
-            tolerance=error.tolerance,
-            iterations=error.iterations,
-            row=error.row,
-            atoms=error.atoms,
-            cluster=error.cluster,
-            step=number,
+            f"System.initial_state): {error.__cause__ or error}"
         )
+        return retold(error, message, type(error), number)
     return SingularGeometryError(f"{where}: {error}", rows=error.rows, atoms=error.atoms)

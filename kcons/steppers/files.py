@@ -1,12 +1,20 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or not there, and archives whose damage is noticed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import SEEK_END, BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO
+from struct import Struct
+from typing import Any, BinaryIO
+from zipfile import ZipFile
+
+import numpy as np
+
+#: The record at the end of an archive without comment; the fifth number is how many files there are.
+_LAST_RECORD = Struct("<4s4H2LH")
 
 
 @contextmanager
@@ -24,3 +32,22 @@ def in_one_piece(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
+
+
+def stored_arrays(file: BinaryIO) -> dict[str, Any]:
+    """The arrays of an archive, each with its checksum compared."""
+    found: dict[str, Any] = {}
+    with ZipFile(file) as archive:
+        # A damaged entry of the directory may hide the next one; its last record says how many there are.
+        file.seek(-_LAST_RECORD.size, SEEK_END)
+        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
+        if count != len(archive.namelist()):
+            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
+        for name in archive.namelist():
+            # Read whole: what `numpy.load` does not look at, it does not check either.
+            content = BytesIO(archive.read(name))
+            array = np.lib.format.read_array(content, allow_pickle=False)
+            if content.read(1):
+                raise ValueError(f"{name} is longer than what it holds")
+            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
+    return found

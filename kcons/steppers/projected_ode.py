@@ -18,7 +18,8 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
-from kcons.steppers.state import State, System, check_finite
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.state import State, System
 from kcons.steppers.stepper import explained, stays
 
 #: Friction times the step above which velocities grow that should die away: 2 for Verlet, 2.8 for Runge-Kutta.

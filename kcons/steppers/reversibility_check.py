@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
+from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
-from kcons.steppers.stepper import Stepper
+from kcons.steppers.stepper import Listed, Stepper, retold
 
 
-class ReversibilityCheck:
+class ReversibilityCheck(Listed):
     """A stepper that takes every step back again and compares; for finding solves that fail silently.
 
     Projections have more than one solution when a step is large; a step that lands on another branch than the
@@ -49,6 +50,12 @@ class ReversibilityCheck:
     def __repr__(self) -> str:
         return f"ReversibilityCheck({self.stepper!r})"
 
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        """Those of the stepper, whose step is then taken back and compared."""
+        if not isinstance(self.stepper, Listed):
+            raise UnsupportedError(f"{self.stepper!r} does not say what its step consists of")
+        return self.stepper.operations(system)
+
     def check(self, system: System) -> None:
         self.stepper.check(system)
 
@@ -68,16 +75,8 @@ class ReversibilityCheck:
         try:
             back = self.stepper.step(system, after, -dt)
         except ConvergenceError as error:
-            raise ReversibilityError(
-                f"step {after.step} cannot be taken back: {error}",
-                residual=error.residual,
-                tolerance=error.tolerance,
-                iterations=error.iterations,
-                row=error.row,
-                atoms=error.atoms,
-                cluster=error.cluster,
-                step=after.step,
-            ) from error
+            message = f"step {after.step} cannot be taken back: {error}"
+            raise retold(error, message, ReversibilityError, after.step) from error
         speed = max(_largest(state.velocities), _largest(after.velocities))
         length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
         rounding = 8 * float(np.spacing(_largest(state.positions)))

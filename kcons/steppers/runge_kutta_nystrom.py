@@ -8,38 +8,24 @@ composition of RATTLE drifts, which costs projections and no force.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 from kcons.errors import UnsupportedError
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
+from kcons.steppers.operations import mirrored
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.state import System
 
-
-def _mirrored_odd(half: Sequence[float]) -> tuple[float, ...]:
-    return (*half, math.fsum([1.0, *(-2.0 * a for a in half)]), *reversed(half))
-
-
-def _mirrored_even(half: Sequence[float]) -> tuple[float, ...]:
-    middle = math.fsum([0.5, *(-b for b in half)])
-    return (*half, middle, middle, *reversed(half))
-
-
 #: SRKN_6^b: seven kicks, six drifts.
-KICKS_4 = _mirrored_odd((0.0829844064174052, 0.396309801498368, -0.0390563049223486))
-DRIFTS_4 = _mirrored_even((0.245298957184271, 0.604872665711080))
+KICKS_4 = mirrored((0.0829844064174052, 0.396309801498368, -0.0390563049223486))
+DRIFTS_4 = mirrored((0.245298957184271, 0.604872665711080), 2)
 
 #: SRKN_11^b: twelve kicks, eleven drifts.
-KICKS_6 = _mirrored_even(
-    (0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807, -0.0115113874206879)
+KICKS_6 = mirrored(
+    (0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807, -0.0115113874206879), 2
 )
-DRIFTS_6 = _mirrored_odd(
-    (0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928)
-)
+DRIFTS_6 = mirrored((0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928))
 
 #: SRKN_14^a: fourteen kicks, fifteen drifts.
-KICKS_6A = _mirrored_even(
+KICKS_6A = mirrored(
     (
         0.09171915262446165,
         0.183983170005006,
@@ -47,9 +33,10 @@ KICKS_6A = _mirrored_even(
         0.004914688774712854,
         0.143761127168358,
         0.328567693746804,
-    )
+    ),
+    2,
 )
-DRIFTS_6A = _mirrored_odd(
+DRIFTS_6A = mirrored(
     (
         0.0378593198406116,
         0.102635633102435,

@@ -6,12 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import SEEK_END, BytesIO
 from os import PathLike
 from pathlib import Path
-from struct import Struct
 from typing import Any, BinaryIO
-from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +16,11 @@ from numpy.typing import ArrayLike
 from kcons.constraints.arguments import as_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, InputError, NonFiniteError, OverdeterminedError
+from kcons.errors import CertificateError, InputError, OverdeterminedError
 from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
-from kcons.steppers.files import in_one_piece
-from kcons.steppers.stages.compensated_steps import all_finite, beyond
+from kcons.steppers.files import in_one_piece, stored_arrays
+from kcons.steppers.stages.compensated_steps import beyond, check_finite
 from kcons.steppers.stages.drifts import Drift, GreatCircles, rattle_drift
 from kcons.steppers.stages.friction import Friction
 from kcons.steppers.stages.fused_stages import Flights
@@ -39,8 +36,6 @@ START_TOLERANCE = 1e-9
 KICK_ROUNDING = 64 * float(np.finfo(float).eps)
 
 _FLOAT = np.dtype(np.float64)
-#: The record at the end of an archive without comment; the fifth number is how many files there are.
-_LAST_RECORD = Struct("<4s4H2LH")
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -138,7 +133,7 @@ class State:
             with Path(file).open("rb") as opened:
                 return cls.load(opened)
         try:
-            return cls(**_checked(_stored(file)))
+            return cls(**_checked(stored_arrays(file)))
         except Exception as error:  # a damaged archive raises whatever its bytes lead to
             name = getattr(file, "name", "the file")
             raise InputError(f"{name} holds no state written by State.save: {error}", item="file") from error
@@ -167,25 +162,6 @@ class _Shown(State):
 
 def _lent(array: FloatArray | None) -> FloatArray | None:
     return None if array is None else lent(array)
-
-
-def _stored(file: BinaryIO) -> dict[str, Any]:
-    """The arrays of an archive, each with its checksum compared."""
-    found: dict[str, Any] = {}
-    with ZipFile(file) as archive:
-        # A damaged entry of the directory may hide the next one; its last record says how many there are.
-        file.seek(-_LAST_RECORD.size, SEEK_END)
-        count = _LAST_RECORD.unpack(file.read(_LAST_RECORD.size))[4]
-        if count != len(archive.namelist()):
-            raise ValueError(f"{len(archive.namelist())} arrays are listed of {count}")
-        for name in archive.namelist():
-            # Read whole: what `numpy.load` does not look at, it does not check either.
-            content = BytesIO(archive.read(name))
-            array = np.lib.format.read_array(content, allow_pickle=False)
-            if content.read(1):
-                raise ValueError(f"{name} is longer than what it holds")
-            found[name.removesuffix(".npy")] = array if array.ndim else array.item()
-    return found
 
 
 def _checked(values: dict[str, Any]) -> dict[str, Any]:
@@ -329,9 +305,9 @@ class System:
         """
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
-        x = self._array(positions, "positions")
+        x = _finite_array(positions, self.n_atoms, "positions")
         given = velocities is not None
-        v = self._array(velocities, "velocities") if given else np.zeros_like(x)
+        v = _finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
             return State(x, v, time)
@@ -498,31 +474,18 @@ class System:
         atoms = self._free_of_origin
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
 
-    def _array(self, values: ArrayLike | None, item: str) -> FloatArray:
-        array: FloatArray = np.array(numbers(values, item), order="C")
-        if array.shape != (self.n_atoms, 3):
-            raise InputError(f"{item} must have shape ({self.n_atoms}, 3), not {array.shape}", item=item)
-        bad = ~np.isfinite(array).all(axis=1)
-        if bad.any():
-            atom = int(np.argmax(bad))
-            raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
-        return array
+
+def _finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
+    array: FloatArray = np.array(numbers(values, item), order="C")
+    if array.shape != (n_atoms, 3):
+        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
+    return array
 
 
 def _fixed_atoms(motion: Motion) -> IntArray:
     held = [c.atoms.ravel() for c in motion.constraint_set.constraints if c.family == "FixedAtoms"]
     return np.unique(np.concatenate(held)) if held else np.zeros(0, dtype=np.int64)
-
-
-def check_finite(values: FloatArray, item: str, step: int) -> None:
-    """Raise `NonFiniteError` unless every number is finite."""
-    if all_finite(values):
-        return
-    atom = int(np.argmax(~np.isfinite(values).all(axis=1)))
-    raise NonFiniteError(
-        f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
-        "check the geometry and the force function there, or use a smaller time step",
-        item=item,
-        atom=atom,
-        step=step,
-    )

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from kcons.errors import ConvergenceError, InputError
+from kcons.steppers.operations import Operation
 from kcons.steppers.state import State, System
 
 
@@ -46,6 +47,25 @@ class Stepper(Protocol):
         ...
 
 
+class Listed:
+    """Base of those whose step is a list of operations."""
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        """What a step consists of.
+
+        Parameters
+        ----------
+        system : System, optional
+            What it makes of the step: great circles, friction, forces that depend on velocities. Without it, what
+            the step consists of where forces depend on positions and time only.
+        """
+        raise NotImplementedError
+
+    def listing(self, system: System | None = None) -> str:
+        """A step in words, a line for each operation, with fractions of the step; `system` as for `operations`."""
+        return "\n".join([f"a step of {self!r}", *(f"  {operation}" for operation in self.operations(system))])
+
+
 def stays(state: State, dt: float) -> State | None:
     """The state after a step of zero, None for any other step.
 
@@ -75,14 +95,11 @@ def explained(error: ConvergenceError, system: System, state: State, dt: float, 
         cause = "a held dihedral becomes undefined"
     else:
         cause = f"time step too large (dt = {dt:g})"
-    return type(error)(
-        f"step {number}: {cause}. {error}",
-        residual=error.residual,
-        tolerance=error.tolerance,
-        iterations=error.iterations,
-        row=error.row,
-        atoms=error.atoms,
-        cluster=error.cluster,
-        step=number,
-        singular=error.singular,
-    )
+    return retold(error, f"step {number}: {cause}. {error}", type(error), number)
+
+
+def retold(error: ConvergenceError, message: str, kind: type[ConvergenceError], step: int) -> ConvergenceError:
+    """The same in other words."""
+    told = kind(message)
+    vars(told).update(vars(error), step=step)
+    return told

@@ -7,15 +7,16 @@ import math
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
-from kcons.steppers.stages.compensated_steps import Point
-from kcons.steppers.state import check_finite
-from kcons.steppers.stepper import explained, stays
+from kcons.steppers.executors.piecewise import ArrayStep
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, drifts_of
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
 
 
-class Langevin:
+class Langevin(Listed):
     """Canonical sampling on constraints: kick, drift, friction and noise, drift, kick (g-BAOAB).
 
     Friction and noise act on velocities in the tangent plane, v = M_par^+ M (e^{-gamma dt} v + noise), exactly; the
@@ -81,10 +82,16 @@ class Langevin:
         self.conserve_momentum = bool(conserve_momentum)
         self._bits = np.random.Philox(0)
         self._normal = np.random.Generator(self._bits)
+        self._substeps = _geodesic_baoab((1.0 / self.substeps,) * self.substeps)
+        self._great_circles = _geodesic_baoab((1.0,), exact=True)
         self._open: tuple[System, FloatArray] | None = None
 
     def __repr__(self) -> str:
         return f"Langevin({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}, substeps={self.substeps})"
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        exact = system is not None and system.great_circles is not None
+        return self._great_circles if exact else self._substeps
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
@@ -111,71 +118,10 @@ class Langevin:
         if dt < 0:
             raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
         carried(state, 1, "Langevin")
-        start = system.with_forces(state)
-        number = state.step + 1
-        time, time_remainder = state.later(dt)
-        middle = state.time + (0.5 * dt + state.time_remainder)
-        motion = system.motion
-        shift = None
-        x, v, f = system.taken(start)
-        if start.remainder is not None:
-            shift = x[system.anchor]
-            x = (x - shift) + start.remainder
         with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            try:
-                assert f is not None
-                v = v + (0.5 * dt) * (f * system.inverse_masses)
-                x, v = self._fly(system, x, v, state.time, middle, 0.5 * dt)
-                v, heat = self._exchange(system, x, v, middle, dt, number)
-                x, v = self._fly(system, x, v, middle, time, 0.5 * dt)
-                check_finite(x, "position", number)
-                positions = x if shift is None else x + shift
-                forces = system.forces(positions, v, time, number)
-                v += (0.5 * dt) * (forces * system.inverse_masses)
-                check_finite(v, "velocity", number)
-                motion.project_velocities(x, v, time=time, out=v)
-            except ConvergenceError as error:
-                raise explained(error, system, state, dt, number) from error
-        before = 0.0 if state.thermostat is None else float(state.thermostat[0])
-        remainder = None if shift is None else x - (positions - shift)
-        return State(positions, v, time, forces, number, remainder, time_remainder, np.array([before + heat]))
+            return LangevinStep(system, system.with_forces(state), dt, self).through(self.operations(system))
 
-    def _fly(
-        self, system: System, x: FloatArray, v: FloatArray, start: float, end: float, h: float
-    ) -> tuple[FloatArray, FloatArray]:
-        circles = system.great_circles
-        flight, count = (system.drift, self.substeps) if circles is None else (circles, 1)
-        point = Point(x, v, system.weights, exact=count > 1 or circles is not None)
-        now = start
-        for k in range(1, count + 1):
-            then, now = now, end if k == count else start + k * (end - start) / count
-            flight.move(point, np.empty_like(x), then, now, h / count)
-        point.land()
-        return point.x, point.v
-
-    def _exchange(
-        self, system: System, x: FloatArray, v: FloatArray, time: float, dt: float, number: int
-    ) -> tuple[FloatArray, float]:
-        """Friction and noise in the tangent plane at x, and the heat they bring."""
-        motion = system.motion
-        v = motion.project_velocities(x, v, time=time, out=v)
-        before = system.kinetic_energy(v)
-        keep = math.exp(-self.friction * dt)
-        spread = math.sqrt(-math.expm1(-2 * self.friction * dt) * self.thermal_energy)
-        noise = self._drawn(number, v.shape)
-        noise *= spread * np.sqrt(system.inverse_masses)
-        # What friction does not act on: velocities that the targets demand, and of the centre of mass.
-        kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
-        if self.conserve_momentum:
-            directions = self._directions(system, x, time)
-            noise -= drift_velocity(noise, system.masses, directions)
-            drift = drift_velocity(v if kept is None else v - kept, system.masses, directions)
-            kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
-        noise += keep * v if kept is None else kept + keep * (v - kept)
-        after = motion.project_velocities(x, noise, time=time, out=noise)
-        return after, system.kinetic_energy(after) - before
-
-    def _drawn(self, number: int, shape: tuple[int, ...]) -> FloatArray:
+    def drawn(self, number: int, shape: tuple[int, ...]) -> FloatArray:
         """Normal numbers that are a function of the seed and of the number of the step."""
         # A counter-based generator, set to the step's own stretch of the seed's stream.
         bits = self._bits
@@ -192,7 +138,8 @@ class Langevin:
         }
         return self._normal.standard_normal(shape)
 
-    def _directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
+    def directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
+        """Those in which no row knows a place in space."""
         if self._open is None or self._open[0] is not system:
             self._open = (system, open_directions(system.motion, x, time))
         return self._open[1]
@@ -200,3 +147,58 @@ class Langevin:
     def conserved_energy(self, system: System, state: State) -> float:
         """Total energy less the heat that has flowed in."""
         return system.total_energy(state) - (0.0 if state.thermostat is None else float(state.thermostat[0]))
+
+
+def _geodesic_baoab(flight: tuple[float, ...], *, exact: bool = False) -> tuple[Operation, ...]:
+    first, second = drifts_of((0.5, 0.5), flight, exact=exact)
+    return Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project()
+
+
+class LangevinStep(ArrayStep):
+    """A step on its way, velocities on the constraints after each drift."""
+
+    def __init__(self, system: System, start: State, dt: float, thermostat: Langevin) -> None:
+        super().__init__(system, start, dt)
+        self.thermostat = thermostat
+        self.heat = 0.0 if start.thermostat is None else float(start.thermostat[0])
+
+    def kick(self, operation: Kick) -> None:
+        assert self.forces is not None
+        self.v = self.v + (operation.fraction * self.dt) * (self.forces * self.system.inverse_masses)
+
+    def pieces(self, operation: Fly) -> list[tuple[float, float]]:
+        begin, end, count = self.now, self.frame.at(operation.ends[-1]), len(operation.flights)
+        h, time = operation.fraction * self.dt / count, end - begin
+        return [*((h, begin + k * time / count) for k in range(1, count)), (h, end)]
+
+    def exchange(self, operation: Exchange) -> None:
+        """Friction and noise in the tangent plane, and the heat they bring."""
+        system, motion, thermostat = self.system, self.system.motion, self.thermostat
+        x, time, dt = self.x, self.now, operation.fraction * self.dt
+        v = motion.project_velocities(x, self.v, time=time, out=self.v)
+        before = system.kinetic_energy(v)
+        keep = math.exp(-thermostat.friction * dt)
+        spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
+        noise = thermostat.drawn(self.number, v.shape)
+        noise *= spread * np.sqrt(system.inverse_masses)
+        # What friction does not act on: velocities that the targets demand, and of the centre of mass.
+        kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
+        if thermostat.conserve_momentum:
+            directions = thermostat.directions(system, x, time)
+            noise -= drift_velocity(noise, system.masses, directions)
+            drift = drift_velocity(v if kept is None else v - kept, system.masses, directions)
+            kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
+        noise += keep * v if kept is None else kept + keep * (v - kept)
+        self.v = motion.project_velocities(x, noise, time=time, out=noise)
+        self.heat += system.kinetic_energy(self.v) - before
+
+    def evaluate(self, operation: Operation) -> None:
+        check_finite(self.x, "position", self.number)
+        super().evaluate(operation)
+
+    def project(self, operation: Operation) -> None:
+        check_finite(self.v, "velocity", self.number)
+        self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+
+    def end(self) -> State:
+        return self.frame.closed(self.x, self.v, self.forces, np.array([self.heat]))

@@ -11,8 +11,9 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
+from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
-from kcons.steppers.stepper import stays
+from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import (
     Momentum,
     carried,
@@ -25,9 +26,11 @@ from kcons.thermostats.freedom import (
 #: Suzuki's fractions of order 4 for the motion of the chain.
 _SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 FRACTIONS = (_SHARE, _SHARE, 1.0 - 4.0 * _SHARE, _SHARE, _SHARE)
+#: What comes before a step on the constraints, and after it.
+HALF = Chain(0.5)
 
 
-class NoseHooverChain:
+class NoseHooverChain(Listed):
     """Canonical dynamics without noise: half a step of the chain, a step on the constraints, half a step of the chain.
 
     The chain scales velocities, which stay tangent to rows that rest. Degrees of freedom are counted by rank, less
@@ -93,6 +96,9 @@ class NoseHooverChain:
     def __repr__(self) -> str:
         return f"NoseHooverChain({self.thermal_energy!r}, {self.period!r}, length={self.length})"
 
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return HALF, *self.stepper.operations(system), HALF
+
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for rows whose targets demand velocities, velocity-dependent forces, or friction."""
         refuse_friction(system)
@@ -152,7 +158,9 @@ class NoseHooverChain:
         assert thermostat is not None
         chain = thermostat.copy()
         masses = self._masses(float(chain[-1]))
-        scale = _advance(chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, 0.5 * dt, FRACTIONS)
+        scale = _advance(
+            chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, HALF.fraction * dt, FRACTIONS
+        )
         if not math.isfinite(scale):
             raise OverflowError
         return v * scale, chain

@@ -11,6 +11,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.errors import NonFiniteError
 from kcons.solvers.kernels.array_views import bits, flat
 
 #: Stands for the work arrays where a step adds up nothing.
@@ -66,10 +67,10 @@ class Point:
         if self.x_low is None:
             before = self.v
             if self.fresh:
-                self.v = self.push = np.empty_like(before)
+                self.v = self.push = np.empty(before.shape)
             sound = fly_once(self.x, before, kick, force, self.weights, h, self.v, out)
         elif self.fresh:
-            before, self.v = self.v, np.empty_like(self.v)
+            before, self.v = self.v, np.empty(self.v.shape)
             sound = fly_first(self.x, self.x_low, before, self.v, self.push, kick, force, self.weights, h, out)
         else:
             sound = fly(self.x, self.x_low, self.v, self.push, kick, force, self.weights, h, out)
@@ -120,6 +121,20 @@ def all_finite(values):  # type: ignore[no-untyped-def]
     for i in range(numbers.size):
         worst = max(worst, numbers[i] & 0x7FF0000000000000)
     return worst != 0x7FF0000000000000
+
+
+def check_finite(values: FloatArray, item: str, step: int) -> None:
+    """Raise `NonFiniteError` unless every number is finite."""
+    if all_finite(values):
+        return
+    atom = int(np.argmax(~np.isfinite(values).all(axis=1)))
+    raise NonFiniteError(
+        f"non-finite {item} at step {step} on atom {atom}: {values[atom]}. The state before this step is intact; "
+        "check the geometry and the force function there, or use a smaller time step",
+        item=item,
+        atom=atom,
+        step=step,
+    )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -22,7 +22,17 @@ from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.kernels.array_views import piece
 from kcons.solvers.rigid_triangles import RigidTriangles
-from kcons.steppers.stages.compensated_steps import Point, add_kick, all_finite, beyond, fly, fly_first, fly_once, land
+from kcons.steppers.stages.compensated_steps import (
+    Point,
+    add_kick,
+    all_finite,
+    beyond,
+    check_finite,
+    fly,
+    fly_first,
+    fly_once,
+    land,
+)
 
 #: Rows, besides those of triangles, up to which one kernel for all shapes is faster than the engine's for each shape.
 MOST_ROWS = 96
@@ -49,29 +59,51 @@ _MANY = (
 )
 #: Of a stage that is not flown.
 NO_FRACTIONS = np.empty(0)
-#: What it reports of the end of a step; less than 0 where the engine has to do it.
-_WHAT = ("", "force", "position", "velocity", "far")
+#: What it reports of the end of a step but 0; less than that where the engine has to do it.
+_BAD_FORCE, _BAD_POSITION, _BAD_VELOCITY, _FAR = 1, 2, 3, 4
 
 
-class Flights:
-    """Stages of a step for one engine.
+class Tables:
+    """What compiled stages need to know of one engine.
 
     Parameters
     ----------
     motion : Motion
     found : tuple
-        All its rows, from `solvers.fused_distances`, 1/m for each coordinate, the atoms that show whether the system is
-        far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
+        All its rows, and more, from `packed_rows`.
     """
 
     def __init__(self, motion: Motion, found: Packed) -> None:
         self.motion = motion
         self._tables = found
         self._cell = motion.cell
-        #: Iterations that the engine has been told of.
-        self.took = _UNKNOWN
         self._lattice = motion.lattice
         set_lattice(found[0], self._lattice)
+
+    def tables(self) -> Packed:
+        """What the kernels need to know, for one step: the rows, and the cell as it is now."""
+        lattice = self._cell()
+        if lattice is not self._lattice:
+            self._lattice = lattice
+            set_lattice(self._tables[0], lattice)
+        return self._tables
+
+
+class Flights(Tables):
+    """Stages of a step for one engine.
+
+    Parameters
+    ----------
+    motion : Motion
+    found : tuple
+        All its rows, from `packed_rows`, 1/m for each coordinate, the atoms that show whether the system is
+        far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
+    """
+
+    def __init__(self, motion: Motion, found: Packed) -> None:
+        super().__init__(motion, found)
+        #: Iterations that the engine has been told of.
+        self.took = _UNKNOWN
         self._kernels: dict[Any, Any] = {}
 
     @classmethod
@@ -90,14 +122,6 @@ class Flights:
         """
         found = packed_rows(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
         return None if found is None else cls(motion, found)
-
-    def tables(self) -> Packed:
-        """What the kernels need to know, for one step: the rows, and the cell as it is now."""
-        lattice = self._cell()
-        if lattice is not self._lattice:
-            self._lattice = lattice
-            set_lattice(self._tables[0], lattice)
-        return self._tables
 
     @property
     def one(self) -> Any:
@@ -120,35 +144,32 @@ class Flights:
             found = self._kernels[function] = function.compile((*types, *flags))
         return found
 
-    def move(self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, tables: Packed) -> str:
+    def move(
+        self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, number: int, tables: Packed
+    ) -> None:
         """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.
-
-        Returns
-        -------
-        str
-            Empty, or "force" where that of the kick is not finite.
 
         Raises
         ------
-        ConvergenceError
-            As a flight by the engine.
+        ConvergenceError, NonFiniteError
+            As `landed`.
         """
         kick, force = point.take_kick()
         x, before, fresh = point.x, point.v, point.fresh
         if fresh:
-            point.v = np.empty_like(before)
+            point.v = np.empty(before.shape)
             if point.x_low is None:
                 point.push = point.v
             point.fresh = False
         v, work = point.v, point.work
         if len(work):
-            found = many_flights(FLY, fractions, dt, 0, x, before, v, work, 0.0, kick, force, fresh, out, *tables)
+            found = self.many(FLY, fractions, dt, 0, x, before, v, work, 0.0, kick, force, fresh, out, *tables)
         else:
-            found = one_flight(FLY, dt, x, before, v, 0.0, kick, force, out, *tables)
-        bad = self.landed(found, fractions, dt, x, v, work, force, out, time, tables)
-        if not bad:
-            point.x = out
-        return bad
+            found = self.one(FLY, dt, x, before, v, 0.0, kick, force, out, *tables)
+        if found != self.took:
+            point.sound = found != _FORCE
+            self.landed(found, fractions, dt, x, v, work, force, out, time, number, tables)
+        point.x = out
 
     def landed(
         self,
@@ -161,22 +182,31 @@ class Flights:
         force: FloatArray,
         out: FloatArray,
         time: float,
+        number: int,
         tables: Packed,
-    ) -> str:
+    ) -> int:
         """What `one_flight` or `many_flights` left to do, from what it reports and the rest of what it was given.
 
         Parameters
         ----------
-        time : float
-            For messages: nothing that is held here moves.
+        time, number : float, int
+            Of the end of the stage, and of the step; for messages.
 
-        Returns, Raises
-        ---------------
-        As `move`.
+        Returns
+        -------
+        int
+            Iterations, as `took`.
+
+        Raises
+        ------
+        ConvergenceError
+            As a flight by the engine.
+        NonFiniteError
+            The force of the kick is not finite.
         """
         while found < 0:
             if found == _FORCE:
-                return "force"
+                check_finite(force, "force", number)
             at = _ENGINE - found
             ends, starts, push, h = out, x, v, dt
             if len(work):
@@ -185,39 +215,55 @@ class Flights:
             self.took = _UNKNOWN
             self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
             if at + 1 == len(fractions):
-                return ""
-            found = many_flights(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, *tables)
+                return self.took
+            found = self.many(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, *tables)
         if found != self.took:
             self.took = found
             self.motion.took(found)
-        return ""
+        return found
 
-    def end(
-        self, dt: float, x: FloatArray, v: FloatArray, work: FloatArray, kick: float, force: FloatArray, tables: Packed
-    ) -> int:
-        """The last kick of a step, and its velocities projected; 0, or what `ended` has to do."""
+    def end(self, point: Point, dt: float, time: float, number: int, tables: Packed) -> None:
+        """The last kick of a step, which the point has not taken yet, and its velocities projected.
+
+        Raises
+        ------
+        ConvergenceError, NonFiniteError
+            As `ended`.
+        """
+        kick, force = point.take_kick()
+        x, v, work = point.x, point.v, point.work
         if len(work):
-            return int(many_flights(END, NO_FRACTIONS, dt, 0, x, v, v, work, kick, 0.0, force, False, x, *tables))
-        return int(one_flight(END, dt, x, v, v, kick, 0.0, force, x, *tables))
+            found = self.many(END, NO_FRACTIONS, dt, 0, x, v, v, work, kick, 0.0, force, False, x, *tables)
+        else:
+            found = self.one(END, dt, x, v, v, kick, 0.0, force, x, *tables)
+        if found:
+            point.sound = found != _BAD_FORCE
+            self.ended(found, x, v, force, time, number, tables)
 
-    def ended(self, found: int, x: FloatArray, v: FloatArray, time: float, tables: Packed) -> str:
-        """What `end` left to do, from what it reports and what it was given.
+    def ended(
+        self, found: int, x: FloatArray, v: FloatArray, force: FloatArray, time: float, number: int, tables: Packed
+    ) -> bool:
+        """What an `END` left to do, from what it reports and what it was given.
 
         Returns
         -------
-        str
-            Empty; what is not finite ("force", "position" or "velocity"); or "far", if all is well but so far from
-            the origin that the next step is made relative to an atom.
+        bool
+            Whether all is so far from the origin that the next step is made relative to an atom.
 
         Raises
         ------
         ConvergenceError
             As `Motion.project_velocities`.
+        NonFiniteError
+            Forces, positions or velocities are not finite.
         """
         if found < 0:
             self.motion.project_velocities(x, v, time=time, out=v)
             found = _after(x, v, tables[0])
-        return _WHAT[found]
+        if _BAD_FORCE <= found <= _BAD_VELOCITY:
+            values, item = ((force, "force"), (x, "position"), (v, "velocity"))[found - _BAD_FORCE]
+            check_finite(values, item, number)
+        return found == _FAR
 
 
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
@@ -341,16 +387,16 @@ def many_flights(  # type: ignore[no-untyped-def]
 def _ended(sound, x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
     """Velocities projected after a kick, sound or not; 0, or what `Flights.ended` has to do."""
     if not sound:
-        return 1
+        return _BAD_FORCE
     if not all_finite(x):
-        return 2
+        return _BAD_POSITION
     return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains) else -1
 
 
 @numba.njit(cache=True, nogil=True)
 def _after(x, v, tables):  # type: ignore[no-untyped-def]
     if not all_finite(v):
-        return 3
+        return _BAD_VELOCITY
     header = tables.view(np.int64)
     held, far = piece(tables.view(np.uint32), header, MORE + 1), piece(tables, header, MORE + 2)
-    return 4 if held.size and beyond(x, held, held[0], far[0]) else 0
+    return _FAR if held.size and beyond(x, held, held[0], far[0]) else 0

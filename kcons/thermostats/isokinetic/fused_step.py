@@ -12,11 +12,11 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.motion.motion import MANY_ITERATIONS
-from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import piece
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import all_finite
-from kcons.steppers.stages.fused_stages import packed_rows
+from kcons.steppers.stages.fused_stages import Tables, packed_rows
 from kcons.thermostats.isokinetic.kick import after_drift, before_drift
 
 #: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
@@ -26,7 +26,7 @@ MANY = 1e4
 DONE, FORCE, POSITION, VELOCITY, KICK, ENGINE = range(6)
 
 
-class IsokineticStages:
+class IsokineticStages(Tables):
     """Compiled halves of a step for one system.
 
     Parameters
@@ -38,10 +38,8 @@ class IsokineticStages:
     """
 
     def __init__(self, system: System, found: Packed) -> None:
-        self._motion, self._shape = system.motion, (system.n_atoms, 3)
-        self._tables = found
-        self._lattice = system.motion.lattice
-        set_lattice(found[0], self._lattice)
+        super().__init__(system.motion, found)
+        self._shape = (system.n_atoms, 3)
 
     @classmethod
     def of(cls, system: System, masses: FloatArray, others: bool) -> IsokineticStages | None:
@@ -59,14 +57,6 @@ class IsokineticStages:
             return None
         found = packed_rows(system.motion, system.weights.ravel(), masses.ravel(), np.array([float(others)]))
         return None if found is None else cls(system, found)
-
-    def tables(self) -> Packed:
-        """What the kernels need to know, for one step: the rows, masses, and the cell as it is now."""
-        lattice = self._motion.cell()
-        if lattice is not self._lattice:
-            self._lattice = lattice
-            set_lattice(self._tables[0], lattice)
-        return self._tables
 
     def before(
         self,
@@ -103,7 +93,7 @@ class IsokineticStages:
         place, speed = np.empty(self._shape), np.empty(self._shape)
         status, log_growth, iterations = kick_and_fly(x, u, f, square, twice, t, h, speed, place, *tables)
         if status == DONE:
-            self._motion.took(iterations)
+            self.motion.took(iterations)
         return status, place, speed, log_growth
 
     def after(

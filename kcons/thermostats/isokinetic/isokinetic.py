@@ -14,10 +14,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.steppers import Splitting, State, System
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
-from kcons.steppers.stepper import explained, stays
+from kcons.steppers.operations import Evaluate, Kick, Operation, Project, Turn, mirrored, splitting
+from kcons.steppers.stepper import stays
 from kcons.thermostats.freedom import (
     Freedom,
     Momentum,
@@ -28,7 +29,7 @@ from kcons.thermostats.freedom import (
     warn_of_conserved_momenta,
 )
 from kcons.thermostats.isokinetic import kick as closed_form
-from kcons.thermostats.isokinetic.step import SMALLEST, IsokineticStep, Share, compiled_step, left_for, split
+from kcons.thermostats.isokinetic.step import SMALLEST, Share, isokinetic_step, left_for, split
 
 Convention = Literal["exact", "notes"]
 
@@ -41,24 +42,13 @@ _S10 = (0.0502627644003922, 0.413514300428344, 0.0450798897943977, -0.1880548538
 _S10_OTHER = (0.148816447901042, -0.132385865767784, 0.067307604692185, 0.432666402578175)
 
 
-def _around(half: tuple[float, ...]) -> tuple[float, ...]:
-    """The first fractions, one in the middle, and their mirror image."""
-    return (*half, math.fsum([1.0, *(-2.0 * a for a in half)]), *reversed(half))
-
-
-def _doubled(half: tuple[float, ...]) -> tuple[float, ...]:
-    """The first fractions, two equal ones in the middle, and their mirror image."""
-    middle = math.fsum([0.5, *(-b for b in half)])
-    return (*half, middle, middle, *reversed(half))
-
-
 #: Kicks, drifts, and the composition each drift is flown by, for each order. Kicks are quadratic in the velocities, so
 #: that the Runge-Kutta-Nystrom splittings of `kcons.steppers` lose their order here; these hold for any two flows
 #: (S_6 and S_10 of Blanes and Moan).
 SCHEMES: dict[int, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {
     2: ((0.5, 0.5), (1.0,), (1.0,)),
-    4: (_around(_S6), _doubled(_S6_OTHER), SUZUKI_4),
-    6: (_around(_S10), _doubled(_S10_OTHER), KAHAN_LI_6),
+    4: (mirrored(_S6), mirrored(_S6_OTHER, 2), SUZUKI_4),
+    6: (mirrored(_S10), mirrored(_S10_OTHER, 2), KAHAN_LI_6),
 }
 
 
@@ -142,7 +132,13 @@ class Isokinetic(Splitting):
         self.atoms = None if atoms is None else np.asarray(atoms)
         self.momentum: Momentum = momentum
         self._shares: tuple[System, Share] | None = None
-        self._one_flight = len(self.drifts) == len(self.flight) == 1
+        operations: list[Operation] = []
+        for operation in splitting(*SCHEMES[order]):
+            # Velocities are on the constraints whenever they turn.
+            operations += [Turn(operation.fraction)] if isinstance(operation, Kick) else [operation]
+            if isinstance(operation, Evaluate):
+                operations.append(Project())
+        self._operations = tuple(operations[:-1])
 
     def __repr__(self) -> str:
         given = [f"{self.thermal_energy!r}"] if self.thermal_energy is not None else []
@@ -155,6 +151,9 @@ class Isokinetic(Splitting):
         if self.atoms is not None:
             given.append(f"atoms=<{len(self.atoms)} atoms>")
         return f"Isokinetic({', '.join(given)})"
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        return self._operations
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
@@ -247,16 +246,7 @@ class Isokinetic(Splitting):
         still = stays(state, dt) if dt == 0 or not math.isfinite(dt) else None
         if still is not None:
             return still
-        begin, share = self.start(system, state), self._share(system)
-        try:
-            if share.stages is not None and self._one_flight:
-                after = compiled_step(system, share, begin, dt, self.kicks, self._stages[0])
-                if after is not None:
-                    return after
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # checked, with the step's number
-                return IsokineticStep(system, share, begin, dt).through(self.kicks, self._stages)
-        except ConvergenceError as error:
-            raise explained(error, system, state, dt, begin.step + 1) from error
+        return isokinetic_step(system, self._share(system), self.start(system, state), dt, self._operations)
 
     # -- what can be read -----------------------------------------------------------------------
 

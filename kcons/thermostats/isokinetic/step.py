@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from kcons.constraints.arguments import lent
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
-from kcons.steppers.splitting import Stage
-from kcons.steppers.stages.compensated_steps import Point
-from kcons.steppers.state import check_finite
+from kcons.steppers.executors.frame import Frame
+from kcons.steppers.executors.piecewise import ArrayStep
+from kcons.steppers.operations import Fly, Operation, Project, Turn
+from kcons.steppers.stages.compensated_steps import Point, check_finite
 from kcons.thermostats.freedom import atom_numbers
 from kcons.thermostats.isokinetic import kick as closed_form
 from kcons.thermostats.isokinetic.fused_step import (
@@ -30,6 +32,8 @@ from kcons.thermostats.isokinetic.fused_step import (
 
 #: Kinetic energy below which v.f/2K may overflow.
 SMALLEST = 1e-290
+#: Operations of a step with one drift.
+FEWEST = 5
 _MAX_ITERATIONS = 50
 _WHAT = {FORCE: "force", POSITION: "position", VELOCITY: "velocity"}
 
@@ -87,10 +91,7 @@ class Share:
     def push_square(self, system: System, state: State) -> float:
         """f . M_par^+ f at the state."""
         assert state.forces is not None
-        x = state.positions
-        if state.remainder is not None:
-            x = (x - x[system.anchor]) + state.remainder
-        pace = paced(system, x, state.forces, state.time)
+        pace = paced(system, Frame(system, state, 0.0).x, state.forces, state.time)
         return float(closed_form.square_sum(pace, self.masses))
 
 
@@ -110,184 +111,157 @@ def _paced(system: System, x: FloatArray, forces: FloatArray, time: float) -> Fl
 
 # As a decorator this costs half of a `with`. What overflows is looked for, and named with the step's number.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def compiled_step(
-    system: System, share: Share, start: State, dt: float, kicks: tuple[float, ...], stage: Stage
+def isokinetic_step(system: System, share: Share, start: State, dt: float, operations: Sequence[Operation]) -> State:
+    """A step: in two compiled calls where that is possible and it has one flight, else an operation at a time."""
+    if share.stages is not None and len(operations) == FEWEST:
+        after = _compiled(system, share, share.stages, start, dt, operations)
+        if after is not None:
+            return after
+    return IsokineticStep(system, share, start, dt).through(operations)
+
+
+def _compiled(
+    system: System, share: Share, stages: IsokineticStages, start: State, dt: float, operations: Sequence[Operation]
 ) -> State | None:
     """A step of order 2 in two compiled calls; None, with nothing done, where the first of them cannot do its half."""
-    stages, force = share.stages, system.force
-    assert stages is not None and force is not None and start.forces is not None and start.thermostat is not None
-    x, u, f = system.taken(start)
+    force = system.force
+    assert force is not None and start.thermostat is not None
+    frame = Frame(system, start, dt)
+    f, number, tables = frame.forces, frame.number, stages.tables()
     assert f is not None
-    shift: FloatArray | None = None
-    if start.remainder is not None:
-        shift = x[system.anchor]
-        x = (x - shift) + start.remainder
     twice, integral, square, count = start.thermostat.tolist()
-    time, time_remainder = start.later(dt)
-    number, tables = start.step + 1, stages.tables()
+    turn, flight, _, _, last = operations
     status, there, speed, first_growth = stages.before(
-        x, u, f, square, twice, kicks[0] * dt, stage.fractions[0] * dt, tables
+        frame.x, frame.v, f, square, twice, turn.fraction * dt, flight.fraction * dt, tables
     )
     if status == POSITION:
         check_finite(there, "position", number)
     if status != DONE:
         return None
-    f = system.accepted(force(lent(there if shift is None else there + shift), time), number, True)
-    status, after, _, square, _, growth = stages.after(there, speed, f, twice, kicks[1] * dt, tables)
+    f = system.accepted(force(lent(frame.whole(there)), frame.time), number, True)
+    status, after, _, square, _, growth = stages.after(there, speed, f, twice, last.fraction * dt, tables)
     if status != DONE:
-        run = IsokineticStep(system, share, start, dt)
-        run.x, run.u, run.forces, run.now, run.integral = there, speed, f, time, integral + first_growth
-        run.last_kick(kicks[1] * dt)
-        return run.ended()
-    positions, remainder = there, None
-    if shift is not None:
-        positions = there + shift
-        remainder = there - (positions - shift)
-    thermostat = np.array([twice, integral + first_growth + growth, square, count])
-    return State(positions, after, time, f, number, remainder, time_remainder, thermostat)
+        rest = IsokineticStep(system, share, start, dt)
+        rest.x, rest.v, rest.forces, rest.now, rest.integral = there, speed, f, frame.time, integral + first_growth
+        return rest.through(operations[3:])
+    return frame.closed(there, after, f, np.array([twice, integral + first_growth + growth, square, count]))
 
 
-class IsokineticStep:
-    """The arrays of one step on its way: velocities v = drive + u, the drive None where targets rest."""
+class IsokineticStep(ArrayStep):
+    """A step on its way; velocities are drive + v, the drive None where targets rest."""
 
     def __init__(self, system: System, share: Share, start: State, dt: float) -> None:
-        self.system, self.share, self.dt = system, share, dt
+        super().__init__(system, start, dt)
+        assert start.thermostat is not None
+        self.share = share
         self.stages = share.stages if system.force is not None else None
         self.tables: tuple[Any, ...] = () if self.stages is None else self.stages.tables()
-        self.begin = start
-        self.number = start.step + 1
-        self.time, self.time_remainder = start.later(dt)
-        self.now = start.time
-        self.shift = None
-        x, self.u, forces = system.taken(start)
-        assert start.thermostat is not None and forces is not None
-        self.forces: FloatArray = forces
-        if start.remainder is not None:
-            self.shift = x[system.anchor]
-            x = (x - self.shift) + start.remainder
         self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
-        self.x = x
         self.drive: FloatArray | None = None
+        #: How long v must be, squared.
         self.left = self.twice
+        #: Whether v has to be projected before it turns.
+        self.askew = False
         if system.motion.plan.driven:
-            self.drive, self.u = split(system, x, self.u, self.now)
-            self._settle()
+            drive, self.v = split(system, self.x, self.v, self.now)
+            assert drive is not None
+            self.drive, self.left = drive, left_for(self.twice, share.square(drive), self.number)
 
-    def through(self, kicks: tuple[float, ...], stages: list[Stage]) -> State:
-        self.first_kick(kicks[0] * self.dt)
-        for fraction, stage in zip(kicks[1:], stages, strict=True):
+    # -- verbs ----------------------------------------------------------------------------------
+
+    def turn(self, operation: Turn) -> None:
+        """The kick: from velocities on the constraints, or projected in the same call."""
+        t = operation.fraction * self.dt
+        if not self.askew:
+            self._turn_before_drift(t)
+            return
+        self.askew = False
+        if self.stages is None or not self._project_and_turn(self.stages, t):
             if self.drive is None:
-                self.drift(stage)
-            else:
-                for piece in zip(stage.fractions, stage.ends, strict=True):
-                    self.driven_drift(piece)
-            if self.system.force is not None:
-                self.forces = self.system.forces(
-                    self.positions, self.velocities, self.now, self.number, finite=self.stages is None
-                )
-            self.last_kick(fraction * self.dt)
-        return self.ended()
+                self.v = self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+            self._turn_after_drift(t)
+            check_finite(self.v, "velocity", self.number)
 
-    def last_kick(self, t: float) -> None:
-        """Velocities projected, and a kick that leaves them on the constraints."""
-        if self.stages is None or not self._project_and_kick(self.stages, t):
-            self.project()
-            self.kick(t)
-            check_finite(self.u, "velocity", self.number)
+    def fly(self, operation: Fly) -> None:
+        if self.drive is None:
+            super().fly(operation)
+            check_finite(self.x, "position", self.number)
+            return
+        for h, end in self.pieces(operation):
+            self._driven_flight(h, end)
 
-    def ended(self) -> State:
-        v = self.velocities
-        positions, remainder = self.positions, None
-        if self.shift is not None:
-            remainder = self.x - (positions - self.shift)
+    def evaluate(self, operation: Operation) -> None:
+        if self.system.force is not None:
+            # Compiled projections look for NaN.
+            self.forces = self.system.forces(
+                self.frame.whole(self.x), self.v, self.now, self.number, finite=self.stages is None
+            )
+
+    def project(self, operation: Project) -> None:
+        """Left to the turn that follows."""
+        self.askew = True
+
+    def end(self) -> State:
+        v = self.v if self.drive is None else self.drive + self.v
         thermostat = np.array([self.twice, self.integral, self.push_square, self.count])
-        return State(positions, v, self.time, self.forces, self.number, remainder, self.time_remainder, thermostat)
+        return self.frame.closed(self.x, v, self.forces, thermostat)
 
-    @property
-    def positions(self) -> FloatArray:
-        return self.x if self.shift is None else self.x + self.shift
+    # -- turns ----------------------------------------------------------------------------------
 
-    @property
-    def velocities(self) -> FloatArray:
-        return self.u if self.drive is None else self.drive + self.u
-
-    def _settle(self) -> None:
-        """How long u must be."""
-        assert self.drive is not None
-        self.left = left_for(self.twice, self.share.square(self.drive), self.number)
-
-    # -- kicks ----------------------------------------------------------------------------------
-
-    def first_kick(self, t: float) -> None:
-        """The kick before the first drift, which takes out what the forces would do across the constraints."""
+    def _turn_before_drift(self, t: float) -> None:
+        """With forces as they are: the drift takes out what they would do across the constraints."""
         system, share = self.system, self.share
         if system.force is None:
             return
-        u = np.empty_like(self.u)
+        assert self.forces is not None
+        u = np.empty_like(self.v)
         log_growth, done = closed_form.before_drift(
-            self.u, self.forces, system.weights, share.masses, self.push_square, self.left, t, MANY, u
+            self.v, self.forces, system.weights, share.masses, self.push_square, self.left, t, MANY, u
         )
         if not done:
-            self.kick(t)
+            self._turn_after_drift(t)
             return
         if share.others is not None:
-            u = np.where(share.others, self.u + t * system.weights * self.forces, u)
-        self.u = u
+            u = np.where(share.others, self.v + t * system.weights * self.forces, u)
+        self.v = u
         self.integral += log_growth
 
-    def kick(self, t: float) -> None:
-        """Bring u, projected, to its length, and follow the closed form."""
+    def _turn_after_drift(self, t: float) -> None:
+        """Bring v, projected, to its length, and follow the closed form."""
         system, share = self.system, self.share
         if system.force is None:
-            factor = math.sqrt(self.left / share.square(self.u))
-            self.u = self.u * factor if share.others is None else np.where(share.others, self.u, self.u * factor)
+            factor = math.sqrt(self.left / share.square(self.v))
+            self.v = self._times(factor, self.v)
             self.integral -= math.log(factor)
             return
+        assert self.forces is not None
         pace = _paced(system, self.x, self.forces, self.now)
         u = np.empty_like(pace)
         self.push_square, factor, log_growth, done = closed_form.after_drift(
-            self.u, pace, share.masses, self.left, t, u
+            self.v, pace, share.masses, self.left, t, u
         )
         self.integral += log_growth
         if not done:
-            self._turn(pace, factor, t)
+            self._turn_against(pace, factor, t)
             return
         if share.others is not None:
-            u = np.where(share.others, self.u + t * pace, u)
-        self.u = u
+            u = np.where(share.others, self.v + t * pace, u)
+        self.v = u
 
-    def _turn(self, pace: FloatArray, factor: float, t: float) -> None:
+    def _turn_against(self, pace: FloatArray, factor: float, t: float) -> None:
+        """Where the force is strong and v runs against it."""
         share = self.share
-        u, growth = closed_form.turned(factor * self.u, pace, share.masses, self.left, t)
+        u, growth = closed_form.turned(factor * self.v, pace, share.masses, self.left, t)
         if share.others is not None:
-            u = np.where(share.others, self.u + t * pace, u)
-        self.u = u
+            u = np.where(share.others, self.v + t * pace, u)
+        self.v = u
         self.integral += growth
 
-    # -- drifts ---------------------------------------------------------------------------------
-
-    def drift(self, stage: Stage) -> None:
-        system = self.system
-        point = Point(self.x, self.u, system.weights, exact=len(stage.ends) > 1)
-        for fraction, end in zip(stage.fractions, stage.ends, strict=True):
-            then, self.now = self.now, self._time_at(end)
-            system.drift.move(point, np.empty_like(self.x), then, self.now, fraction * self.dt)
-        point.land()
-        check_finite(point.x, "position", self.number)
-        self.x, self.u = point.x, point.v
-
-    def project(self) -> None:
-        """Bring u onto the constraints after `drift`; where targets move it is there."""
-        if self.drive is None:
-            self.u = self.system.motion.project_velocities(self.x, self.u, time=self.now, out=self.u)
-
-    # -- both, in one call ----------------------------------------------------------------------
-
-    def _project_and_kick(self, stages: IsokineticStages, t: float) -> bool:
-        """What `project` and `kick` do; whether it was done."""
+    def _project_and_turn(self, stages: IsokineticStages, t: float) -> bool:
+        """A projection and the turn after it in one call; whether it was done."""
         assert self.forces is not None
         status, u, pace, square, factor, log_growth = stages.after(
-            self.x, self.u, self.forces, self.left, t, self.tables
+            self.x, self.v, self.forces, self.left, t, self.tables
         )
         if status == ENGINE:
             return False
@@ -296,25 +270,26 @@ class IsokineticStep:
         self.push_square = square
         self.integral += log_growth
         if status == KICK:
-            self._turn(pace, factor, t)
-            check_finite(self.u, "velocity", self.number)
+            self._turn_against(pace, factor, t)
+            check_finite(self.v, "velocity", self.number)
         else:
-            self.u = u
+            self.v = u
         return True
 
-    def driven_drift(self, piece: tuple[float, float]) -> None:
+    # -- moving targets ------------------------------------------------------------------------
+
+    def _driven_flight(self, h: float, now: float) -> None:
         """Moving targets do work: u is scaled by one factor before and after the flight, that which keeps K.
 
         So it is symmetric, of order 2 (Hairer, BIT 40, 726 (2000)).
         """
         system, share = self.system, self.share
         assert self.drive is not None
-        fraction, end = piece
-        then, now = self.now, self._time_at(end)
+        then = self.now
         log_factor, last = 0.0, math.inf
         for _ in range(_MAX_ITERATIONS):
-            point = Point(self.x, self.drive + self._times(math.exp(log_factor), self.u), system.weights, exact=False)
-            system.drift.move(point, np.empty_like(self.x), then, now, fraction * self.dt)
+            point = Point(self.x, self.drive + self._times(math.exp(log_factor), self.v), system.weights, exact=False)
+            system.drift.move(point, np.empty_like(self.x), then, now, h)
             check_finite(point.x, "position", self.number)
             drive, u = split(system, point.x, point.v, now)
             assert drive is not None
@@ -332,12 +307,8 @@ class IsokineticStep:
                 tolerance=1e-12,
                 iterations=_MAX_ITERATIONS,
             )
-        self.x, self.now, self.drive, self.u, self.left = point.x, now, drive, u, left
+        self.x, self.now, self.drive, self.v, self.left = point.x, now, drive, u, left
         self.integral -= 2 * log_factor
 
     def _times(self, factor: float, u: FloatArray) -> FloatArray:
         return u * factor if self.share.others is None else np.where(self.share.others, u, u * factor)
-
-    def _time_at(self, end: float) -> float:
-        start = self.begin
-        return self.time if end == 1.0 else start.time + (end * self.dt + start.time_remainder)

@@ -1,0 +1,148 @@
+"""Kicks and drifts in few compiled calls, each of which costs as much as its work on a few molecules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError, InputError
+from kcons.steppers.operations import Fly
+from kcons.steppers.stages.compensated_steps import NO_WORK, check_finite
+from kcons.steppers.stages.fused_stages import BOTH, END, FLY, NO_FRACTIONS, UNENDED, Flights
+from kcons.steppers.state import State, System
+from kcons.steppers.stepper import explained
+
+_FLOAT = np.dtype(np.float64)
+
+
+def fused_steps(
+    system: System, start: State, dt: float, steps: int, flights: Flights, kicks: Sequence[float], drifts: Sequence[Fly]
+) -> tuple[State, int]:
+    """As many steps K D K ... D K as can be joined: the state after them, and their number, which may be 0.
+
+    The end of a step and the beginning of the next are one call. Where that call cannot end the step, it and those
+    after it are left to the caller; one step alone is always made.
+
+    Parameters
+    ----------
+    start : State
+        With its forces.
+    steps : int
+        1 if the state has a remainder: the atom that positions are relative to moves.
+    kicks : sequence of float
+    drifts : sequence of Fly
+        One less, neither along great circles nor with friction.
+
+    Raises
+    ------
+    ConvergenceError, NonFiniteError
+        With `step`.
+    InputError
+        As of the force function.
+    """
+    # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
+    force, number, stage = system.force, start.step, drifts[0]
+    x, v, f = system.taken(start)
+    shape, shift = x.shape, None
+    if start.remainder is not None:
+        shift = x[system.anchor]
+        x = (x - shift) + start.remainder
+    if force is None or f is None:
+        kicks, f = (0.0,) * len(kicks), system.weights  # any finite numbers
+    first, last, fractions = kicks[0] * dt, kicks[-1] * dt, stage.lengths
+    later, work = None, NO_WORK
+    if len(drifts) * len(stage.flights) > 1:
+        later = list(zip(kicks[1:], drifts, drifts[1:], strict=False))
+        work = np.empty((3, *shape))
+    time, left_over, what, found, made = start.time, start.time_remainder, FLY, 0, 0
+    new, array, double, landed = np.empty, np.ndarray, _FLOAT, flights.landed
+    # Where this step begins and where the last one did. Nobody else knows their velocities, so that the arrays are
+    # used again.
+    here = before = x, v, time, left_over
+    u = spare = next_spare = new(shape)
+    if steps > 1:
+        spare, next_spare = new(shape), new(shape)
+    tables, (given, held) = flights.tables(), system.motion.sources
+    cell = held.lattice
+    one = many = flights.one if later is None else flights.many
+    out = x
+    try:
+        for made in range(steps):
+            if held.lattice is not cell or given.lattice is not cell:
+                # The force function is a barostat, too.
+                tables, cell = flights.tables(), held.lattice
+            out = new(shape)
+            if later is None:
+                found = one(what, dt, x, v, u, last, first, f, out, *tables)
+            else:
+                found = many(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
+            if found == UNENDED:
+                return _at(before, start, made - 1), made - 1
+            here = x, v, time, left_over
+            if found < 0:
+                # The engine's kernels are compiled for arrays that can be written to.
+                found = landed(found, fractions, dt, x.copy(), u, work, f, out, time, number + made + 1, tables)
+            if later is not None:
+                for kick, passed, stage in later:
+                    if force is not None:
+                        out.setflags(False)  # type: ignore[call-arg]
+                        now = time + (passed.ends[-1] * dt + left_over)
+                        f = system.accepted(force(out if shift is None else out + shift, now), number + made + 1, False)
+                    x, out = out, new(shape)
+                    found = many(FLY, stage.lengths, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
+                    if found < 0:
+                        lengths, now = stage.lengths, time + (stage.ends[-1] * dt + left_over)
+                        found = landed(found, lengths, dt, x.copy(), u, work, f, out, now, number + made + 1, tables)
+            # As State.later.
+            change = dt + left_over
+            then = time + change
+            part = then - time
+            left_over = (time - (then - part)) + (change - part)
+            time = then
+            if force is not None:
+                # The function can neither write to it nor will anybody else: it may keep what it sees.
+                out.setflags(False)  # type: ignore[call-arg]
+                raw: Any = force(out if shift is None else out + shift, time)
+                # What System.accepted finds most often.
+                if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
+                    f = raw
+                else:
+                    f = system.accepted(raw, number + made + 1, False)
+            x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
+        if force is not None:
+            x = x.copy()  # other kernels are compiled for arrays that can be written to
+            if held.lattice is not cell or given.lattice is not cell:
+                tables = flights.tables()
+        if later is None:
+            status = one(END, dt, x, v, v, last, 0.0, f, x, *tables)
+        else:
+            status = many(END, NO_FRACTIONS, dt, 0, x, v, v, work, last, 0.0, f, False, x, *tables)
+        far = status and flights.ended(status, x, v, f, time, number + steps, tables)
+    except ConvergenceError as error:
+        raise explained(error, system, _at(here, start, made), dt, number + made + 1) from error
+    except InputError:
+        for numbers, item in ((out, "position"), (u, "velocity"), (work[1] if len(work) else u, "velocity")):
+            check_finite(numbers, item, number + made + 1)
+        raise
+    if found != flights.took:
+        flights.took = found
+        flights.motion.took(found)
+    remainder = None
+    if shift is not None:
+        out = x + shift
+        remainder = x - (out - shift)
+        x = out
+    elif far:  # by now: from here on relative to one atom
+        remainder = work[0].copy() if len(work) else np.zeros(shape)
+    forces = start.forces if force is None else f.copy()
+    state = system.last = State(x, v, time, forces, number + steps, remainder, left_over)
+    return state, steps
+
+
+def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: int) -> State:
+    """Where a step began, `made` steps after `start`; its forces have been forgotten since."""
+    x, v, time, left_over = begin
+    return State(x, v.copy(), time, None, start.step + made, None, left_over) if made else start

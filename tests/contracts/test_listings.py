@@ -1,0 +1,147 @@
+"""What steps consist of: the fractions of every stepper and thermostat, and that what is listed is what is done."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kcons import steppers, thermostats
+from kcons.constraints import Distance, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.motion import Motion
+from kcons.steppers import (
+    BlanesMoan4,
+    BlanesMoan6,
+    BlanesMoan6a,
+    Composition,
+    Geodesic,
+    KahanLi6,
+    Rattle,
+    ReversibilityCheck,
+    RungeKuttaNystrom,
+    Splitting,
+    Suzuki4,
+    System,
+    Yoshida4,
+)
+from kcons.steppers.operations import Fly, Settle, Timed
+from kcons.steppers.stepper import Listed
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
+
+ALL = [
+    *(Rattle(), Geodesic(3), Suzuki4(), Yoshida4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()),
+    *(Composition((0.25, 0.5, 0.25), 2), RungeKuttaNystrom((1.0,), (0.5, 0.5)), Splitting((1.0,), (0.5, 0.5))),
+    *(Langevin(1.0, 0.5, 1), Langevin(1.0, 0.5, 1, substeps=1), ReversibilityCheck(Suzuki4())),
+    *(Isokinetic(1.0), Isokinetic(1.0, order=4), Isokinetic(1.0, order=6)),
+    *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
+]
+STEPPERS = pytest.mark.parametrize("stepper", ALL, ids=repr)
+#: Kicks of all kinds share the step among themselves, and so do drifts, and each kind of bath.
+SHARING = [("kick", "settle", "turn"), ("fly",), ("exchange",), ("chain",), ("damp",)]
+
+
+def systems() -> dict[str, System | None]:
+    """What makes something else of a step."""
+    x = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.6, 0.8]])
+    spheres = Motion(ConstraintSet([Sphere([0, 1, 2], np.zeros(3), 1.0)], x, np.ones(3)), x)
+    bond = Motion(ConstraintSet([Distance([0, 1])], x, np.ones(3)), x)
+    return {
+        "nothing known": None,
+        "bonds": System(bond),
+        "great circles": System(spheres),
+        "friction": System(bond, friction=0.1),
+        "friction on great circles": System(spheres, friction=0.1),
+        "frictions on great circles": System(spheres, friction=[0.1, 0.2, 0.3]),
+        "forces of velocities": System(bond, lambda x, v, t: -v, velocity_dependent=True),
+        "both": System(bond, lambda x, v, t: -v, velocity_dependent=True, friction=0.1),
+    }
+
+
+SYSTEMS = systems()
+EVERY = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
+
+
+def test_every_public_stepper_is_here() -> None:
+    public = [getattr(folder, name) for folder in (steppers, thermostats) for name in folder.__all__]
+    listed = {each for each in public if isinstance(each, type) and issubclass(each, Listed)}
+    assert listed == {type(stepper) for stepper in ALL}
+    # Those that integrate an equation of motion, or choose their steps, have no such list.
+    others = {each.__name__ for each in public if isinstance(each, type) and hasattr(each, "step")} - {
+        each.__name__ for each in listed
+    }
+    assert others == {"Baumgarte", "ProjectedRungeKutta4", "ProjectedVerlet", "State", "Stepper"}
+
+
+@EVERY
+@STEPPERS
+def test_fractions_share_the_step(stepper, system) -> None:
+    operations = stepper.operations(system)
+    for verbs in SHARING:
+        fractions = [operation.fraction for operation in operations if operation.verb in verbs]
+        assert not fractions or math.fsum(fractions) == pytest.approx(1.0, abs=2e-15)
+    drifts = [operation for operation in operations if isinstance(operation, Fly)]
+    # A drift ends where its flights have led, the last one at the end of the step.
+    flown = 0.0
+    for drift in drifts:
+        assert math.fsum(drift.flights) == pytest.approx(drift.fraction, abs=2e-15)
+        assert len(drift.ends) == len(drift.flights)
+        for length, end in zip(drift.flights, drift.ends, strict=True):
+            flown += length
+            assert end == pytest.approx(flown, abs=1e-14)
+    assert drifts[-1].ends[-1] == 1.0
+
+
+@EVERY
+@pytest.mark.parametrize("stepper", [stepper for stepper in ALL if stepper.reversible], ids=repr)
+def test_what_is_reversible_is_the_same_backwards(stepper, system) -> None:
+    # A kick is undone by the one that is solved for.
+    timed = [(op.verb, op.fraction) for op in stepper.operations(system) if isinstance(op, Timed)]
+    pairs = {"kick": "settle", "settle": "kick"} if any(verb == "settle" for verb, _ in timed) else {}
+    mirrored = [(pairs.get(verb, verb), fraction) for verb, fraction in reversed(timed)]
+    assert [verb for verb, _ in mirrored] == [verb for verb, _ in timed]
+    np.testing.assert_allclose([f for _, f in mirrored], [f for _, f in timed], rtol=0, atol=1e-15)
+
+
+@STEPPERS
+def test_forces_are_evaluated_as_often_as_it_says(stepper) -> None:
+    evaluated = sum(operation.verb == "evaluate" for operation in stepper.operations())
+    there_and_back = 2 if isinstance(stepper, ReversibilityCheck) else 1
+    assert there_and_back * evaluated == stepper.force_evaluations
+
+
+@EVERY
+@STEPPERS
+def test_a_line_for_each_operation(stepper, system) -> None:
+    first, *lines = stepper.listing(system).splitlines()
+    operations = stepper.operations(system)
+    assert first == f"a step of {stepper!r}"
+    assert len(lines) == len(operations)
+    for line, operation in zip(lines, operations, strict=True):
+        verb, *rest = line.split()
+        assert verb == operation.verb and line.endswith(operation.meaning)
+        if isinstance(operation, Timed):
+            assert float(rest[0]) == pytest.approx(operation.fraction, rel=1e-7)
+
+
+def test_what_a_system_makes_of_a_step() -> None:
+    def verbs(name: str) -> list[str]:
+        return [operation.verb for operation in Geodesic(2).operations(SYSTEMS[name])]
+
+    def drifts(name: str, stepper) -> list[Fly]:
+        return [op for op in stepper.operations(SYSTEMS[name]) if isinstance(op, Fly)]
+
+    plain = ["kick", "fly", "evaluate", "kick", "project"]
+    assert verbs("nothing known") == verbs("bonds") == verbs("great circles") == plain
+    assert verbs("friction") == ["kick", *["damp", "fly", "damp"] * 2, "evaluate", "kick", "project"]
+    assert verbs("friction on great circles") == ["kick", "damp", "fly", "damp", "evaluate", "kick", "project"]
+    assert verbs("frictions on great circles") == verbs("friction")
+    assert verbs("forces of velocities") == ["kick", "fly", "settle"]
+    assert verbs("both") == ["kick", *["damp", "fly", "damp"] * 2, "settle"]
+    for stepper in (Geodesic(2), BlanesMoan4(), Langevin(1.0, 1.0, 1)):
+        assert all(drift.exact and len(drift.flights) == 1 for drift in drifts("great circles", stepper))
+        assert not any(drift.exact or len(drift.flights) == 1 for drift in drifts("bonds", stepper))
+    assert all(drift.exact for drift in drifts("frictions on great circles", Geodesic(2)))
+    assert not any(drift.exact for drift in drifts("great circles", Rattle()))
+    assert Suzuki4().operations(SYSTEMS["forces of velocities"])[2] == Settle(0.5 * Suzuki4().fractions[0])
