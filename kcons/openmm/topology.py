@@ -191,7 +191,8 @@ def _plain(values: Any, wanted: Any) -> FloatArray:
 def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:
     """Pairs of particles that harmonic bonds or constraints of the System join, shape (n, 2).
 
-    Springs of which most are off their lengths at `x` by more than a quarter make no structure: none counts then.
+    Springs of which most are off their lengths at `x` by more than a quarter make no structure, and more than two an
+    atom are a network, not bonds (diamond has two): none counts then.
     """
     pairs = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
     for force in system.getForces():
@@ -200,6 +201,7 @@ def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:
             ends = np.array([spring[:2] for spring in springs])
             rest = np.array([spring[2].value_in_unit(unit.nanometer) for spring in springs])
             apart = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
-            if np.median(np.abs(apart - rest)) <= 0.25 * np.median(rest):
+            network = len(ends) > 2 * len(np.unique(ends))
+            if not network and np.median(np.abs(apart - rest)) <= 0.25 * np.median(rest):
                 pairs += ends.tolist()
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -34,7 +34,6 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance, RadiusO
 from kcons.errors import (
     ConstraintError,
     ConvergenceError,
-    InfeasibleError,
     InputError,
     SingularGeometryError,
     UnsupportedError,
@@ -239,9 +238,7 @@ def test_a_start_off_the_rows_is_refused_and_can_be_restored():
     with pytest.raises(ConstraintError, match="restore"):
         integrator.step(1)
     v = state_of(context)[1]
-    with pytest.raises(InfeasibleError, match="angle 0-3-5 changed"):  # springs go from each bead to several others
-        part.apply_positions(context)
-    assert part.apply_positions(context, bonds=[]) > 0
+    assert part.apply_positions(context) > 0
     assert np.array_equal(state_of(context)[1], v)
     part.apply_velocities(context)
     part.check(context)

@@ -13,6 +13,7 @@ from kcons.constraints import Angle, CenterDistance, Dihedral, Distance
 from kcons.errors import ConvergenceError, InfeasibleError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row
 from kcons.openmm.collective.plain_rows import as_constraint
+from kcons.openmm.topology import bonds_of
 
 
 def loose(constraints=None):
@@ -132,6 +133,28 @@ def test_a_target_out_of_reach_is_infeasible():
     with pytest.raises(InfeasibleError):
         rows.apply_positions(context)
     np.testing.assert_array_equal(state_of(context)[0], x)
+    rows.apply_positions(context, bonds=[])  # whatever becomes of the bonds
+    assert abs(rows.values(context)[0] - 0.6) < 1e-11
+
+
+def test_a_network_of_springs_is_no_molecule():
+    rng = np.random.default_rng(4)
+    x = rng.uniform(size=(7, 3))
+    system, force = openmm.System(), openmm.HarmonicBondForce()
+    for i in range(7):
+        system.addParticle(12.0)
+        for j in range(i):
+            force.addBond(i, j, float(np.linalg.norm(x[i] - x[j])), 1000.0)
+    system.addForce(force)
+    assert len(bonds_of(system, x)) == 0
+    chain = openmm.System()
+    springs = openmm.HarmonicBondForce()
+    for i in range(7):
+        chain.addParticle(12.0)
+        if i:
+            springs.addBond(i - 1, i, float(np.linalg.norm(x[i - 1] - x[i])), 1000.0)
+    chain.addForce(springs)
+    assert len(bonds_of(chain, x)) == 6
 
 
 def test_rows_of_any_function_are_left_to_newton():
