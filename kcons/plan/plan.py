@@ -15,7 +15,7 @@ from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import rank_of_shape, ranked, small_enough
 from kcons.plan.solver_table import solver_of
-from kcons.solvers.cluster_solver import ClusterSolver
+from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
@@ -81,9 +81,9 @@ class Plan:
     late: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
 
-    def cell_for(self, solver: int, lattice: FloatArray | None) -> FloatArray | None:
-        """The cell that a solver is given: None where positions come whole and every image is as they say."""
-        return None if self.whole[solver] else lattice
+    def asked_of(self, solver: int, request: Request) -> Request:
+        """What a solver is asked: no cell where positions come whole and every image is as they say."""
+        return request._replace(lattice=None) if self.whole[solver] else request
 
     def pinned_targets(self, targets: FloatArray | None) -> FloatArray:
         """Where fixed atoms are held, shape (len(pinned), 3)."""

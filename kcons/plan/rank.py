@@ -83,12 +83,9 @@ def rank_of_shape(
     time: float,
 ) -> int:
     """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, SparseRows):
+    if isinstance(solver, (SparseRows, SparseDistances)):
         return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
-        sparse = solver.solver
-        if isinstance(sparse, SparseDistances):
-            return sparse.rank(positions, lattice)
         return rank_of_small(shape, inverse_masses, positions, lattice)
     assert isinstance(solver, GeneralClusters)
     return solver.rank(positions, time)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import Outcome, Request
 
 #: Singular values of the row-normalised, mass-weighted matrix below this part of the largest are redundant.
 RANK_TOLERANCE = 1e-8
@@ -122,34 +122,23 @@ class GeneralClusters:
 
     # -- positions ------------------------------------------------------------------------------
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
-        self.subset.lattice = lattice
-        state = x_new[self.atoms]
+        self.subset.lattice = request.lattice
+        state = request.changed[self.atoms]
         with np.errstate(all="ignore"):
-            reference = self._data(x_ref[self.atoms], reference_time)
+            reference = self._data(request.reference[self.atoms], request.reference_time)
             total = np.zeros(len(self.rows))
             moves = np.zeros_like(state)
             worst = Outcome(True, 0.0, 0, -1)
             for batch in self._batches:
-                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), time, total)
+                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), request.time, total)
                 if not outcome.converged:
                     return outcome
                 worst = _worse(worst, outcome)
-        x_new[self.atoms] = state
-        if velocities is not None:
-            velocities[self.atoms] += inv_dt * moves
+        request.changed[self.atoms] = state
+        if request.velocities is not None:
+            request.velocities[self.atoms] += request.inv_dt * moves
         if multipliers is not None:
             multipliers[:] = total
         return worst
@@ -289,19 +278,12 @@ class GeneralClusters:
 
     # -- tangents -------------------------------------------------------------------------------
 
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome:
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """y <- y - M^-1 A^T mu with A y = rates, in place; see `Motion.project_velocities`."""
-        self.subset.lattice = lattice
+        rates, y = request.wanted, request.changed
+        self.subset.lattice = request.lattice
         with np.errstate(all="ignore"):
-            data = self._data(x[self.atoms], time)
+            data = self._data(request.reference[self.atoms], request.time)
             local = y[self.atoms]
             flat = local.reshape(-1)
             mu = np.zeros(len(self.rows))

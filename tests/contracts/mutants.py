@@ -64,14 +64,14 @@ MUTANTS = [
     # -- solvers: eight small clusters at once --
     (
         "solvers/small_clusters.py",
-        "kept = kept and all_within(TINY, dot(x, y, z, a, b, c))",
-        "kept = kept and all_within(-1e300, dot(x, y, z, a, b, c))",
+        "kept = kept and all_within(TINY, inner)",
+        "kept = kept and all_within(-1e300, inner)",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-flipped]",
     ),
     (
         "solvers/small_clusters.py",
-        "2 * n_local, n_local)\n",
-        "2 * n_local, 0)\n",
+        "kept_points, n_local)\n",
+        "kept_points, 0)\n",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-far]",
     ),
     (
@@ -95,8 +95,8 @@ MUTANTS = [
     ),
     (
         "solvers/rigid_triangles.py",
-        "restore_points(velocities, atoms, undo, group, 3, 6, 3)",
-        "restore_points(velocities, atoms, undo, group, 3, 6, 0)",
+        "restore_points(velocities, atoms, undo, group, 3, kept_points, 3)",
+        "restore_points(velocities, atoms, undo, group, 3, kept_points, 0)",
         "tests/solvers/test_rigid_triangles.py::test_failure_changes_nothing_and_names_the_triangle[far]",
     ),
     # -- solvers: chains --

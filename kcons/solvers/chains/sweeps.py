@@ -396,26 +396,9 @@ def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
 
 @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
 def project(
-    points,
-    references,
-    velocities,
-    inverse_dt,
-    tangent,
-    starts,
-    atoms,
-    owned,
-    full,
-    rows,
-    present,
-    weights,
-    wholes,
-    given,
-    lattice,
-    kind,
-    multipliers,
-    work,
-    undo,
-):
+    points, references, velocities, inverse_dt, tangent, starts, atoms, owned, full, rows, present, weights, wholes,
+    given, lattice, kind, multipliers, work, undo,
+):  # type: ignore[no-untyped-def]  # fmt: skip
     """Project one strip after another.
 
     `tangent` is None where `points` are positions, and anything else where

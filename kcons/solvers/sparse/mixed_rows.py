@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.aligned_memory import aligned
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 from kcons.solvers.kernels.two_and_four_wide import (
@@ -110,63 +110,46 @@ class SparseRows:
         self._kept_solution = np.zeros(n)
         self._speeds = aligned(4 * len(self._atoms))
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        wanted = self._targets if targets is None else targets[self.rows]
+        targets = self._targets if request.wanted is None else request.wanted[self.rows]
+        lattice, periodic = NO_LATTICE if request.lattice is None else request.lattice, request.lattice is not None
         for careful in (False, True):
-            failed, residual, iterations, worst = _positions(
-                careful, x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
+            failed, *found = _positions(
+                careful, request.changed, request.reference, targets, lattice, periodic,
                 *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
                 self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             if not failed:
                 break
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        _apply(x_new, 1.0, self._atoms, self._moves)
-        if velocities is not None:
-            _apply(velocities, inv_dt, self._atoms, self._moves)
-        if multipliers is not None:
-            multipliers[:] = self._solution
-        return Outcome(True, residual, iterations, worst)
+        if not failed:
+            _apply(request.changed, 1.0, self._atoms, self._moves)
+            if request.velocities is not None:
+                _apply(request.velocities, request.inv_dt, self._atoms, self._moves)
+            if multipliers is not None:
+                multipliers[:] = self._solution
+        return Outcome(not failed, *found)
 
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome:
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        wanted = self._targets if rates is None else rates[self.rows]
-        failed, residual, iterations, worst = _tangents(
-            x, y, wanted, rates is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
+        rates, driven = self._targets, request.wanted is not None
+        if request.wanted is not None:
+            rates = request.wanted[self.rows]
+        lattice, periodic = NO_LATTICE if request.lattice is None else request.lattice, request.lattice is not None
+        failed, *found = _tangents(
+            request.reference, request.changed, rates, driven, lattice, periodic,
             *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
             self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        _apply(y, 1.0, self._atoms, self._moves)
-        if multipliers is not None:
-            np.negative(self._solution, out=multipliers)
-        return Outcome(True, residual, iterations, worst)
+        if not failed:
+            _apply(request.changed, 1.0, self._atoms, self._moves)
+            if multipliers is not None:
+                np.negative(self._solution, out=multipliers)
+        return Outcome(not failed, *found)
 
     def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(x, np.zeros_like(x), None, lattice, None, 0.0)
+        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice))
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))

@@ -238,10 +238,10 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     for solver in plan.solvers:
         if not isinstance(solver, DistanceClusters):
             return None
-        if triangles is None and not compact and isinstance(solver.solver, RigidTriangles):
-            triangles = solver.solver
-        elif chains is None and isinstance(solver.solver, Chains):
-            chains = solver.solver
+        if triangles is None and not compact and isinstance(solver, RigidTriangles):
+            triangles = solver
+        elif chains is None and isinstance(solver, Chains):
+            chains = solver
         else:
             rows.append(solver.rows)
     if chains is not None and not _worth_it(chains, sum(map(len, rows))):
