@@ -17,6 +17,7 @@ from kcons.plan.rank import rank_of_shape, ranked, small_enough
 from kcons.plan.solver_table import solver_of
 from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rank_revealing import RANK_TOLERANCE
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
@@ -177,7 +178,7 @@ class Plan:
             transposed = transposed[used]
             force = transposed @ lam[rows]
             if len(rows) <= DENSE_ROWS:
-                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
+                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=RANK_TOLERANCE)[0]
             else:
                 from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
 

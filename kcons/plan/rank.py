@@ -11,7 +11,8 @@ from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.general_clusters import RANK_TOLERANCE, GeneralClusters
+from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rank_revealing import independent, rank
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
@@ -39,7 +40,7 @@ def ranked(
 
     jacobian = constraint_set.jacobian(positions, time)
     root_w = np.repeat(np.sqrt(inverse_masses), 3)
-    rank = 0
+    found = 0
     for rows in clusters:
         part = jacobian[rows]
         columns, place = np.unique(part.indices, return_inverse=True)
@@ -49,10 +50,10 @@ def ranked(
         triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
         diagonal = np.zeros(len(rows))
         diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
-        left_over = diagonal <= RANK_TOLERANCE * diagonal[0]
-        late[rows[order]] = left_over
-        rank += int(np.sum(~left_over))
-    return rank
+        # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
+        late[rows[order]] = left_over = ~independent(diagonal)
+        found += int(np.sum(~left_over))
+    return found
 
 
 def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
@@ -67,11 +68,7 @@ def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArra
     root_w = np.sqrt(inverse_masses[shape.atoms[0]])
     b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
     b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
-    flat = b.reshape(n, k, -1)
-    size = np.linalg.norm(flat, axis=2, keepdims=True)
-    unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
-    s = np.linalg.svd(unit, compute_uv=False)
-    return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
+    return rank(b.reshape(n, k, -1))
 
 
 def rank_of_shape(
