@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.solvers.distance_clusters import EightAtATime
+from kcons.solvers.kernels import groups_of_eight as groups
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -30,20 +31,6 @@ from kcons.solvers.kernels.eight_wide import (
     square_root,
     stack,
     store,
-)
-from kcons.solvers.kernels.groups_of_eight import (
-    MAX_ITERATIONS,
-    OPEN,
-    POSITION_TOLERANCE,
-    SAVED,
-    TANGENT_TOLERANCE,
-    TINY,
-    dot,
-    lane_tables,
-    lattice_numbers,
-    minimum_image,
-    restore_points,
-    worst_row,
 )
 
 LARGEST = 6
@@ -98,7 +85,7 @@ def _gram(matrix, left, right, coupling, n):
         x, y, z = _point(left, k)
         for j in range(n):
             a, b, c = _point(right, j)
-            poke(matrix, k * n + j, dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
+            poke(matrix, k * n + j, groups.dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
     _factor(matrix, n)
 
 
@@ -130,7 +117,7 @@ def _kernel(n_rows: int) -> Any:
         n_local = weights.shape[0]
         # Points kept of a cluster, and what residuals are counted in.
         kept_points, unit = (2 * n_local, 2.0) if tangent is None else (n_local, 1.0)
-        cell = lattice_numbers(lattice)
+        cell = groups.lattice_numbers(lattice)
         errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
         # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
         s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
@@ -147,10 +134,10 @@ def _kernel(n_rows: int) -> Any:
                 i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
                 x, y, z = gather_differences(references, atoms, i, j)
                 a, b, c = gather_differences(points, atoms, i, j)
-                if kind != OPEN:
-                    x, y, z = minimum_image(x, y, z, cell, kind)
+                if kind != groups.OPEN:
+                    x, y, z = groups.minimum_image(x, y, z, cell, kind)
                     if tangent is None:
-                        a, b, c = minimum_image(a, b, c, cell, kind)
+                        a, b, c = groups.minimum_image(a, b, c, cell, kind)
                 _set_point(s, k, x, y, z)
                 _set_point(r, k, a, b, c)
                 poke(total, k, splat(0.0))
@@ -158,9 +145,9 @@ def _kernel(n_rows: int) -> Any:
                     length = gather(given, slots, group * WIDTH, k)
                     poke(squares, k, length * length)
                 else:
-                    square = dot(x, y, z, x, y, z)
+                    square = groups.dot(x, y, z, x, y, z)
                     poke(squares, k, square)
-                    size = size + dot(a, b, c, a, b, c)
+                    size = size + groups.dot(a, b, c, a, b, c)
                     rate = splat(0.0)
                     if driven:
                         rate = gather(given, slots, group * WIDTH, k)
@@ -168,7 +155,7 @@ def _kernel(n_rows: int) -> Any:
                         rate = rate * square_root(square)
                     poke(wanted, k, rate)
             if tangent is not None:
-                size = size * (TANGENT_TOLERANCE * TANGENT_TOLERANCE)
+                size = size * (groups.TANGENT_TOLERANCE * groups.TANGENT_TOLERANCE)
                 _gram(matrix, s, s, coupling, n)
             iteration = 0
             ok = False
@@ -178,15 +165,15 @@ def _kernel(n_rows: int) -> Any:
                 for k in range(n):
                     x, y, z = _point(r, k)
                     if tangent is None:
-                        e = peek(squares, k) - dot(x, y, z, x, y, z)
-                        limit = peek(squares, k) * (2.0 * POSITION_TOLERANCE)
+                        e = peek(squares, k) - groups.dot(x, y, z, x, y, z)
+                        limit = peek(squares, k) * (2.0 * groups.POSITION_TOLERANCE)
                         ok = ok and all_within(absolute(e), limit)
                     else:
                         a, b, c = _point(s, k)
-                        e = peek(wanted, k) - dot(x, y, z, a, b, c)
+                        e = peek(wanted, k) - groups.dot(x, y, z, a, b, c)
                         ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
-                if ok or iteration == MAX_ITERATIONS:
+                if ok or iteration == groups.MAX_ITERATIONS:
                     break
                 # A factor serves two steps: Newton, then chord; order three for both.
                 if tangent is None and iteration % 2 == 0:
@@ -206,12 +193,12 @@ def _kernel(n_rows: int) -> Any:
                     # A bond that turned round has found the wrong root.
                     x, y, z = _point(r, k)
                     a, b, c = _point(s, k)
-                    e, inner = absolute(e), dot(x, y, z, a, b, c)
+                    e, inner = absolute(e), groups.dot(x, y, z, a, b, c)
                 else:
                     e = e * e
                 poke(error, k, e)
                 poke(step, k, inner)
-                kept = kept and all_within(TINY, inner)
+                kept = kept and all_within(groups.TINY, inner)
                 better = better and all_within(e, peek(squares, k) * (unit * worst))
             if not (ok and kept and better):
                 for k in range(n):
@@ -220,12 +207,12 @@ def _kernel(n_rows: int) -> Any:
                     if ok and not kept:
                         store(errors, k * WIDTH, not_positive(peek(step, k)))
                         store(sizes, k * WIDTH, splat(1.0))
-                worst, worst_at = worst_row(errors, sizes, n)
+                worst, worst_at = groups.worst_row(errors, sizes, n)
                 worst_at += group * n * WIDTH
                 if not (ok and kept):
-                    restore_points(points, atoms, undo, group, n_local, kept_points, 0)
+                    groups.restore_points(points, atoms, undo, group, n_local, kept_points, 0)
                     if move:
-                        restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
+                        groups.restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
                     return False, worst if tangent is None else np.sqrt(worst), most, worst_at
             for a in range(n_local):
                 _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
@@ -233,7 +220,7 @@ def _kernel(n_rows: int) -> Any:
                 x, y, z = _point(s, k)
                 f = peek(total, k)
                 if report:
-                    g = f * square_root(dot(x, y, z, x, y, z))
+                    g = f * square_root(groups.dot(x, y, z, x, y, z))
                     scatter(multipliers, slots, group * WIDTH, k, g if tangent is None else -g)
                 x, y, z = f * x, f * y, f * z
                 i, j = ends[2 * k], ends[2 * k + 1]
@@ -241,15 +228,15 @@ def _kernel(n_rows: int) -> Any:
                 _set_point(shifts, i, a + x, b + y, c + z)
                 a, b, c = _point(shifts, j)
                 _set_point(shifts, j, a - x, b - y, c - z)
-            saved = kept_points * group * SAVED
+            saved = kept_points * group * groups.SAVED
             for a in range(n_local):
                 w, i = weights[a], at + a * WIDTH
                 dx, dy, dz = _point(shifts, a)
                 dx, dy, dz = w * dx, w * dy, w * dz
-                x, y, z = keep_points(points, atoms, i, undo, saved + a * SAVED)
+                x, y, z = keep_points(points, atoms, i, undo, saved + a * groups.SAVED)
                 scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
                 if tangent is None and move:
-                    x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
+                    x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * groups.SAVED)
                     x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
                     scatter_points(velocities, atoms, i, x, y, z)
         return True, worst if tangent is None else np.sqrt(worst), most, worst_at
@@ -300,6 +287,6 @@ class SmallClusters(EightAtATime):
         super().__init__(rows, lengths, len(local))
         self._kernel = _kernel(len(local))
         weights = np.array(inv_mass, dtype=np.float64)
-        slots, points = lane_tables(members, len(local))
+        slots, points = groups.lane_tables(members, len(local))
         self._tables = points, slots, local.reshape(-1), weights, _couplings(local, weights)
         self._sizes = (6 * len(points),)

@@ -64,7 +64,7 @@ MUTANTS = [
     # -- solvers: eight small clusters at once --
     (
         "solvers/small_clusters.py",
-        "kept = kept and all_within(TINY, inner)",
+        "kept = kept and all_within(groups.TINY, inner)",
         "kept = kept and all_within(-1e300, inner)",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-flipped]",
     ),

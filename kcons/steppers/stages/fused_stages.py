@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.motion.motion import MANY_ITERATIONS, Motion
+from kcons.motion.local_projections import MANY_ITERATIONS
+from kcons.motion.motion import Motion
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
