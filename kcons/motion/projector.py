@@ -185,12 +185,18 @@ class Projector:
             check_multipliers(multipliers, self.constraint_set.n_rows)
         reference_time = time if reference_time is None else reference_time
         self.cell()
-        work = self._to_change(x, out is x_new)
-        speeds = velocities if velocities is None or self._atoms is None else velocities.take(self._atoms, 0)
-        self._solve.positions(work, self._reference(ref, work), time, reference_time, speeds, inv_dt, multipliers)
-        if velocities is not None and speeds is not None and speeds is not velocities:
+        atoms = self._atoms
+        if atoms is None:
+            work = x if out is x_new else x.copy()
+            ref = ref.copy() if np.may_share_memory(work, ref) else ref
+            self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers)
+            return _in(out, work)
+        part = x.take(atoms, 0)
+        speeds = None if velocities is None else velocities.take(atoms, 0)
+        self._solve.positions(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers)
+        if velocities is not None and speeds is not None:
             velocities.put(self._flat, speeds)
-        return self._result(work, x, x_new, out)
+        return self._put_back(part, x, x_new, out)
 
     def project_velocities(
         self,
@@ -226,34 +232,29 @@ class Projector:
         if multipliers is not None:
             check_multipliers(multipliers, self.constraint_set.n_rows)
         self.cell()
-        work = self._to_change(y, out is v)
-        here = self._reference(here, work)
-        self._solve.tangents(here, work, self._solve.rates(here, time), time, multipliers, "velocity")
-        return self._result(work, y, v, out)
+        atoms = self._atoms
+        if atoms is None:
+            work = y if out is v else y.copy()
+            here = here.copy() if np.may_share_memory(work, here) else here
+            self._solve.tangents(here, work, self._solve.rates(here, time), time, multipliers, "velocity")
+            return _in(out, work)
+        here, part = here.take(atoms, 0), y.take(atoms, 0)
+        self._solve.tangents(here, part, self._solve.rates(here, time), time, multipliers, "velocity")
+        return self._put_back(part, y, v, out)
 
-    def _to_change(self, x: FloatArray, in_place: bool) -> FloatArray:
-        """What solvers may change: the local atoms of `x`, or a copy of it, or itself."""
-        if self._atoms is not None:
-            return x.take(self._atoms, 0)
-        return x if in_place else x.copy()
-
-    def _reference(self, x: FloatArray, work: FloatArray) -> FloatArray:
-        """Local positions that stay as they are while `work` is changed."""
-        if self._atoms is not None:
-            return x.take(self._atoms, 0)
-        return x.copy() if np.may_share_memory(work, x) else x
-
-    def _result(self, work: FloatArray, x: FloatArray, given: ArrayLike, out: FloatArray | None) -> FloatArray:
-        """What became of `x`, which was `given`, in `out` or in a new array."""
-        if self._atoms is None:
-            if out is None:
-                return work
-            if out is not given:
-                np.copyto(out, work)
-            return out
+    def _put_back(self, part: FloatArray, x: FloatArray, given: ArrayLike, out: FloatArray | None) -> FloatArray:
+        """`x`, which was `given`, with what became of its local atoms, in `out` or in a new array."""
         if out is None:
             out = x.copy()
         elif out is not given:
             np.copyto(out, x)
-        out.put(self._flat, work)
+        out.put(self._flat, part)
         return out
+
+
+def _in(out: FloatArray | None, work: FloatArray) -> FloatArray:
+    """`work` in `out`, which may be `work` itself, if there is any."""
+    if out is None or out is work:
+        return work
+    np.copyto(out, work)
+    return out
