@@ -51,7 +51,8 @@ def ranked(
         diagonal = np.zeros(len(rows))
         diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
         # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
-        late[rows[order]] = left_over = ~independent(diagonal)
+        left_over = ~independent(diagonal)
+        late[rows[order]] = left_over
         found += int(np.sum(~left_over))
     return found
 

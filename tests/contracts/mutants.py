@@ -341,7 +341,7 @@ MUTANTS = [
     ("projection.py", "rtol)].conj().T)", "rtol)].T)", "tests/test_projection.py::test_complex_matrices"),
     # -- steppers, thermostats, arrays --
     (
-        "motion/motion.py",
+        "motion/local_projections.py",
         "np.copyto(velocities, saved[1])",
         "pass",
         "tests/motion/test_motion.py::test_velocities_are_put_back_when_a_later_solver_fails",
