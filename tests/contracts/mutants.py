@@ -38,9 +38,9 @@ MUTANTS = [
     ),
     # -- solvers: distances of any connection --
     (
-        "solvers/sparse/distances.py",
-        "LENGTH_TOLERANCE = 4e-15",
-        "LENGTH_TOLERANCE = 4e-11",
+        "solvers/sparse/step_control.py",
+        "NEWTON_TOLERANCE = 4e-15",
+        "NEWTON_TOLERANCE = 4e-11",
         "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
     ),
     (

@@ -37,15 +37,20 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
 )
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_small_pattern
+from kcons.solvers.sparse.step_control import (
+    MAX_HALVINGS,
+    NEWTON_TOLERANCE,
+    factor_serves,
+    go_back,
+    hopeless,
+    keep,
+    overshot,
+    refines,
+)
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 
-#: Newton stops at this relative error of a length in relative coordinates (a few roundings).
-LENGTH_TOLERANCE = 4e-15
 #: |A v - c| allowed after a velocity projection, relative to the largest relative speed of the cluster.
 SPEED_TOLERANCE = 1e-15
-MAX_ITERATIONS = 50
-#: Halvings of one Newton step by the step control.
-MAX_HALVINGS = 30
 _EPS = float(np.finfo(float).eps)
 
 
@@ -114,19 +119,19 @@ class SparseDistances(DistanceClusters):
     def _project(
         self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
     ) -> Outcome:
-        lattice, periodic = NO_LATTICE if request.lattice is None else request.lattice, request.lattice is not None
-        x, reference, velocities = request.changed, request.reference, request.velocities
+        x, reference, _, lattice, _, _, velocities, inv_dt = request
+        cell, periodic = NO_LATTICE if lattice is None else lattice, lattice is not None
         rooms = (
             self._state, self._entries, self._pivots, self._starts, self._places, self._moves, self._solution,
         )  # fmt: skip
         if tangent:
-            failed, *found = solve_tangents(
-                reference, x, given, len(given) > 0, lattice, periodic, *self._tables, *rooms
+            failed, residual, iterations, worst = solve_tangents(
+                reference, x, given, len(given) > 0, cell, periodic, *self._tables, *rooms
             )
         else:
             for careful in (False, True):
-                failed, *found = solve_positions(
-                    careful, x, reference, given, lattice, periodic, *self._tables, *rooms,
+                failed, residual, iterations, worst = solve_positions(
+                    careful, x, reference, given, cell, periodic, *self._tables, *rooms,
                     self._kept_moves, self._kept_solution,
                 )  # fmt: skip
                 if not failed:
@@ -135,10 +140,10 @@ class SparseDistances(DistanceClusters):
             if velocities is None or tangent:
                 apply(x, self._atoms, self._moves)
             else:
-                apply_both(x, velocities, request.inv_dt, self._atoms, self._moves)
+                apply_both(x, velocities, inv_dt, self._atoms, self._moves)
             if multipliers is not None:
                 _natural(self._state, self._solution, -1.0 if tangent else 1.0, multipliers)
-        return Outcome(not failed, *found)
+        return Outcome(not failed, residual, iterations, worst)
 
     def tables(self) -> tuple[tuple[NDArray[Any], ...], tuple[FloatArray, ...]]:
         """What `solve_positions` and `solve_tangents` are given of the rows, and the rooms that they work in."""
@@ -287,20 +292,17 @@ def solve_positions(  # type: ignore[no-untyped-def]
         while True:
             if iteration > 0:
                 error, total = _measure(first, last, lengths, links, state, starts, moves)
-            if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
-                # Step control: go back half the way.
+            if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, _worst(first, last, state, lengths)
                 halvings += 1
-                for a in range(4 * first_atom, 4 * last_atom):
-                    moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
-                for k in range(first, last):
-                    solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
+                go_back(4 * first_atom, 4 * last_atom, moves, kept_moves)
+                go_back(first, last, solution, kept_solution)
                 continue
             # max() may drop a NaN; the sum cannot.
-            if not (total < np.inf) or iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
+            if not (total < np.inf) or hopeless(iteration, error, previous):
                 return True, error, iteration, _worst(first, last, state, lengths)
-            if error <= LENGTH_TOLERANCE:
+            if error <= NEWTON_TOLERANCE:
                 break
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
             if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, links):
@@ -308,13 +310,9 @@ def solve_positions(  # type: ignore[no-untyped-def]
             if careful:
                 best = total
                 halvings = 0
-                for a in range(4 * first_atom, 4 * last_atom):
-                    kept_moves[a] = moves[a]
-                for k in range(first, last):
-                    kept_solution[k] = solution[k]
-            # Reuse the factor while a step with it still gains enough for its lower price.
-            ratio = error / previous
-            if factored and (error * ratio <= LENGTH_TOLERANCE or ratio < 1e-4):
+                keep(4 * first_atom, 4 * last_atom, moves, kept_moves)
+                keep(first, last, solution, kept_solution)
+            if factor_serves(factored, error, previous):
                 forward(first, last, links, columns, state, entries)
             else:
                 factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
@@ -408,8 +406,7 @@ def solve_tangents(  # type: ignore[no-untyped-def]
                 error = max(error, abs(miss))
             if not (total < np.inf):
                 return True, error, iteration, _first_bad(first, last, state)
-            # One refinement more as long as it helps; the floor itself is accepted.
-            if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
+            if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             forward(first, last, links, columns, state, entries)

@@ -38,11 +38,18 @@ from kcons.solvers.kernels.two_and_four_wide import (
 )
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
+from kcons.solvers.sparse.step_control import (
+    MAX_HALVINGS,
+    NEWTON_TOLERANCE,
+    factor_serves,
+    go_back,
+    hopeless,
+    keep,
+    overshot,
+    refines,
+)
 from kcons.solvers.sparse.substitution import update
 
-MAX_ITERATIONS = 50
-#: Halvings of one Newton step by the step control.
-MAX_HALVINGS = 30
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
 SPEED_TOLERANCE = 1e-15
 _EPS = float(np.finfo(float).eps)
@@ -112,40 +119,38 @@ class SparseRows:
 
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        targets = self._targets if request.wanted is None else request.wanted[self.rows]
-        lattice, periodic = NO_LATTICE if request.lattice is None else request.lattice, request.lattice is not None
+        x, reference, wanted, lattice, _, _, velocities, inv_dt = request
+        targets = self._targets if wanted is None else wanted[self.rows]
         for careful in (False, True):
-            failed, *found = _positions(
-                careful, request.changed, request.reference, targets, lattice, periodic,
+            failed, residual, iterations, worst = _positions(
+                careful, x, reference, targets, NO_LATTICE if lattice is None else lattice, lattice is not None,
                 *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
                 self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             if not failed:
                 break
         if not failed:
-            _apply(request.changed, 1.0, self._atoms, self._moves)
-            if request.velocities is not None:
-                _apply(request.velocities, request.inv_dt, self._atoms, self._moves)
+            _apply(x, 1.0, self._atoms, self._moves)
+            if velocities is not None:
+                _apply(velocities, inv_dt, self._atoms, self._moves)
             if multipliers is not None:
                 multipliers[:] = self._solution
-        return Outcome(not failed, *found)
+        return Outcome(not failed, residual, iterations, worst)
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        rates, driven = self._targets, request.wanted is not None
-        if request.wanted is not None:
-            rates = request.wanted[self.rows]
-        lattice, periodic = NO_LATTICE if request.lattice is None else request.lattice, request.lattice is not None
-        failed, *found = _tangents(
-            request.reference, request.changed, rates, driven, lattice, periodic,
+        y, x, wanted, lattice, *_ = request
+        rates = self._targets if wanted is None else wanted[self.rows]
+        failed, residual, iterations, worst = _tangents(
+            x, y, rates, wanted is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
             *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
             self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
         if not failed:
-            _apply(request.changed, 1.0, self._atoms, self._moves)
+            _apply(y, 1.0, self._atoms, self._moves)
             if multipliers is not None:
                 np.negative(self._solution, out=multipliers)
-        return Outcome(not failed, *found)
+        return Outcome(not failed, residual, iterations, worst)
 
     def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
@@ -323,6 +328,14 @@ def _measure(first, last, kinds, wanted, scale, floor, values, state):  # type: 
     return error, total, excess, bad
 
 
+@nb.njit(cache=True)
+def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
+        if not (abs(state[2 * k + 1]) < np.inf):
+            return k
+    return first
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
     careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters,
@@ -347,35 +360,27 @@ def _positions(  # type: ignore[no-untyped-def]
                 first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
             )
             error, total, excess, bad = _measure(first, last, kinds, wanted, scale, floor, values, state)
-            if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
-                # Step control: go back half the way.
+            if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, bad
                 halvings += 1
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
-                    moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
-                for k in range(first, last):
-                    solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
+                go_back(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
+                go_back(first, last, solution, kept_solution)
                 error = previous
                 continue
             if not (total < np.inf):
-                for k in range(first, last):
-                    if not (abs(state[2 * k + 1]) < np.inf):
-                        return True, np.inf, iteration, k
-            if iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
+                return True, np.inf, iteration, _first_not_finite(first, last, state)
+            if hopeless(iteration, error, previous):
                 return True, error, iteration, bad
             # Go on to the floor of the relative coordinates as long as Newton still gains.
-            if excess <= 1.0 and (error <= 4e-15 or error > 0.1 * previous):
+            if excess <= 1.0 and (error <= NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
             if careful:
                 best = total
                 halvings = 0
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
-                    kept_moves[a] = moves[a]
-                for k in range(first, last):
-                    kept_solution[k] = solution[k]
-            ratio = error / previous
-            if factored and (error * ratio <= 4e-15 or ratio < 1e-4):
+                keep(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
+                keep(first, last, solution, kept_solution)
+            if factor_serves(factored, error, previous):
                 _forward(first, last, links, columns, state, entries)
             else:
                 _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
@@ -431,10 +436,7 @@ def _tangents(  # type: ignore[no-untyped-def]
             total += size
             solution[k] = 0.0
         if not (total < np.inf):
-            for k in range(first, last):
-                if not (abs(state[2 * k + 1]) < np.inf):
-                    return True, np.inf, 0, k
-            return True, np.inf, 0, first
+            return True, np.inf, 0, _first_not_finite(first, last, state)
         _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
@@ -457,7 +459,7 @@ def _tangents(  # type: ignore[no-untyped-def]
                     bad = k
             if not (total < np.inf):
                 return True, np.inf, iteration, bad
-            if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
+            if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             _forward(first, last, links, columns, state, entries)
