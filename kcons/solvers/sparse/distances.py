@@ -36,17 +36,9 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_line,
     store_quad,
 )
+from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, make_pattern, make_small_pattern
-from kcons.solvers.sparse.step_control import (
-    MAX_HALVINGS,
-    NEWTON_TOLERANCE,
-    factor_serves,
-    go_back,
-    hopeless,
-    keep,
-    overshot,
-    refines,
-)
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 
 #: |A v - c| allowed after a velocity projection, relative to the largest relative speed of the cluster.
@@ -302,7 +294,7 @@ def solve_positions(  # type: ignore[no-untyped-def]
             # max() may drop a NaN; the sum cannot.
             if not (total < np.inf) or hopeless(iteration, error, previous):
                 return True, error, iteration, _worst(first, last, state, lengths)
-            if error <= NEWTON_TOLERANCE:
+            if error <= step_control.NEWTON_TOLERANCE:
                 break
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
             if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, links):

@@ -36,18 +36,10 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
+from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
-from kcons.solvers.sparse.step_control import (
-    MAX_HALVINGS,
-    NEWTON_TOLERANCE,
-    factor_serves,
-    go_back,
-    hopeless,
-    keep,
-    overshot,
-    refines,
-)
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
@@ -373,7 +365,7 @@ def _positions(  # type: ignore[no-untyped-def]
             if hopeless(iteration, error, previous):
                 return True, error, iteration, bad
             # Go on to the floor of the relative coordinates as long as Newton still gains.
-            if excess <= 1.0 and (error <= NEWTON_TOLERANCE or error > 0.1 * previous):
+            if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
             if careful:
                 best = total
