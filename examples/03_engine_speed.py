@@ -38,7 +38,7 @@ from kcons.comparison import scripts, system_of
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, Plane
 from kcons.motion import Motion
 from kcons.plan import make_plan
-from kcons.solvers import DistanceClusters, SparseDistances
+from kcons.solvers import SparseDistances
 
 KT = 2.494e-4  # 300 K in amu Å²/fs²
 STEP = 2.0  # fs
@@ -240,7 +240,7 @@ def _use_sparse(motion: Motion, x: np.ndarray) -> None:
     (item,) = held.constraints
     plan = make_plan(held, x, 0.0)
     sparse = SparseDistances(np.arange(held.n_rows), item.atoms, held.target(), plan.inverse_masses)
-    motion.plan.solvers[:] = [DistanceClusters(sparse, held.target())]
+    motion.plan.solvers[:] = [sparse]
     motion.plan.kinds[:] = [type(k)("sparse", k.clusters, k.rows, k.rank, k.example) for k in plan.kinds]
 
 

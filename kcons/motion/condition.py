@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.solvers.general_clusters import RANK_TOLERANCE
+from kcons.solvers.rank_revealing import independent
 
 #: Largest cluster, in rows, that goes through dense singular values.
 DENSE_ROWS = 300
@@ -89,7 +89,7 @@ def _dense(unit: sp.csr_array, starts: IntArray, size: int) -> float:
         dense = np.zeros((n, size, int(column.max()) + 1))
         np.add.at(dense, (cluster, line, column), unit.data[entry])
         s = np.linalg.svd(dense, compute_uv=False)
-        smallest = np.min(np.where(s > RANK_TOLERANCE * s[:, :1], s, np.inf), axis=1)
+        smallest = np.min(np.where(independent(s), s, np.inf), axis=1)
         worst = max(worst, float(np.max(s[:, 0] / smallest)))
     return worst
 

@@ -7,33 +7,25 @@ that names the row, with nothing changed, where there is no solution.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from math import isfinite
-from typing import Literal
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_multipliers, check_out, check_pairs
+from kcons.constraints.arguments import as_array, check_out, check_pairs
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion import failures
 from kcons.motion.certificate import certify
+from kcons.motion.projector import Projector
 from kcons.motion.report import Report, make_report
 from kcons.motion.restoring.kept_geometry import Bonds
 from kcons.motion.restoring.moved_groups import restored
-from kcons.motion.restoring.nearest_point import FarStart, Rescuers, Task, Work
-from kcons.plan.plan import Plan, make_plan
-from kcons.plan.second_order.conversion import without_second_order_rows
-from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody
-
-#: More Newton iterations than a time step of any use takes: the start was far off.
-MANY_ITERATIONS = 6
+from kcons.motion.restoring.nearest_point import Work
+from kcons.plan.second_order.flat_bodies import MISFIT
 
 
-class Motion:
+class Motion(Projector):
     """Constrained motion of one system.
 
     Parameters
@@ -70,265 +62,6 @@ class Motion:
     ----------
     Notes, section 4.1; eqs. 94-107.
     """
-
-    def __init__(
-        self,
-        constraint_set: ConstraintSet,
-        positions: ArrayLike,
-        *,
-        degenerate: Literal["convert", "raise"] = "convert",
-        time: float = 0.0,
-    ) -> None:
-        if degenerate not in ("convert", "raise"):
-            raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
-        self._shape = (constraint_set.n_atoms, 3)
-        x = as_array(positions, self._shape, "positions")
-        self._given = constraint_set
-        self.constraint_set = without_second_order_rows(constraint_set, x, time, convert=degenerate == "convert")
-        self.n_atoms = constraint_set.n_atoms
-        self.masses = constraint_set.masses
-        touched = self.constraint_set.touched
-        # Few constrained atoms among many: work on a compact copy of them, and on nothing else.
-        self._atoms: IntArray | None = None if 2 * len(touched) >= self.n_atoms else touched
-        if self._atoms is None:
-            self._local = self.constraint_set
-        else:
-            self._local, _ = self.constraint_set.subset(np.arange(self.constraint_set.n_rows))
-        self.plan: Plan = make_plan(
-            self._local, x if self._atoms is None else x[self._atoms], time, self.constraint_set
-        )
-        self._touched = touched
-        # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
-        self._flat: IntArray = (3 * touched[:, None] + np.arange(3)).ravel() if self._atoms is not None else touched
-        self._lattice = self._local.lattice
-        #: A cell before the present one, until positions have shown that no row has another image for it.
-        self._unchecked: FloatArray | None = None
-        self._moving = self._local.moving
-        self._several = len(self.plan.solvers) > 1 or len(self.plan.pinned) > 0
-        self._iterations = [0] * len(self.plan.solvers)
-        self._rescuers = Rescuers(self._local, self.plan, self._atoms)
-
-    @property
-    def rank(self) -> int:
-        return self.plan.rank
-
-    @property
-    def conversions(self) -> tuple[FlatBody, ...]:
-        """Straight and flat groups whose rows were singular at second order, and what holds them instead."""
-        return self.constraint_set.conversions
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        return 3 * self.constraint_set.n_moving - self.plan.rank
-
-    def took(self, iterations: int) -> None:
-        """Remember for reports what a kernel took that did the work of all solvers in one call."""
-        for k in range(len(self._iterations)):
-            self._iterations[k] = iterations
-
-    # -- cell -----------------------------------------------------------------------------------
-
-    @property
-    def lattice(self) -> FloatArray | None:
-        """The cell and its inverse as they are now, shape (2, 3, 3); None without periodicity."""
-        return self.cell()
-
-    def set_cell(
-        self, cell: ArrayLike | None, pbc: bool | Sequence[bool] = True, positions: ArrayLike | None = None
-    ) -> None:
-        """Change the periodic cell in place; rows, targets, rank and solvers stay as they are.
-
-        For barostats and cell relaxation: costs microseconds where a new engine costs milliseconds.
-
-        Parameters
-        ----------
-        cell, pbc
-            As for `ConstraintSet`.
-        positions : array_like, shape (n_atoms, 3), optional
-            Positions in the new cell; where given, rows other than distances are checked against half the box at
-            once, and not when they are first projected.
-
-        Raises
-        ------
-        InputError
-            A degenerate cell, a row that is not shorter than half the box, or a first cell for rows whose images
-            have to be found anew; nothing was changed.
-        ImageError
-            Atoms of a row that nothing ties together are half the box apart at `positions`.
-        """
-        held = self.constraint_set
-        before = held.lattice
-        try:
-            held.with_cell(cell, pbc)
-            held.check_half_box(None if positions is None else as_array(positions, self._shape, "positions"), before)
-        except KconsError:
-            held.lattice = before
-            raise
-        # The solvers take the lattice at each call.
-        self._given.lattice = self._local.lattice = self._lattice = held.lattice
-        self._unchecked = before if positions is None else None
-
-    # -- positions ------------------------------------------------------------------------------
-
-    def project_positions(
-        self,
-        x_new: ArrayLike,
-        x_ref: ArrayLike,
-        *,
-        time: float = 0.0,
-        reference_time: float | None = None,
-        velocities: FloatArray | None = None,
-        dt: float | None = None,
-        out: FloatArray | None = None,
-        multipliers: FloatArray | None = None,
-    ) -> FloatArray:
-        """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 (SHAKE condition, true Newton).
-
-        Parameters
-        ----------
-        x_new, x_ref : array_like, shape (n_atoms, 3)
-            Positions to correct, and the positions whose gradients give the directions.
-        time, reference_time : float
-            Times of `x_new` and `x_ref`; `reference_time` defaults to `time`.
-        velocities : ndarray, shape (n_atoms, 3), optional
-            Changed in place by (correction)/`dt`, from the multipliers and not from rounded positions;
-            those of fixed atoms stay as they are.
-        dt : float, optional
-            Needed with `velocities`.
-        out : ndarray, optional
-            Where to put the result; ``out=x_new`` works in place. Without it a new array is made.
-        multipliers : ndarray, shape (n_rows,), optional
-            Receives Lambda, in natural units (x_new is changed by M^-1 A^T Lambda).
-
-        Returns
-        -------
-        ndarray, shape (n_atoms, 3)
-
-        Raises
-        ------
-        ConvergenceError
-            No solution near enough; nothing was changed.
-        InputError
-            Wrong shapes, or a NaN or infinity in the positions of a constrained atom.
-        """
-        x = as_array(x_new, self._shape, "x_new")
-        ref = as_array(x_ref, self._shape, "x_ref")
-        if out is not None:
-            check_out(out, self._shape)
-        inv_dt = 0.0
-        if velocities is not None:
-            check_out(velocities, self._shape, "velocities")
-            if not dt or not isfinite(dt):
-                raise InputError(f"velocities are corrected by 1/dt; dt is {dt}", item="dt")
-            inv_dt = 1.0 / dt
-        if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
-        reference_time = time if reference_time is None else reference_time
-        atoms = self._atoms
-        if atoms is None:
-            work = x if out is x_new else x.copy()
-            if np.may_share_memory(work, ref):
-                ref = ref.copy()
-            self._positions_direct(work, ref, time, reference_time, velocities, inv_dt, multipliers)
-            if out is None:
-                return work
-            if out is not x_new:
-                np.copyto(out, work)
-            return out
-        part = x.take(atoms, 0)
-        speeds = None if velocities is None else velocities.take(atoms, 0)
-        self._positions_direct(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers)
-        if out is None:
-            out = x.copy()
-        elif out is not x_new:
-            np.copyto(out, x)
-        out.put(self._flat, part)
-        if velocities is not None and speeds is not None:
-            velocities.put(self._flat, speeds)
-        return out
-
-    def _positions_direct(
-        self,
-        x: FloatArray,
-        ref: FloatArray,
-        time: float,
-        reference_time: float,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-    ) -> None:
-        """Run all solvers on the local arrays in place; restore them and raise if one fails."""
-        plan = self.plan
-        lattice = self.cell()
-        images = None if lattice is None else self._local.images
-        targets = self._local.target(time) if self._moving else None
-        # One solver alone restores what it changed; several need a copy to go back to.
-        several = self._several or images is not None
-        saved = (x.copy(), None if velocities is None else velocities.copy()) if several else None
-        found: list[FloatArray | None] = []
-        try:
-            if len(plan.pinned):
-                x[plan.pinned] = plan.pinned_targets(targets)
-                if plan.loose is not None:
-                    plan.check_loose_rows(x, time)
-            if images is not None and lattice is not None:
-                if self._unchecked is not None:
-                    self._local.refuse_other_images(ref, self._unchecked, reference_time, self._atoms)
-                    self._unchecked = None
-                stored, ref = ref, images.make_whole(ref, lattice)
-                shifts = images.follow(x, stored, ref, lattice)
-                x[images.atoms] += shifts
-            for k, solver in enumerate(plan.solvers):
-                lam = None if multipliers is None else np.empty(len(solver.rows))
-                cell = plan.cell_for(k, lattice)
-                outcome = solver.positions(x, ref, targets, cell, velocities, inv_dt, lam, time, reference_time)
-                if not outcome.converged or outcome.iterations > MANY_ITERATIONS:
-                    task = Task(x, ref, targets, cell, velocities, inv_dt, time, reference_time)
-                    if not outcome.converged:
-                        outcome = self._rescuers.rescue(solver, outcome, task, lam)
-                    if outcome.iterations > MANY_ITERATIONS:
-                        # A far start leaves the rounding of its size; once more from the near end removes it.
-                        task.polish(solver, lam)
-                self._iterations[k] = outcome.iterations
-                found.append(lam)
-            if images is not None:
-                self._local.refuse_loose_links(x, self._atoms)
-                x[images.atoms] -= shifts
-        except KconsError as error:
-            asked = x.copy() if images is not None else x
-            if saved is not None:
-                np.copyto(x, saved[0])
-                if velocities is not None and saved[1] is not None:
-                    np.copyto(velocities, saved[1])
-            if isinstance(error, ConvergenceError):
-                # Atoms that have reached half the cell are the cause, and no step size a remedy.
-                self._local.refuse_loose_links(asked, self._atoms)
-            raise
-        if multipliers is not None:
-            self._collect(found, multipliers)
-
-    def _collect(self, found: list[FloatArray | None], multipliers: FloatArray) -> None:
-        """Multipliers of all solvers by row; 0 for rows that none of them has."""
-        if (self.plan.labels < 0).any():
-            multipliers[:] = 0.0
-        for solver, lam in zip(self.plan.solvers, found, strict=True):
-            multipliers[solver.rows] = lam
-
-    @property
-    def sources(self) -> tuple[ConstraintSet, ConstraintSet]:
-        """The set that was given and `constraint_set`: a barostat may change the cell in either."""
-        return self._given, self.constraint_set
-
-    def cell(self) -> FloatArray | None:
-        """`lattice`, which a barostat may have changed in the set that was given."""
-        if self._given.lattice is self._lattice and self.constraint_set.lattice is self._lattice:
-            return self._lattice
-        for source in (self._given, self.constraint_set):
-            if source.lattice is not self._lattice:
-                self._unchecked = self._lattice
-                self._lattice = source.lattice
-                self._given.lattice = self.constraint_set.lattice = self._local.lattice = self._lattice
-        return self._lattice
 
     def restore_positions(
         self,
@@ -377,133 +110,23 @@ class Motion:
             def pairs() -> IntArray:
                 return table
 
-        self._rescuers.work = work = Work(self.plan)
-        try:
-            result = restored(
-                self.constraint_set, self.plan, start, time, pairs, lambda y: self._nearest(y, time, work)
-            )
-        finally:
-            self._rescuers.work = None
+        work = Work(self.plan)
+
+        def nearest(y: FloatArray) -> FloatArray:
+            result = y.copy()
+            local = result if self._atoms is None else result[self._atoms]
+            self._solve.nearest(local, time, work)
+            if self._atoms is not None:
+                result[self._atoms] = local
+            return result
+
+        result = restored(self.constraint_set, self.plan, start, time, pairs, nearest)
         if out is None:
             return result
         np.copyto(out, result)
         return out
 
-    def _nearest(self, x: FloatArray, time: float, work: Work) -> FloatArray:
-        """The nearest point on the constraints in the mass metric; a new array."""
-        result = x.copy()
-        local = result if self._atoms is None else result[self._atoms]
-        targets = self._local.target(time) if self._moving else None
-        if len(self.plan.pinned):
-            local[self.plan.pinned] = self.plan.pinned_targets(targets)
-        start = FarStart(
-            self._local,
-            self.plan,
-            self._atoms,
-            self._positions_direct,
-            self._tangents,
-            work,
-            lambda: max(self._iterations, default=0),
-        )
-        start.restore(local, time)
-        if self._atoms is not None:
-            result[self._atoms] = local
-        return result
-
-    # -- velocities, accelerations, forces ------------------------------------------------------
-
-    def project_velocities(
-        self,
-        x: ArrayLike,
-        v: ArrayLike,
-        *,
-        time: float = 0.0,
-        out: FloatArray | None = None,
-        multipliers: FloatArray | None = None,
-    ) -> FloatArray:
-        """Nearest admissible velocities in the mass metric: A v = c (RATTLE's second stage).
-
-        v - M^-1 A^T mu with (A M^-1 A^T) mu = A v - c; kinetic energy can only decrease where c = 0.
-
-        Parameters
-        ----------
-        x, v : array_like, shape (n_atoms, 3)
-        time : float
-        out : ndarray, optional
-            ``out=v`` works in place.
-        multipliers : ndarray, shape (n_rows,), optional
-            Receives mu, in natural units.
-
-        Raises
-        ------
-        ConvergenceError, InputError
-            As `project_positions`; nothing was changed.
-        """
-        y = as_array(v, self._shape, "velocities")
-        here = as_array(x, self._shape, "positions")
-        if out is not None:
-            check_out(out, self._shape)
-        if multipliers is not None:
-            check_multipliers(multipliers, self.constraint_set.n_rows)
-        atoms = self._atoms
-        if atoms is None:
-            work = y if out is v else y.copy()
-            if np.may_share_memory(work, here):
-                here = here.copy()
-            self._tangents(here, work, self._rates(here, time), time, multipliers, "velocity")
-            if out is None:
-                return work
-            if out is not v:
-                np.copyto(out, work)
-            return out
-        here = here.take(atoms, 0)
-        part = y.take(atoms, 0)
-        self._tangents(here, part, self._rates(here, time), time, multipliers, "velocity")
-        if out is None:
-            out = y.copy()
-        elif out is not v:
-            np.copyto(out, y)
-        out.put(self._flat, part)
-        return out
-
-    def _rates(self, x: FloatArray, time: float) -> FloatArray | None:
-        """c of A v = c at local positions; None if it is 0."""
-        return self._local.velocity_target(x, time) if self.plan.driven else None
-
-    def _tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        time: float,
-        multipliers: FloatArray | None,
-        what: str,
-    ) -> None:
-        plan = self.plan
-        lattice = self.cell()
-        saved = y.copy() if self._several else None
-        if lattice is not None:
-            x = self._local.whole(x)
-        if len(plan.pinned):
-            y[plan.pinned] = 0.0 if rates is None else rates[plan.pinned_rows].reshape(-1, 3)
-            if plan.loose is not None:
-                try:
-                    plan.check_loose_rates(x, y, rates, time, what)
-                except KconsError:
-                    if saved is not None:
-                        np.copyto(y, saved)
-                    raise
-        found: list[FloatArray | None] = []
-        for k, solver in enumerate(plan.solvers):
-            lam = None if multipliers is None else np.empty(len(solver.rows))
-            outcome = solver.tangents(x, y, rates, plan.cell_for(k, lattice), lam, time)
-            if not outcome.converged:
-                if saved is not None:
-                    np.copyto(y, saved)
-                raise failures.tangents_failed(self._local, self._atoms, x, y, outcome, solver, what, plan)
-            found.append(lam)
-        if multipliers is not None:
-            self._collect(found, multipliers)
+    # -- accelerations, forces ------------------------------------------------------------------
 
     def acceleration(
         self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
@@ -535,6 +158,7 @@ class Motion:
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
         force = as_array(f, self._shape, "forces")
+        self.cell()
         with np.errstate(divide="ignore", invalid="ignore"):
             a = force / self.masses[:, None]
         local_x, local_v = (here, speed) if self._atoms is None else (here[self._atoms], speed[self._atoms])
@@ -547,7 +171,7 @@ class Motion:
             arrays = {"velocity": local_v, "position": local_x}
             raise failures.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
         mu = np.zeros(self._local.n_rows)
-        self._tangents(local_x, local_a, b, time, mu, "force")
+        self._solve.tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
             a[self._atoms] = local_a
         lam = self.plan.least_norm(local_x, -mu, time)
@@ -569,10 +193,11 @@ class Motion:
         here = as_array(x, self._shape, "positions")
         if out is not None:
             check_out(out, self._shape)
+        self.cell()
         touched, masses = self._touched, self._local.masses[:, None]
         local = force if self._atoms is None else force.take(touched, 0)
         y = local * self.plan.inverse_masses[:, None]
-        self._tangents(here if self._atoms is None else here.take(touched, 0), y, None, time, None, "force")
+        self._solve.tangents(here if self._atoms is None else here.take(touched, 0), y, None, time, None, "force")
         if self._atoms is None:
             y, masses = y.take(touched, 0), masses[touched]
         result = force.copy() if out is None else out
@@ -608,7 +233,9 @@ class Motion:
         here = as_array(x, self._shape, "positions")
         speed = None if v is None else as_array(v, self._shape, "velocities")
         self.cell()
-        return make_report(self.constraint_set, self.plan, here, speed, time, self._iterations, condition=condition)
+        return make_report(
+            self.constraint_set, self.plan, here, speed, time, self._solve.iterations, condition=condition
+        )
 
     def __repr__(self) -> str:
         return f"<Motion: {self.constraint_set.n_rows} rows of rank {self.rank} on {self.n_atoms} atoms>"

@@ -15,8 +15,9 @@ from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
 from kcons.plan.rank import rank_of_shape, ranked, small_enough
 from kcons.plan.solver_table import solver_of
-from kcons.solvers.cluster_solver import ClusterSolver
+from kcons.solvers.cluster_solver import ClusterSolver, Request
 from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rank_revealing import RANK_TOLERANCE
 
 #: Largest cluster, in rows, whose multipliers of least norm are found by dense algebra.
 DENSE_ROWS = 1500
@@ -81,9 +82,9 @@ class Plan:
     late: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     _places: FloatArray | None = None
 
-    def cell_for(self, solver: int, lattice: FloatArray | None) -> FloatArray | None:
-        """The cell that a solver is given: None where positions come whole and every image is as they say."""
-        return None if self.whole[solver] else lattice
+    def asked_of(self, solver: int, request: Request) -> Request:
+        """What a solver is asked: no cell where positions come whole and every image is as they say."""
+        return request._replace(lattice=None) if self.whole[solver] else request
 
     def pinned_targets(self, targets: FloatArray | None) -> FloatArray:
         """Where fixed atoms are held, shape (len(pinned), 3)."""
@@ -177,7 +178,7 @@ class Plan:
             transposed = transposed[used]
             force = transposed @ lam[rows]
             if len(rows) <= DENSE_ROWS:
-                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=1e-10)[0]
+                lam[rows] = np.linalg.lstsq(transposed.toarray(), force, rcond=RANK_TOLERANCE)[0]
             else:
                 from scipy.sparse.linalg import lsqr  # slow to import, rarely needed
 

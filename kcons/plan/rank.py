@@ -11,7 +11,8 @@ from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.general_clusters import RANK_TOLERANCE, GeneralClusters
+from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.rank_revealing import independent, rank
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
@@ -39,7 +40,7 @@ def ranked(
 
     jacobian = constraint_set.jacobian(positions, time)
     root_w = np.repeat(np.sqrt(inverse_masses), 3)
-    rank = 0
+    found = 0
     for rows in clusters:
         part = jacobian[rows]
         columns, place = np.unique(part.indices, return_inverse=True)
@@ -49,10 +50,11 @@ def ranked(
         triangle, order = qr((b / np.where(size > 0, size, 1.0)).T, mode="r", pivoting=True)
         diagonal = np.zeros(len(rows))
         diagonal[: min(triangle.shape)] = np.abs(np.diagonal(triangle))
-        left_over = diagonal <= RANK_TOLERANCE * diagonal[0]
+        # The diagonal of the triangle stands for the singular values: it does not grow, and is their size.
+        left_over = ~independent(diagonal)
         late[rows[order]] = left_over
-        rank += int(np.sum(~left_over))
-    return rank
+        found += int(np.sum(~left_over))
+    return found
 
 
 def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArray, lattice: FloatArray | None) -> int:
@@ -67,11 +69,7 @@ def rank_of_small(shape: Shape, inverse_masses: FloatArray, positions: FloatArra
     root_w = np.sqrt(inverse_masses[shape.atoms[0]])
     b[:, row, shape.pairs[:, 0]] = difference * root_w[shape.pairs[:, 0], None]
     b[:, row, shape.pairs[:, 1]] = -difference * root_w[shape.pairs[:, 1], None]
-    flat = b.reshape(n, k, -1)
-    size = np.linalg.norm(flat, axis=2, keepdims=True)
-    unit = np.divide(flat, size, out=np.zeros_like(flat), where=size > 0)
-    s = np.linalg.svd(unit, compute_uv=False)
-    return int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
+    return rank(b.reshape(n, k, -1))
 
 
 def rank_of_shape(
@@ -83,12 +81,9 @@ def rank_of_shape(
     time: float,
 ) -> int:
     """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, SparseRows):
+    if isinstance(solver, (SparseRows, SparseDistances)):
         return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
-        sparse = solver.solver
-        if isinstance(sparse, SparseDistances):
-            return sparse.rank(positions, lattice)
         return rank_of_small(shape, inverse_masses, positions, lattice)
     assert isinstance(solver, GeneralClusters)
     return solver.rank(positions, time)

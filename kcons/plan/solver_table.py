@@ -8,8 +8,7 @@ from kcons.constraints.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.chains.open_chains import Chains
-from kcons.solvers.cluster_solver import ClusterSolver, DistanceSolver
-from kcons.solvers.distance_clusters import DistanceClusters, LongChains
+from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.small_clusters import SmallClusters
@@ -31,15 +30,11 @@ def solver_of(
         return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
     if shape.kind == "mixed":
         return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
-    targets = constraint_set.target(time)
-    solver: DistanceSolver
+    targets = constraint_set.target(time)[rows]
     if shape.kind == "water":
-        solver = RigidTriangles(rows, shape.atoms, targets[rows], inverse_masses[shape.atoms[0]])
-    elif shape.kind == "lanes":
-        solver = SmallClusters(rows, shape.atoms, shape.pairs, targets[rows], inverse_masses[shape.atoms[0]])
-    elif shape.kind == "chain":
-        chains = Chains(rows, shape.starts, shape.atoms, targets[rows], inverse_masses[shape.atoms])
-        return LongChains(chains, shape.pairs, targets)
-    else:
-        solver = SparseDistances(rows, shape.pairs, targets[rows], inverse_masses, None if late is None else late[rows])
-    return DistanceClusters(solver, targets)
+        return RigidTriangles(rows, shape.atoms, targets, inverse_masses[shape.atoms[0]])
+    if shape.kind == "lanes":
+        return SmallClusters(rows, shape.atoms, shape.pairs, targets, inverse_masses[shape.atoms[0]])
+    if shape.kind == "chain":
+        return Chains(rows, shape.starts, shape.atoms, targets, inverse_masses[shape.atoms])
+    return SparseDistances(rows, shape.pairs, targets, inverse_masses, None if late is None else late[rows])

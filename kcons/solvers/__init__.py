@@ -1,9 +1,10 @@
 """Constraint solvers, one shape of cluster each; the Numba kernels live here.
 
 - `kernels`: what compiled kernels are made of
-- `cluster_solver`: the contract of a solver, and what it reports
+- `cluster_solver`: the contract of a solver: what it is asked, and what it reports
+- `distance_clusters`: what the solvers of held distances share
 - `rigid_triangles`, `small_clusters`, `chains`, `sparse`: held distances by shape, and rows of mixed kinds
-- `distance_clusters`: held distances of every shape behind one contract
+- `rank_revealing`: which rows are independent
 - `general_clusters`: any rows whatever
 - `fused_distances`: distances of every shape in one call
 """

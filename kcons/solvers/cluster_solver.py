@@ -1,11 +1,44 @@
-"""The contract of a cluster solver, and what it reports back after one call."""
+"""The contract of a cluster solver: what it is asked to do, and what it reports back."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+
+
+class Request(NamedTuple):
+    """One projection, in place on the whole local arrays.
+
+    Attributes
+    ----------
+    changed : ndarray, shape (n_atoms, 3)
+        What is changed in place: positions, or vectors to be made tangent (velocities, forces per mass).
+    reference : ndarray, shape (n_atoms, 3)
+        Positions on the constraints, whose gradients give the directions.
+    wanted : ndarray, shape (n_rows,), optional
+        Targets, or rates, by row of the set; None for the targets found at set-up, and for no motion of the surface.
+    lattice : ndarray, shape (2, 3, 3), optional
+        Cell and its inverse; None without periodicity.
+    time, reference_time : float
+        Times of `changed` and `reference`; of tangents only `time` counts.
+    velocities : ndarray, shape (n_atoms, 3), optional
+        Changed by the displacement of positions times `inv_dt`.
+    inv_dt : float
+    """
+
+    changed: FloatArray
+    reference: FloatArray
+    wanted: FloatArray | None = None
+    lattice: FloatArray | None = None
+    time: float = 0.0
+    reference_time: float = 0.0
+    velocities: FloatArray | None = None
+    inv_dt: float = 0.0
 
 
 class Outcome(NamedTuple):
@@ -33,60 +66,28 @@ class Outcome(NamedTuple):
 class ClusterSolver(Protocol):
     """A solver of one kind for all clusters of one shape.
 
-    Both methods work in place on the whole local arrays, touch only the atoms of their rows, and leave
-    everything as it was when the outcome is not converged. `targets` and `rates` are indexed by row of
-    the set (None: the targets found at set-up; no motion of the surface).
+    Both methods touch only the atoms of their rows, and leave everything as it was when the outcome is not
+    converged. `multipliers`, in the order of `rows`, receive those of unit steps in what a row measures.
     """
 
     name: str
     rows: IntArray
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome: ...
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
+        """Solve sigma(x + M^-1 A(reference)^T Lambda, time) = 0; `multipliers` receive Lambda."""
+        ...
 
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome: ...
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
+        """y - M^-1 A^T mu with A y = rates; `multipliers` receive mu."""
+        ...
 
 
-class DistanceSolver(Protocol):
-    """The kernels behind `DistanceClusters`; lengths and rates come in the order of `rows`."""
-
-    name: str
-    rows: IntArray
-
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        lengths: FloatArray,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-    ) -> Outcome: ...
-
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-    ) -> Outcome: ...
+def go_on(
+    positions: Callable[[Request, FloatArray | None], Outcome], request: Request, multipliers: FloatArray | None
+) -> bool:
+    """Let a solver go on from the positions where it ended, and add to `multipliers`; whether it converged again."""
+    more = None if multipliers is None else np.empty(len(multipliers))
+    again = positions(request, more)
+    if again.converged and multipliers is not None and more is not None:
+        multipliers += more
+    return again.converged

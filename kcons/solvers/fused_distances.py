@@ -18,11 +18,12 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.sweeps import project
+from kcons.solvers.distance_clusters import resolved
 from kcons.solvers.kernels.aligned_memory import LINE, aligned
 from kcons.solvers.kernels.array_views import piece
 from kcons.solvers.kernels.eight_wide import WIDTH
 from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, OPEN, lattice_kind, restore_points
-from kcons.solvers.rigid_triangles import RigidTriangles, triangle_positions, triangle_tangents
+from kcons.solvers.rigid_triangles import RigidTriangles, project_triangles
 from kcons.solvers.sparse import distances
 from kcons.solvers.sparse.distances import SparseDistances
 
@@ -92,8 +93,7 @@ def packed(
     if triangles is None:
         pieces += [np.zeros(0, dtype=np.uint32)] * 2 + [np.zeros(0)] * 3
     else:
-        corners, slots, sides, inv_mass, undo = triangles.tables()
-        pieces += [corners, slots, sides.ravel(), inv_mass, undo]
+        pieces += triangles.tables()
     pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()]
     pieces += [np.zeros(0)] * _CHAIN_PIECES if chains is None else chains.tables(numbers)
     pieces += more
@@ -159,15 +159,15 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
                 return most if turn else -1
             most = max(most, iterations)
         if triangles is not None and turn == 0:
-            landed, _, iterations, _ = triangle_positions(
-                x, x_ref, v, inv_dt, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _SIDES).reshape(-1, 3),
-                piece(t, h, _WEIGHTS), lattice, kind, t[:0], piece(t, h, _UNDO),
+            landed, _, iterations, _ = project_triangles(
+                x, x_ref, v, inv_dt, None, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
+                piece(t, h, _SIDES), lattice, kind, t[:0], piece(t, h, _UNDO),
             )  # fmt: skip
             if not landed:
                 return -1
             most = max(most, iterations)
         if chains is not None and turn == 0:
-            # As `kcons.plan.plan.LongChains` does it.
+            # As `Chains.positions` does it.
             for again in range(_MAX_ROUNDS + 1):
                 landed, _, iterations, _ = project(
                     x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
@@ -178,7 +178,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
                 )  # fmt: skip
                 if again == 0:
                     first, most = landed, max(most, iterations)
-                if not landed or distances.resolved(
+                if not landed or resolved(
                     x, piece(u, h, _CHAINS + 9).reshape(-1, 2), piece(t, h, _CHAINS + 8), lattice, kind != OPEN
                 ):
                     break
@@ -192,7 +192,7 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
             break
         distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
         # Large multipliers have a rounding that shows in the positions; another round takes it away.
-        if distances.resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, kind != OPEN):
+        if resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, kind != OPEN):
             break
     return most
 
@@ -215,9 +215,9 @@ def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no
         if failed:
             return False
     if triangles is not None:
-        converged, _, _, _ = triangle_tangents(
-            x, v, piece(u, h, _CORNERS), piece(u, h, _SLOTS), t[:0], piece(t, h, _WEIGHTS), lattice, kind, t[:0],
-            piece(t, h, _UNDO),
+        converged, _, _, _ = project_triangles(
+            v, x, t[:0].reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
+            t[:0], lattice, kind, t[:0], piece(t, h, _UNDO),
         )  # fmt: skip
         if not converged:
             return False

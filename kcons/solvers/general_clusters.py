@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import Outcome, Request
+from kcons.solvers.rank_revealing import damped, independent, least_norm, rank
 
-#: Singular values of the row-normalised, mass-weighted matrix below this part of the largest are redundant.
-RANK_TOLERANCE = 1e-8
 MAX_ITERATIONS = 50
 #: |A v - c| allowed after a projection, relative to the speeds of the cluster (unit rows).
 SPEED_TOLERANCE = 1e-11
@@ -122,34 +121,23 @@ class GeneralClusters:
 
     # -- positions ------------------------------------------------------------------------------
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
-        self.subset.lattice = lattice
-        state = x_new[self.atoms]
+        self.subset.lattice = request.lattice
+        state = request.changed[self.atoms]
         with np.errstate(all="ignore"):
-            reference = self._data(x_ref[self.atoms], reference_time)
+            reference = self._data(request.reference[self.atoms], request.reference_time)
             total = np.zeros(len(self.rows))
             moves = np.zeros_like(state)
             worst = Outcome(True, 0.0, 0, -1)
             for batch in self._batches:
-                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), time, total)
+                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), request.time, total)
                 if not outcome.converged:
                     return outcome
                 worst = _worse(worst, outcome)
-        x_new[self.atoms] = state
-        if velocities is not None:
-            velocities[self.atoms] += inv_dt * moves
+        request.changed[self.atoms] = state
+        if request.velocities is not None:
+            request.velocities[self.atoms] += request.inv_dt * moves
         if multipliers is not None:
             multipliers[:] = total
         return worst
@@ -173,7 +161,7 @@ class GeneralClusters:
         # Unknowns are the parts along an orthonormal basis of the reference rows: the matrix then has the
         # condition of the rows and not its square, and dependent rows are out of it from the start.
         u0, s0, v0t = np.linalg.svd(unit0, full_matrices=False)
-        kept = s0 > RANK_TOLERANCE * s0[:, :1]
+        kept = independent(s0)
         basis = v0t * kept[..., None]
         scale = self._scale[batch.rows]
         root_w = self._root_w[batch.columns]
@@ -203,7 +191,7 @@ class GeneralClusters:
                 return _failed(batch, bad, iteration)
             safe = np.where(held, size, 1.0)
             rows = np.where(held[..., None], b / safe[..., None], 0.0)
-            step = -_least_norm(np.einsum("nkc,nrc->nkr", rows, basis), sigma / safe)
+            step = -least_norm(np.einsum("nkc,nrc->nkr", rows, basis), sigma / safe)
             shift = root_w * np.einsum("nrc,nr->nc", basis, step)
             here = flat[batch.columns]
             factor = np.where(done, 0.0, 1.0)
@@ -266,7 +254,7 @@ class GeneralClusters:
             here = flat[batch.columns]
             active = ~settled
             for _ in range(_HALVINGS):
-                step = -root_w * _damped(b, sigma, damping)
+                step = -root_w * damped(b, sigma, damping)
                 flat[batch.columns] = here + np.where(active[:, None], step, 0.0)
                 trial = self._sigma(batch, state, time) * held
                 trial_error = _rms(trial)
@@ -289,19 +277,12 @@ class GeneralClusters:
 
     # -- tangents -------------------------------------------------------------------------------
 
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome:
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """y <- y - M^-1 A^T mu with A y = rates, in place; see `Motion.project_velocities`."""
-        self.subset.lattice = lattice
+        rates, y = request.wanted, request.changed
+        self.subset.lattice = request.lattice
         with np.errstate(all="ignore"):
-            data = self._data(x[self.atoms], time)
+            data = self._data(request.reference[self.atoms], request.time)
             local = y[self.atoms]
             flat = local.reshape(-1)
             mu = np.zeros(len(self.rows))
@@ -325,7 +306,7 @@ class GeneralClusters:
                 scaled = np.where(free, speeds / np.where(free, root_w, 1.0), 0.0)
                 reach = np.maximum(np.linalg.norm(scaled, axis=1), np.linalg.norm(wanted, axis=1))
                 u, s, _ = np.linalg.svd(unit, full_matrices=False)
-                inverse = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / s**2, 0.0)
+                inverse = np.where(independent(s), 1 / s**2, 0.0)
                 total = np.zeros(size.shape)
                 for _ in range(3):
                     miss = np.einsum("nkc,nc->nk", unit, scaled) - wanted
@@ -350,13 +331,7 @@ class GeneralClusters:
     def rank(self, x: FloatArray, time: float) -> int:
         """Independent rows at `x`, by singular values."""
         data = self._data(x[self.atoms], time)
-        rank = 0
-        for batch in self._batches:
-            b = self._weighted(batch, data)
-            size = np.linalg.norm(b, axis=2, keepdims=True)
-            s = np.linalg.svd(np.divide(b, size, out=np.zeros_like(b), where=size > 0), compute_uv=False)
-            rank += int(np.sum(s > RANK_TOLERANCE * s[:, :1]))
-        return rank
+        return sum(rank(self._weighted(batch, data)) for batch in self._batches)
 
 
 def _worse(one: Outcome, other: Outcome) -> Outcome:
@@ -379,19 +354,3 @@ def _each(test: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _rms(values: FloatArray) -> FloatArray:
     return np.sqrt(np.mean(values**2, axis=1))
-
-
-def _least_norm(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Least-norm, least-squares solutions of a stack of systems, singular directions cut."""
-    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    inverse = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / np.where(s > 0, s, 1.0), 0.0)
-    return np.einsum("nrk,nr->nk", vt, inverse * np.einsum("nkr,nk->nr", u, right))
-
-
-def _damped(unit: FloatArray, right: FloatArray, damping: FloatArray) -> FloatArray:
-    """B^+ right, or (B^T B + damping)^-1 B^T right where `damping` is positive."""
-    u, s, vt = np.linalg.svd(unit, full_matrices=False)
-    plain = np.where(s > RANK_TOLERANCE * s[:, :1], 1 / np.where(s > 0, s, 1.0), 0.0)
-    filtered = s / (s**2 + damping[:, None] * s[:, :1] ** 2)
-    weight = np.where(damping[:, None] > 0, filtered, plain)
-    return np.einsum("nrc,nr->nc", vt, weight * np.einsum("nkr,nk->nr", u, right))

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.solvers.cluster_solver import Outcome
-from kcons.solvers.kernels.aligned_memory import aligned
+from kcons.solvers.distance_clusters import EightAtATime
+from kcons.solvers.kernels import groups_of_eight as groups
 from kcons.solvers.kernels.eight_wide import (
     FASTMATH,
     WIDTH,
@@ -31,23 +31,6 @@ from kcons.solvers.kernels.eight_wide import (
     square_root,
     stack,
     store,
-)
-from kcons.solvers.kernels.groups_of_eight import (
-    MAX_ITERATIONS,
-    NO_NUMBERS,
-    NO_POINTS,
-    OPEN,
-    POSITION_TOLERANCE,
-    SAVED,
-    TANGENT_TOLERANCE,
-    TINY,
-    dot,
-    lane_tables,
-    lattice_kind,
-    lattice_numbers,
-    minimum_image,
-    restore_points,
-    worst_row,
 )
 
 LARGEST = 6
@@ -102,7 +85,7 @@ def _gram(matrix, left, right, coupling, n):
         x, y, z = _point(left, k)
         for j in range(n):
             a, b, c = _point(right, j)
-            poke(matrix, k * n + j, dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
+            poke(matrix, k * n + j, groups.dot(x, y, z, a, b, c) * peek(coupling, k * n + j))
     _factor(matrix, n)
 
 
@@ -119,70 +102,84 @@ def _move(bonds, directions, step, coupling, n):
 
 
 @functools.cache
-def _kernels(n_rows: int) -> tuple[Any, Any]:
-    """Kernels for clusters of `n_rows` rows; the closed-over number unrolls their loops."""
+def _kernel(n_rows: int) -> Any:
+    """The kernel for clusters of `n_rows` rows; the closed-over number unrolls its loops."""
     n, n_square, n_coordinates = n_rows, n_rows * n_rows, 3 * n_rows
     n_shifts = 3 * (n_rows + 1)
 
     @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-    def positions(
-        points,
-        references,
-        velocities,
-        inverse_dt,
-        atoms,
-        slots,
-        ends,
-        weights,
-        couplings,
-        lengths,
-        lattice,
-        kind,
-        multipliers,
-        undo,
-    ):
-        move = velocities.shape[0] > 0
-        report = multipliers.shape[0] > 0
+    def project(
+        points, references, velocities, inverse_dt, tangent, atoms, slots, ends, weights, couplings,
+        given, lattice, kind, multipliers, undo,
+    ):  # fmt: skip
+        """Project one group of eight clusters after another; `tangent` as in `project_triangles`."""
+        move, report, driven = velocities.shape[0] > 0, multipliers.shape[0] > 0, given.shape[0] > 0
         n_local = weights.shape[0]
-        cell = lattice_numbers(lattice)
+        # Points kept of a cluster, and what residuals are counted in.
+        kept_points, unit = (2 * n_local, 2.0) if tangent is None else (n_local, 1.0)
+        cell = groups.lattice_numbers(lattice)
         errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
+        # Reference bonds s, present bonds r; what is wanted of these, and what errors are compared with.
         s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
         matrix, coupling = stack(n_square), stack(n_square)
-        squares, error, step, total = stack(n), stack(n), stack(n), stack(n)
+        squares, wanted = stack(n), stack(n)
+        error, step, total = stack(n), stack(n), stack(n)
         for k in range(n_square):
             poke(coupling, k, splat(couplings[k]))
         worst, worst_at, most = 0.0, -1, 0
         for group in range(slots.shape[0] // WIDTH):
             at = group * n_local * WIDTH
+            size = splat(0.0)
             for k in range(n):
                 i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
                 x, y, z = gather_differences(references, atoms, i, j)
                 a, b, c = gather_differences(points, atoms, i, j)
-                if kind != OPEN:
-                    x, y, z = minimum_image(x, y, z, cell, kind)
-                    a, b, c = minimum_image(a, b, c, cell, kind)
+                if kind != groups.OPEN:
+                    x, y, z = groups.minimum_image(x, y, z, cell, kind)
+                    if tangent is None:
+                        a, b, c = groups.minimum_image(a, b, c, cell, kind)
                 _set_point(s, k, x, y, z)
                 _set_point(r, k, a, b, c)
-                length = gather(lengths, slots, group * WIDTH, k)
-                poke(squares, k, length * length)
                 poke(total, k, splat(0.0))
+                if tangent is None:
+                    length = gather(given, slots, group * WIDTH, k)
+                    poke(squares, k, length * length)
+                else:
+                    square = groups.dot(x, y, z, x, y, z)
+                    poke(squares, k, square)
+                    size = size + groups.dot(a, b, c, a, b, c)
+                    rate = splat(0.0)
+                    if driven:
+                        rate = gather(given, slots, group * WIDTH, k)
+                        size = size + rate * rate
+                        rate = rate * square_root(square)
+                    poke(wanted, k, rate)
+            if tangent is not None:
+                size = size * (groups.TANGENT_TOLERANCE * groups.TANGENT_TOLERANCE)
+                _gram(matrix, s, s, coupling, n)
             iteration = 0
             ok = False
             while True:
-                ok = True
+                # An infinite speed would make every error look small.
+                ok = all_within(size, 1e300)
                 for k in range(n):
                     x, y, z = _point(r, k)
-                    e = peek(squares, k) - dot(x, y, z, x, y, z)
+                    if tangent is None:
+                        e = peek(squares, k) - groups.dot(x, y, z, x, y, z)
+                        limit = peek(squares, k) * (2.0 * groups.POSITION_TOLERANCE)
+                        ok = ok and all_within(absolute(e), limit)
+                    else:
+                        a, b, c = _point(s, k)
+                        e = peek(wanted, k) - groups.dot(x, y, z, a, b, c)
+                        ok = ok and all_within(e * e, size * peek(squares, k))
                     poke(error, k, e)
-                    limit = peek(squares, k) * (2.0 * POSITION_TOLERANCE)
-                    ok = ok and all_within(absolute(e), limit)
-                if ok or iteration == MAX_ITERATIONS:
+                if ok or iteration == groups.MAX_ITERATIONS:
                     break
                 # A factor serves two steps: Newton, then chord; order three for both.
-                if iteration % 2 == 0:
+                if tangent is None and iteration % 2 == 0:
                     _gram(matrix, r, s, coupling, n)
                 for k in range(n):
-                    poke(step, k, 0.5 * peek(error, k))
+                    poke(step, k, peek(error, k) / unit)
                 _solve(matrix, step, n)
                 _move(r, s, step, coupling, n)
                 for k in range(n):
@@ -191,166 +188,60 @@ def _kernels(n_rows: int) -> tuple[Any, Any]:
             most = max(most, iteration)
             kept, better = True, True
             for k in range(n):
-                # A bond that turned round has found the wrong root.
-                x, y, z = _point(r, k)
-                a, b, c = _point(s, k)
-                kept = kept and all_within(TINY, dot(x, y, z, a, b, c))
-                better = better and all_within(absolute(peek(error, k)), peek(squares, k) * (2.0 * worst))
+                e, inner = peek(error, k), peek(squares, k)
+                if tangent is None:
+                    # A bond that turned round has found the wrong root.
+                    x, y, z = _point(r, k)
+                    a, b, c = _point(s, k)
+                    e, inner = absolute(e), groups.dot(x, y, z, a, b, c)
+                else:
+                    e = e * e
+                poke(error, k, e)
+                poke(step, k, inner)
+                kept = kept and all_within(groups.TINY, inner)
+                better = better and all_within(e, peek(squares, k) * (unit * worst))
             if not (ok and kept and better):
                 for k in range(n):
                     store(errors, k * WIDTH, peek(error, k))
-                    store(sizes, k * WIDTH, 2.0 * peek(squares, k))
+                    store(sizes, k * WIDTH, unit * peek(squares, k))
                     if ok and not kept:
-                        x, y, z = _point(r, k)
-                        a, b, c = _point(s, k)
-                        store(errors, k * WIDTH, not_positive(dot(x, y, z, a, b, c)))
+                        store(errors, k * WIDTH, not_positive(peek(step, k)))
                         store(sizes, k * WIDTH, splat(1.0))
-                worst, worst_at = worst_row(errors, sizes, n)
+                worst, worst_at = groups.worst_row(errors, sizes, n)
                 worst_at += group * n * WIDTH
                 if not (ok and kept):
-                    restore_points(points, atoms, undo, group, n_local, 2 * n_local, 0)
+                    groups.restore_points(points, atoms, undo, group, n_local, kept_points, 0)
                     if move:
-                        restore_points(velocities, atoms, undo, group, n_local, 2 * n_local, n_local)
-                    return False, worst, most, worst_at
+                        groups.restore_points(velocities, atoms, undo, group, n_local, kept_points, n_local)
+                    return False, worst if tangent is None else np.sqrt(worst), most, worst_at
             for a in range(n_local):
                 _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
             for k in range(n):
                 x, y, z = _point(s, k)
                 f = peek(total, k)
+                if report:
+                    g = f * square_root(groups.dot(x, y, z, x, y, z))
+                    scatter(multipliers, slots, group * WIDTH, k, g if tangent is None else -g)
                 x, y, z = f * x, f * y, f * z
                 i, j = ends[2 * k], ends[2 * k + 1]
                 a, b, c = _point(shifts, i)
                 _set_point(shifts, i, a + x, b + y, c + z)
                 a, b, c = _point(shifts, j)
                 _set_point(shifts, j, a - x, b - y, c - z)
-                if report:
-                    x, y, z = _point(s, k)
-                    f = f * square_root(dot(x, y, z, x, y, z))
-                    scatter(multipliers, slots, group * WIDTH, k, f)
-            saved = 2 * group * n_local * SAVED
+            saved = kept_points * group * groups.SAVED
             for a in range(n_local):
                 w, i = weights[a], at + a * WIDTH
                 dx, dy, dz = _point(shifts, a)
                 dx, dy, dz = w * dx, w * dy, w * dz
-                x, y, z = keep_points(points, atoms, i, undo, saved + a * SAVED)
+                x, y, z = keep_points(points, atoms, i, undo, saved + a * groups.SAVED)
                 scatter_points(points, atoms, i, x + dx, y + dy, z + dz)
-                if move:
-                    x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * SAVED)
+                if tangent is None and move:
+                    x, y, z = keep_points(velocities, atoms, i, undo, saved + (n_local + a) * groups.SAVED)
                     x, y, z = x + dx * inverse_dt, y + dy * inverse_dt, z + dz * inverse_dt
                     scatter_points(velocities, atoms, i, x, y, z)
-        return True, worst, most, worst_at
+        return True, worst if tangent is None else np.sqrt(worst), most, worst_at
 
-    @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
-    def tangents(
-        points,
-        vectors,
-        atoms,
-        slots,
-        ends,
-        weights,
-        couplings,
-        rates,
-        lattice,
-        kind,
-        multipliers,
-        undo,
-    ):
-        driven = rates.shape[0] > 0
-        report = multipliers.shape[0] > 0
-        n_local = weights.shape[0]
-        cell = lattice_numbers(lattice)
-        errors, sizes = np.empty(n * WIDTH), np.empty(n * WIDTH)
-        s, r, shifts = stack(n_coordinates), stack(n_coordinates), stack(n_shifts)
-        matrix, coupling = stack(n_square), stack(n_square)
-        squares, wanted = stack(n), stack(n)
-        error, step, total = stack(n), stack(n), stack(n)
-        for k in range(n_square):
-            poke(coupling, k, splat(-couplings[k]))
-        worst, worst_at, most = 0.0, -1, 0
-        for group in range(slots.shape[0] // WIDTH):
-            at = group * n_local * WIDTH
-            size = splat(0.0)
-            for k in range(n):
-                i, j = at + ends[2 * k] * WIDTH, at + ends[2 * k + 1] * WIDTH
-                x, y, z = gather_differences(points, atoms, i, j)
-                a, b, c = gather_differences(vectors, atoms, i, j)
-                if kind != OPEN:
-                    x, y, z = minimum_image(x, y, z, cell, kind)
-                _set_point(s, k, x, y, z)
-                _set_point(r, k, a, b, c)
-                square = dot(x, y, z, x, y, z)
-                poke(squares, k, square)
-                poke(total, k, splat(0.0))
-                size = size + dot(a, b, c, a, b, c)
-                rate = splat(0.0)
-                if driven:
-                    rate = gather(rates, slots, group * WIDTH, k)
-                    size = size + rate * rate
-                    rate = rate * square_root(square)
-                poke(wanted, k, rate)
-            size = size * (TANGENT_TOLERANCE * TANGENT_TOLERANCE)
-            _gram(matrix, s, s, coupling, n)
-            iteration = 0
-            ok = False
-            while True:
-                # An infinite speed would make every error look small.
-                ok = all_within(size, 1e300)
-                for k in range(n):
-                    x, y, z = _point(r, k)
-                    a, b, c = _point(s, k)
-                    e = peek(wanted, k) - dot(x, y, z, a, b, c)
-                    poke(error, k, e)
-                    ok = ok and all_within(e * e, size * peek(squares, k))
-                if ok or iteration == MAX_ITERATIONS:
-                    break
-                for k in range(n):
-                    poke(step, k, peek(error, k))
-                _solve(matrix, step, n)
-                _move(r, s, step, coupling, n)
-                for k in range(n):
-                    poke(total, k, peek(total, k) + peek(step, k))
-                iteration += 1
-            most = max(most, iteration)
-            sized, better = True, True
-            for k in range(n):
-                e, square = peek(error, k), peek(squares, k)
-                sized = sized and all_within(TINY, square)
-                better = better and all_within(e * e, square * worst)
-            if not (ok and sized and better):
-                for k in range(n):
-                    e = peek(error, k)
-                    store(errors, k * WIDTH, e * e)
-                    store(sizes, k * WIDTH, peek(squares, k))
-                    if ok and not sized:
-                        store(errors, k * WIDTH, not_positive(peek(squares, k)))
-                        store(sizes, k * WIDTH, splat(1.0))
-                worst, worst_at = worst_row(errors, sizes, n)
-                worst_at += group * n * WIDTH
-                if not (ok and sized):
-                    restore_points(vectors, atoms, undo, group, n_local, n_local, 0)
-                    return False, np.sqrt(worst), most, worst_at
-            for a in range(n_local):
-                _set_point(shifts, a, splat(0.0), splat(0.0), splat(0.0))
-            for k in range(n):
-                x, y, z = _point(s, k)
-                f = peek(total, k)
-                x, y, z = f * x, f * y, f * z
-                i, j = ends[2 * k], ends[2 * k + 1]
-                a, b, c = _point(shifts, i)
-                _set_point(shifts, i, a + x, b + y, c + z)
-                a, b, c = _point(shifts, j)
-                _set_point(shifts, j, a - x, b - y, c - z)
-                if report:
-                    scatter(multipliers, slots, group * WIDTH, k, f * square_root(peek(squares, k)))
-            saved = group * n_local * SAVED
-            for a in range(n_local):
-                w, i = weights[a], at + a * WIDTH
-                dx, dy, dz = _point(shifts, a)
-                x, y, z = keep_points(vectors, atoms, i, undo, saved + a * SAVED)
-                scatter_points(vectors, atoms, i, x - w * dx, y - w * dy, z - w * dz)
-        return True, np.sqrt(worst), most, worst_at
-
-    return positions, tangents
+    return project
 
 
 def _couplings(pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -362,7 +253,7 @@ def _couplings(pairs: NDArray[np.int64], inv_mass: NDArray[np.float64]) -> NDArr
     return np.ascontiguousarray((incidence * inv_mass) @ incidence.T).reshape(-1)
 
 
-class SmallClusters:
+class SmallClusters(EightAtATime):
     """Clusters of the same connection and masses, up to `LARGEST` distances each.
 
     Parameters
@@ -374,7 +265,7 @@ class SmallClusters:
     pairs : array_like of int, shape (K, 2)
         Local atoms of each row, the same in every cluster.
     lengths : array_like of float, shape (n_clusters, K)
-        Lengths used where a call passes none.
+        Lengths used where a request names none.
     inv_mass : array_like of float, shape (n_local,)
         Inverse masses; 0 for a pinned atom.
     """
@@ -389,112 +280,13 @@ class SmallClusters:
         lengths: ArrayLike,
         inv_mass: ArrayLike,
     ) -> None:
-        self.rows: NDArray[np.int64] = np.array(rows, dtype=np.int64).reshape(-1)
-        self.lengths = np.array(lengths, dtype=np.float64).reshape(-1)
         local = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         members = np.array(atoms, dtype=np.int64)
         if not 1 <= len(local) <= LARGEST or members.shape[1] > len(local) + 1:
             raise ValueError(f"a small cluster holds 1 to {LARGEST} connected distances")
-        self._n_rows = len(local)
-        self._ends = local.reshape(-1)
-        self._weights = np.array(inv_mass, dtype=np.float64)
-        self._couplings = _couplings(local, self._weights)
-        self._slots, self._atoms = lane_tables(members, len(local))
-        self._undo = NO_NUMBERS
-
-    def _undo_room(self) -> NDArray[np.float64]:
-        if not len(self._undo):
-            self._undo = aligned(6 * len(self._atoms))
-        return self._undo
-
-    def _outcome(self, ok: bool, residual: float, iterations: int, row: int) -> Outcome:
-        # Rows of lanes that repeat the last cluster are that cluster's rows.
-        beyond = max(row - len(self.rows) + self._n_rows, 0) // self._n_rows
-        return Outcome(ok, residual, iterations, row - beyond * self._n_rows)
-
-    def positions(
-        self,
-        x_new: NDArray[np.float64],
-        x_ref: NDArray[np.float64],
-        lengths: NDArray[np.float64] | None = None,
-        lattice: NDArray[np.float64] | None = None,
-        velocities: NDArray[np.float64] | None = None,
-        inv_dt: float = 0.0,
-        multipliers: NDArray[np.float64] | None = None,
-    ) -> Outcome:
-        """Move `x_new` along the gradients at `x_ref` onto the held lengths.
-
-        Parameters
-        ----------
-        x_new, x_ref : ndarray, shape (n_atoms, 3)
-            Positions to correct in place, and positions on the constraints.
-        lengths : ndarray, shape (n_rows,), optional
-            Held lengths now.
-        lattice : ndarray, shape (2, 3, 3), optional
-            Cell and its inverse; None without periodicity.
-        velocities : ndarray, shape (n_atoms, 3), optional
-            Receives the displacement times `inv_dt`.
-        multipliers : ndarray, shape (n_rows,), optional
-            Receives the multipliers of unit gradients.
-
-        Returns
-        -------
-        Outcome
-            Nothing has changed where it is not converged.
-        """
-        cell, kind = lattice_kind(lattice)
-        return self._outcome(
-            *_kernels(self._n_rows)[0](
-                x_new,
-                x_ref,
-                NO_POINTS if velocities is None else velocities,
-                inv_dt,
-                self._atoms,
-                self._slots,
-                self._ends,
-                self._weights,
-                self._couplings,
-                self.lengths if lengths is None else lengths,
-                cell,
-                kind,
-                NO_NUMBERS if multipliers is None else multipliers,
-                self._undo_room(),
-            )
-        )
-
-    def tangents(
-        self,
-        x: NDArray[np.float64],
-        y: NDArray[np.float64],
-        rates: NDArray[np.float64] | None = None,
-        lattice: NDArray[np.float64] | None = None,
-        multipliers: NDArray[np.float64] | None = None,
-    ) -> Outcome:
-        """Project `y` (velocities, or forces per mass) so that lengths change at `rates`.
-
-        Parameters
-        ----------
-        x, y : ndarray, shape (n_atoms, 3)
-            Positions, and the vectors to project in place.
-        rates : ndarray, shape (n_rows,), optional
-            Wanted ``u·(y_i - y_j)``; zero where None or empty.
-        lattice, multipliers
-            As in `positions`.
-        """
-        cell, kind = lattice_kind(lattice)
-        return self._outcome(
-            *_kernels(self._n_rows)[1](
-                x,
-                y,
-                self._atoms,
-                self._slots,
-                self._ends,
-                self._weights,
-                self._couplings,
-                NO_NUMBERS if rates is None else rates,
-                cell,
-                kind,
-                NO_NUMBERS if multipliers is None else multipliers,
-                self._undo_room(),
-            )
-        )
+        super().__init__(rows, lengths, len(local))
+        self._kernel = _kernel(len(local))
+        weights = np.array(inv_mass, dtype=np.float64)
+        slots, points = groups.lane_tables(members, len(local))
+        self._tables = points, slots, local.reshape(-1), weights, _couplings(local, weights)
+        self._sizes = (6 * len(points),)

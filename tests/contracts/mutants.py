@@ -38,9 +38,9 @@ MUTANTS = [
     ),
     # -- solvers: distances of any connection --
     (
-        "solvers/sparse/distances.py",
-        "LENGTH_TOLERANCE = 4e-15",
-        "LENGTH_TOLERANCE = 4e-11",
+        "solvers/sparse/step_control.py",
+        "NEWTON_TOLERANCE = 4e-15",
+        "NEWTON_TOLERANCE = 4e-11",
         "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
     ),
     (
@@ -64,14 +64,14 @@ MUTANTS = [
     # -- solvers: eight small clusters at once --
     (
         "solvers/small_clusters.py",
-        "kept = kept and all_within(TINY, dot(x, y, z, a, b, c))",
-        "kept = kept and all_within(-1e300, dot(x, y, z, a, b, c))",
+        "kept = kept and all_within(groups.TINY, inner)",
+        "kept = kept and all_within(-1e300, inner)",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-flipped]",
     ),
     (
         "solvers/small_clusters.py",
-        "2 * n_local, n_local)\n",
-        "2 * n_local, 0)\n",
+        "kept_points, n_local)\n",
+        "kept_points, 0)\n",
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-far]",
     ),
     (
@@ -95,8 +95,8 @@ MUTANTS = [
     ),
     (
         "solvers/rigid_triangles.py",
-        "restore_points(velocities, atoms, undo, group, 3, 6, 3)",
-        "restore_points(velocities, atoms, undo, group, 3, 6, 0)",
+        "restore_points(velocities, atoms, undo, group, 3, kept_points, 3)",
+        "restore_points(velocities, atoms, undo, group, 3, kept_points, 0)",
         "tests/solvers/test_rigid_triangles.py::test_failure_changes_nothing_and_names_the_triangle[far]",
     ),
     # -- solvers: chains --
@@ -341,7 +341,7 @@ MUTANTS = [
     ("projection.py", "rtol)].conj().T)", "rtol)].T)", "tests/test_projection.py::test_complex_matrices"),
     # -- steppers, thermostats, arrays --
     (
-        "motion/motion.py",
+        "motion/local_projections.py",
         "np.copyto(velocities, saved[1])",
         "pass",
         "tests/motion/test_motion.py::test_velocities_are_put_back_when_a_later_solver_fails",

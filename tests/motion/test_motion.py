@@ -17,6 +17,7 @@ from kcons.errors import (
     SingularGeometryError,
 )
 from kcons.motion import Motion
+from kcons.solvers.cluster_solver import Request
 
 # -- in place, pure, wrong arguments ----------------------------------------------------------------
 
@@ -274,7 +275,7 @@ def test_rescue_by_damped_newton(name: str, crowd: int) -> None:
     (solver,) = motion.plan.solvers
     assert solver.name == name
     kept = new.copy()
-    outcome = solver.positions(kept, x, None, None, None, 0.0, None, 0.0, 0.0)
+    outcome = solver.positions(Request(kept, x))
     assert not outcome.converged
     np.testing.assert_array_equal(kept, new)
     assert solver.rows[outcome.worst_row] // len(pairs) == rescued

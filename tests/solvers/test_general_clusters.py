@@ -8,6 +8,7 @@ import pytest
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
+from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
 
 WATER = np.array([[0.0, 0, 0], [0.9572, 0, 0], [-0.2399872, 0.92662721, 0]])
@@ -21,7 +22,7 @@ def solver_of(rows, x, masses=None, labels=None) -> tuple[GeneralClusters, Const
 
 
 def positions(solver, x_new, x_ref, velocities=None, inv_dt=0.0, multipliers=None):
-    return solver.positions(x_new, x_ref, None, None, velocities, inv_dt, multipliers, 0.0, 0.0)
+    return solver.positions(Request(x_new, x_ref, velocities=velocities, inv_dt=inv_dt), multipliers)
 
 
 def weighted_square(weights: np.ndarray) -> held.Custom:
@@ -111,7 +112,7 @@ def test_dependent_rows_share_their_multiplier() -> None:
     np.testing.assert_allclose(lb, np.repeat(la / 3, 3), rtol=1e-12)
     assert np.abs(whole.value(b)).max() < 1e-15
     y, mu = np.random.default_rng(1).normal(size=x.shape), np.empty(3)
-    assert thrice.tangents(x, y, None, None, mu, 0.0).converged
+    assert thrice.tangents(Request(y, x), mu).converged
     np.testing.assert_allclose(mu, mu[0], rtol=1e-12)
 
 
@@ -143,7 +144,7 @@ def test_atoms_of_infinite_mass_move_as_prescribed() -> None:
     whole = ConstraintSet(held.Distance([[0, 1], [1, 2]]), x, np.ones(3))
     solver = GeneralClusters(whole, np.arange(2), np.zeros(2, dtype=np.int64), np.array([0.0, 1.0, 0.5]))
     driving, rates = y[0].copy(), np.array([0.3, -0.2])
-    assert solver.tangents(x, y, rates, None, None, 0.0).converged
+    assert solver.tangents(Request(y, x, rates)).converged
     np.testing.assert_array_equal(y[0], driving)
     assert whole.jacobian(x) @ y.ravel() == pytest.approx(rates, abs=1e-14)
 
@@ -156,7 +157,7 @@ def test_velocities_that_cannot_be_tangent_are_refused(apart: float, converged: 
     y = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.2]])
     before = y.copy()
     rates = np.array([0.7, 0.7 * (1 + apart)])
-    outcome = solver.tangents(x, y, rates, None, None, 0.0)
+    outcome = solver.tangents(Request(y, x, rates))
     assert outcome.converged == converged
     if converged:
         assert whole.jacobian(x) @ y.ravel() == pytest.approx(rates, rel=1e-13)
@@ -174,7 +175,7 @@ def test_no_more_is_left_than_rounding(offset: float, apart: float, converged: b
     solver, whole = solver_of(rows, x)
     moved = x + 0.01 * np.random.default_rng(0).normal(size=x.shape)
     before = moved.copy()
-    outcome = solver.positions(moved, x, None, None, None, 0.0, None, 1.0, 0.0)
+    outcome = solver.positions(Request(moved, x, time=1.0))
     assert outcome.converged == converged
     if converged:
         assert np.all(np.abs(whole.value(moved, 1.0)) <= whole.tolerance(moved, 1.0))
@@ -196,7 +197,7 @@ def test_velocity_rows_move_no_positions() -> None:
     assert lam[1] == 0.0
     v = np.random.default_rng(0).normal(size=(3, 3))
     rates = whole.velocity_target(WATER)
-    assert solver.tangents(WATER, v, rates, None, None, 0.0).converged
+    assert solver.tangents(Request(v, WATER, rates)).converged
     np.testing.assert_allclose(whole.jacobian(WATER) @ v.ravel(), rates, rtol=0, atol=1e-14)
 
 
@@ -241,7 +242,7 @@ def test_not_finite(bad: float) -> None:
         elif wrong == "ref":
             outcome = positions(solver, good, broken)
         else:
-            outcome = solver.tangents(x, broken, None, None, None, 0.0)
+            outcome = solver.tangents(Request(broken, x))
         assert not outcome.converged and outcome.worst_row == 1
         np.testing.assert_array_equal(good, x)
 
@@ -252,7 +253,7 @@ def test_a_gradient_that_vanishes() -> None:
     x[0] = 0.0
     outcome = positions(solver, x.copy(), x)
     assert not outcome.converged and outcome.worst_row == 0
-    outcome = solver.tangents(x, x.copy(), None, None, None, 0.0)
+    outcome = solver.tangents(Request(x.copy(), x))
     assert not outcome.converged and outcome.worst_row == 0
 
 
@@ -268,7 +269,7 @@ def test_no_rows() -> None:
     solver, _ = solver_of([], WATER)
     y = WATER.copy()
     assert positions(solver, y, WATER).converged
-    assert solver.tangents(WATER, y, None, None, None, 0.0).converged
+    assert solver.tangents(Request(y, WATER)).converged
     assert solver.restore(y, time=0.0).converged
     assert solver.rank(WATER, 0.0) == 0
     np.testing.assert_array_equal(y, WATER)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kcons.solvers.rigid_triangles import PAIRS, RigidTriangles
+from tests.systems.solver_calls import positions, tangents
 
 I, J = np.array(PAIRS).T
 
@@ -56,7 +57,7 @@ def test_matches_dense_newton(n):
     w = Water(n)
     x, velocities = w.x_new.copy(), w.velocities.copy()
     multipliers = np.full(3 * n, np.nan)
-    outcome = w.solver.positions(x, w.x_ref, w.lengths, None, velocities, 500.0, multipliers)
+    outcome = positions(w.solver, x, w.x_ref, w.lengths, None, velocities, 500.0, multipliers)
     assert outcome.converged
     assert 0 <= outcome.worst_row < 3 * n
     expected = w.x_new.copy()
@@ -75,7 +76,7 @@ def test_tangents_match_dense_solve(driven):
     w = Water(13)
     rates = np.random.default_rng(5).normal(size=39) if driven else None
     y, multipliers = w.y.copy(), np.full(39, np.nan)
-    assert w.solver.tangents(w.x_ref, y, rates, None, multipliers).converged
+    assert tangents(w.solver, w.x_ref, y, rates, None, multipliers).converged
     for k, atoms in enumerate(w.atoms):
         a = jacobian(w.x_ref[atoms])
         wanted = rates[3 * k : 3 * k + 3] if driven else np.zeros(3)
@@ -94,13 +95,13 @@ def test_tangents_match_dense_solve(driven):
 def test_periodic_equals_unwrapped(cell):
     w = Water(11)
     x, y, z = w.x_new.copy(), w.y.copy(), w.y.copy()
-    assert w.solver.positions(x, w.x_ref, w.lengths).converged
-    assert w.solver.tangents(w.x_ref, y).converged
+    assert positions(w.solver, x, w.x_ref, w.lengths).converged
+    assert tangents(w.solver, w.x_ref, y).converged
     jumps = np.random.default_rng(4).integers(-2, 3, size=(2, w.n_atoms, 3)) @ cell
     lattice = np.array([cell, np.linalg.inv(cell)])
     wrapped = w.x_new + jumps[0]
-    assert w.solver.positions(wrapped, w.x_ref + jumps[1], w.lengths, lattice).converged
-    assert w.solver.tangents(w.x_ref + jumps[1], z, None, lattice).converged
+    assert positions(w.solver, wrapped, w.x_ref + jumps[1], w.lengths, lattice).converged
+    assert tangents(w.solver, w.x_ref + jumps[1], z, None, lattice).converged
     np.testing.assert_allclose(wrapped - jumps[0], x, atol=1e-13)
     np.testing.assert_allclose(z, y, atol=1e-13)
 
@@ -110,7 +111,7 @@ def test_pinned_atom_stays():
     pinned = w.atoms[:, 0]
     w.x_new[pinned] = w.x_ref[pinned]
     x = w.x_new.copy()
-    assert w.solver.positions(x, w.x_ref, w.lengths).converged
+    assert positions(w.solver, x, w.x_ref, w.lengths).converged
     np.testing.assert_array_equal(x[pinned], w.x_ref[pinned])
     assert np.abs(np.linalg.norm(w.bonds(x), axis=1) / w.lengths - 1).max() <= 2e-14
 
@@ -118,8 +119,8 @@ def test_pinned_atom_stays():
 def test_far_from_the_origin():
     w = Water(10, offset=1e6)
     x, y = w.x_new.copy(), w.y.copy()
-    assert w.solver.positions(x, w.x_ref, w.lengths).converged
-    assert w.solver.tangents(w.x_ref, y).converged
+    assert positions(w.solver, x, w.x_ref, w.lengths).converged
+    assert tangents(w.solver, w.x_ref, y).converged
     sigma = np.linalg.norm(w.bonds(x), axis=1) - w.lengths
     assert np.abs(sigma).max() <= 2 * 2.3e-16 * 2 * np.sqrt(3) * 1e6
 
@@ -137,7 +138,7 @@ def test_failure_changes_nothing_and_names_the_triangle(damage):
     else:
         w.x_new[atoms] = -w.x_ref[atoms]
     x, velocities = w.x_new.copy(), w.velocities.copy()
-    outcome = w.solver.positions(x, w.x_ref, w.lengths, None, velocities, 500.0)
+    outcome = positions(w.solver, x, w.x_ref, w.lengths, None, velocities, 500.0)
     assert not outcome.converged
     assert outcome.worst_row // 3 == 26
     np.testing.assert_array_equal(x, w.x_new)
@@ -148,7 +149,7 @@ def test_newton_and_a_chord_step_gain_together():
     """Of order three, a factor for both: from three hundredths of a length to rounding in five steps."""
     for seed in range(3):
         w = Water(64, seed)
-        outcome = w.solver.positions(w.x_new.copy(), w.x_ref, w.lengths)
+        outcome = positions(w.solver, w.x_new.copy(), w.x_ref, w.lengths)
         assert outcome.converged
         assert outcome.iterations <= 6
 
@@ -160,11 +161,11 @@ def test_a_third_side_that_turned_round_is_no_solution():
     w.x_ref[w.atoms] = narrow
     w.lengths[:] = np.tile(np.linalg.norm(narrow[I] - narrow[J], axis=1), 9)
     w.x_new[:] = w.x_ref
-    assert w.solver.positions(w.x_new.copy(), w.x_ref, w.lengths).converged
+    assert positions(w.solver, w.x_new.copy(), w.x_ref, w.lengths).converged
     _, b, c = w.atoms[4]
     w.x_new[[b, c]] = w.x_new[[c, b]]
     x = w.x_new.copy()
-    outcome = w.solver.positions(x, w.x_ref, w.lengths)
+    outcome = positions(w.solver, x, w.x_ref, w.lengths)
     assert not outcome.converged
     assert outcome.worst_row == 3 * 4 + PAIRS.index((1, 2))
     np.testing.assert_array_equal(x, w.x_new)
@@ -181,7 +182,7 @@ def test_failed_tangents_change_nothing(damage):
     else:
         w.x_ref[[a, b, c]] = [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]
     y = w.y.copy()
-    outcome = w.solver.tangents(w.x_ref, y)
+    outcome = tangents(w.solver, w.x_ref, y)
     assert not outcome.converged
     assert outcome.worst_row // 3 == 28
     np.testing.assert_array_equal(y, w.y)
@@ -191,6 +192,6 @@ def test_infeasible_triangle_is_refused():
     w = Water(8)
     lengths = w.lengths.copy()
     lengths[9:12] = 1.0, 1.0, 3.0
-    outcome = w.solver.positions(w.x_new.copy(), w.x_ref, lengths)
+    outcome = positions(w.solver, w.x_new.copy(), w.x_ref, lengths)
     assert not outcome.converged
     assert outcome.worst_row // 3 == 3

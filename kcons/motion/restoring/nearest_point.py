@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,10 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, SingularGeometryError
 from kcons.motion import failures
 from kcons.plan.plan import Plan
-from kcons.solvers.cluster_solver import ClusterSolver, Outcome
-from kcons.solvers.distance_clusters import LongChains, sparse_distances
+from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.cluster_solver import ClusterSolver, Outcome, Request
 from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.sparse.distances import sparse_distances
 
 #: Largest cluster, in rows, that dense damped Newton rescues.
 RESCUE_ROWS = 400
@@ -30,30 +31,6 @@ MOST_ITERATIONS, SMALL_CLUSTER, FAILED, RESCUED = 600, 25, 40, 4
 STALLED = 10
 #: Halvings of one step of it.
 MAX_HALVINGS = 30
-
-
-class Task(NamedTuple):
-    """One position projection, in place on local arrays; see `ClusterSolver.positions`."""
-
-    x_new: FloatArray
-    x_ref: FloatArray
-    targets: FloatArray | None
-    lattice: FloatArray | None
-    velocities: FloatArray | None
-    inv_dt: float
-    time: float
-    reference_time: float
-
-    def given_to(self, solver: ClusterSolver, multipliers: FloatArray | None) -> Outcome:
-        """Let `solver` do it."""
-        return solver.positions(*self[:6], multipliers, self.time, self.reference_time)
-
-    def polish(self, solver: ClusterSolver, multipliers: FloatArray | None) -> None:
-        """Let `solver` do it again from where it ended; adds to `multipliers`."""
-        more = None if multipliers is None else np.empty(len(multipliers))
-        again = self.given_to(solver, more)
-        if again.converged and multipliers is not None and more is not None:
-            multipliers += more
 
 
 class Work:
@@ -91,29 +68,33 @@ class Rescuers:
         #: Set during restorations, which try many projections and may do without some of them.
         self.work: Work | None = None
 
-    def rescue(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
-        """Do a task that `solver` failed at, or raise what says why there is no way.
+    def rescue(
+        self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
+    ) -> Outcome:
+        """Do what `solver` failed at, or raise what says why there is no way.
 
         Raises
         ------
         ConvergenceError, InputError, SingularGeometryError
             Positions and velocities are as they were.
         """
-        x, velocities = task.x_new, task.velocities
+        x, reference, velocities = request.changed, request.reference, request.velocities
         saved = x.copy(), None if velocities is None else velocities.copy()
-        error = failures.unusable(self._local, self._numbers, {"x_new": x, "x_ref": task.x_ref}, outcome, solver)
+        error = failures.unusable(self._local, self._numbers, {"x_new": x, "x_ref": reference}, outcome, solver)
         if self.work is not None:
             self.work.rescues -= 1
         if error is None and (self.work is None or self.work.rescues >= 0):
-            outcome = self._damped(solver, outcome, task, multipliers)
+            outcome = self._damped(solver, outcome, request, multipliers)
             if outcome.converged:
                 return outcome
         np.copyto(x, saved[0])
         if velocities is not None and saved[1] is not None:
             np.copyto(velocities, saved[1])
-        raise error or failures.positions_failed(self._local, self._numbers, task.x_ref, outcome, solver, self._plan)
+        raise error or failures.positions_failed(self._local, self._numbers, reference, outcome, solver, self._plan)
 
-    def _damped(self, solver: ClusterSolver, outcome: Outcome, task: Task, multipliers: FloatArray | None) -> Outcome:
+    def _damped(
+        self, solver: ClusterSolver, outcome: Outcome, request: Request, multipliers: FloatArray | None
+    ) -> Outcome:
         """Solve the failing clusters by damped Newton, then let the fast solver go on from there."""
         extra = np.zeros(self._local.n_rows)
         for _ in range(MAX_RESCUES):
@@ -124,13 +105,13 @@ class Rescuers:
             if rescuer is None:
                 return outcome
             piece = np.zeros(len(rescuer.rows))
-            rescued = task.given_to(rescuer, piece)
+            rescued = rescuer.positions(request, piece)
             if not rescued.converged:
                 where = int(rescuer.rows[rescued.worst_row]) if rescued.worst_row >= 0 else row
                 index = np.flatnonzero(solver.rows == where)
                 return rescued._replace(worst_row=int(index[0]) if len(index) else outcome.worst_row)
             extra[rescuer.rows] += piece
-            outcome = task.given_to(solver, multipliers)
+            outcome = solver.positions(request, multipliers)
             if outcome.converged:
                 if multipliers is not None:
                     multipliers += extra[solver.rows]
@@ -146,7 +127,7 @@ class Rescuers:
             if len(rows) <= RESCUE_ROWS:
                 labels = np.zeros(len(rows), dtype=np.int64)
                 self._made[label] = GeneralClusters(self._local, rows, labels, plan.inverse_masses)
-            elif any(isinstance(solver, LongChains) and row in solver.rows for solver in plan.solvers):
+            elif any(isinstance(solver, Chains) and row in solver.rows for solver in plan.solvers):
                 self._made[label] = sparse_distances(self._local, rows, plan.inverse_masses)
             else:
                 return None

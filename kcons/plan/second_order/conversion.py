@@ -28,7 +28,7 @@ from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
 from kcons.plan.independent_blocks import fixed_atoms, row_blocks
 from kcons.plan.second_order.flat_bodies import MISFIT, FlatBody, find_flat_bodies, refusal, with_flat_bodies
-from kcons.plan.second_order.singular_rows import DISPLACEMENT, RANK_TOLERANCE, BoolArray, LocalRows, unsolvable
+from kcons.plan.second_order.singular_rows import DISPLACEMENT, LOST, BoolArray, LocalRows, unsolvable
 
 #: Larger blocks are first reduced to their internal coordinates, then to their distances, and what is
 #: still larger is tested by sparse inertia counts.
@@ -236,7 +236,7 @@ def _deficient(unit: FloatArray) -> BoolArray:
         result[:] = False
     except np.linalg.LinAlgError:
         squares = np.linalg.eigvalsh(gram)
-        result[result] = squares[:, 0] <= RANK_TOLERANCE**2 * squares[:, -1]
+        result[result] = squares[:, 0] <= LOST**2 * squares[:, -1]
     return result
 
 
@@ -290,11 +290,11 @@ def _check_large(constraint_set: ConstraintSet, rows: IntArray, positions: Float
 
 
 def _lost_rows(part: ConstraintSet, x: FloatArray, free: BoolArray, time: float) -> int:
-    """Rows less rank: eigenvalues of A A^T below RANK_TOLERANCE^2, counted by Sylvester's law of inertia."""
+    """Rows less rank: eigenvalues of A A^T below LOST^2, counted by Sylvester's law of inertia."""
     a = part.jacobian(x, time).multiply(np.repeat(free, 3)[None, :].astype(float)).tocsr()
     norms = np.sqrt(np.asarray(a.multiply(a).sum(axis=1)).ravel())
     a = sp.diags_array(1.0 / np.where(norms > 0, norms, 1.0)) @ a
-    shifted = (a @ a.T - RANK_TOLERANCE**2 * sp.eye_array(part.n_rows)).tocsc()
+    shifted = (a @ a.T - LOST**2 * sp.eye_array(part.n_rows)).tocsc()
     from scipy.sparse.linalg import splu  # slow to import, seldom needed
 
     factor = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

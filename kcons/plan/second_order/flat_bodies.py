@@ -18,7 +18,7 @@ from kcons.constraints.internal import Distance
 from kcons.constraints.linear import LinearRelation
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import SingularGeometryError
-from kcons.plan.second_order.singular_rows import RANK_TOLERANCE, UNSOLVABLE, BoolArray, LocalRows, extent_of
+from kcons.plan.second_order.singular_rows import LOST, STEP_CUT, UNSOLVABLE, BoolArray, LocalRows, extent_of
 
 #: Extent across a line or plane, relative to the extent along it, that still counts as flat.
 FLAT = 1e-6
@@ -230,7 +230,7 @@ def _fitted(
             break
         a = block.part.jacobian(whole, block.time)[inside][:, columns].toarray()
         a = np.einsum("rnc,fc->rnf", a.reshape(len(inside), len(atoms), 3), axes).reshape(len(inside), -1)
-        step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=1e-9)[0]
+        step = np.linalg.lstsq(a / scale[:, None], -sigma / scale, rcond=STEP_CUT)[0]
         plane = plane + step.reshape(plane.shape)
     if not miss <= MISFIT:
         whole[atoms] = centre + best @ axes
@@ -308,7 +308,7 @@ def _check_result(block: LocalRows, bodies: list[FlatBody], generic: int) -> Non
     new = _rebuilt(block, bodies)
     unit, _ = new.unit_jacobian(block.x)
     u, s, vt = np.linalg.svd(unit, full_matrices=True)
-    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+    rank = int(np.sum(s > LOST * s[0]))
     old, _ = block.unit_jacobian(block.x)
     if np.abs(old @ vt[rank:].T).max(initial=0.0) > 1e-4 or new.singular(block.x):
         raise _unresolved(block, generic)

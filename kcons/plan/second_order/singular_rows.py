@@ -20,9 +20,13 @@ from kcons.plan.independent_blocks import fixed_atoms
 
 BoolArray = NDArray[np.bool_]
 
-#: Singular values of the row-normalised A below this part of the largest are lost directions. The rank
-#: does not depend on the masses. A triatomic at 179.9 degrees has 8.7e-4 and is held as it is.
-RANK_TOLERANCE = 1e-6
+#: Singular values of the row-normalised A, without masses, below this part of the largest are directions that a
+#: geometry has lost: an angle from the straight or flat one, and no measure of rank (`kcons.solvers.rank_revealing`).
+#: A triatomic at 179.9 degrees has 8.7e-4 and is held as it is.
+LOST = 1e-6
+#: Directions that a step of Gauss-Newton leaves out. Towards a flat geometry singular values go with the square root of
+#: the residual, to 1e-7, and have to count.
+STEP_CUT = 1e-9
 #: Size of the displacements that break special geometries, relative to the shortest row.
 DISPLACEMENT = 1e-2
 #: Part of the curvature outside the range of A that is more than rounding (or than the differences of a
@@ -49,7 +53,7 @@ def unsolvable(unit: FloatArray, curvature: Callable[[FloatArray], FloatArray], 
     Notes, eqs. 92 and 95.
     """
     u, s, vt = np.linalg.svd(unit, full_matrices=True)
-    cut = RANK_TOLERANCE * s[:, :1]
+    cut = LOST * s[:, :1]
     lost = np.ones(unit.shape[:2], bool)
     lost[:, : s.shape[1]] = s <= cut
     free = np.ones((len(unit), unit.shape[2]), bool)
@@ -141,13 +145,13 @@ class LocalRows:
         """Rows (block numbering) that take part in a dependence omega^T A = 0."""
         unit, _ = self.unit_jacobian(x)
         u, s, _ = np.linalg.svd(unit, full_matrices=True)
-        rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+        rank = int(np.sum(s > LOST * s[0]))
         return np.flatnonzero(np.einsum("rk,rk->r", u[:, rank:], u[:, rank:]) > 1e-10)
 
     def rank(self, x: FloatArray, rows: IntArray | None = None) -> int:
         unit, _ = self.unit_jacobian(x)
         s = np.linalg.svd(unit if rows is None else unit[rows], compute_uv=False)
-        return int(np.sum(s > RANK_TOLERANCE * s[0])) if len(s) else 0
+        return int(np.sum(s > LOST * s[0])) if len(s) else 0
 
     def restored(self) -> LocalRows:
         """The same block at positions that fulfil its targets, as nearly as Gauss-Newton gets there."""
@@ -159,7 +163,7 @@ class LocalRows:
             if np.max(np.abs(sigma) / self.part.scale) < 1e-14:
                 break
             unit, norms = self.unit_jacobian(x)
-            step = np.linalg.lstsq(unit[held], -(sigma / np.where(norms > 0, norms, 1.0))[held], rcond=1e-9)[0]
+            step = np.linalg.lstsq(unit[held], -(sigma / np.where(norms > 0, norms, 1.0))[held], rcond=STEP_CUT)[0]
             x = x + step.reshape(x.shape)
         other = copy.copy(self)
         other.x = x
@@ -176,7 +180,7 @@ class LocalRows:
             x[self.pinned] = self.x[self.pinned]
             unit, _ = self.unit_jacobian(x)
             _, s, vt = np.linalg.svd(unit, full_matrices=True)
-            rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+            rank = int(np.sum(s > LOST * s[0]))
             if rank <= best:
                 continue
             best = rank

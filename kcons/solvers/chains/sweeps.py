@@ -50,7 +50,7 @@ TANGENT_TOLERANCE = 2e-15
 
 # Fields of a slot: vectors of WIDTH doubles, one a lane. Slot t of a lane holds
 # the bond from its atom t to t + 1; the last slot's bond is the separator.
-_S, _R, _TARGET, _F, _C, _L, _FIRST, _LATER = (WIDTH * k for k in (0, 3, 6, 7, 8, 9, 10, 11))
+_S, _R, _TARGET, _RIGHT, _AHEAD, _ASIDE, _FIRST, _LATER = (WIDTH * k for k in (0, 3, 6, 7, 8, 9, 10, 11))
 SLOT = 12 * WIDTH
 
 
@@ -112,22 +112,40 @@ def _rate_error(rx, ry, rz, sx, sy, sz, rate, real):
     return error, inner, positive, absolute(error) / square_root(positive)
 
 
+@njit(fastmath=FASTMATH)
+def _first_bad(work, present, first, n_slots, tangent):
+    """The first bond that turned round or is not finite, where comparisons do not see it; -1 if there is none."""
+    for k in range(n_slots * WIDTH):
+        at = (k // WIDTH) * SLOT + k % WIDTH
+        inner = 0.0
+        for axis in range(0, 3 * WIDTH, WIDTH):
+            s, r = work[at + _S + axis], work[at + _R + axis]
+            inner += s * s + 0.0 * r if tangent is not None else s * r
+        if present[first + k] > 0.0 and not inner > 0.0:
+            return k
+    return -1
+
+
 @njit(fastmath=FASTMATH, error_model="numpy")
 def _solve(
     base, other, atoms, rows, present, weights, given, cell, kind, first, n_slots, whole, tangent, limit, work, small
 ):
     """Newton iteration on one strip of eight pieces.
 
-    Bonds s come from the points `base`; r, from `other`, is what the
-    multipliers change: bonds to bring to the lengths `given`, or relative
-    velocities to bring to those rates along s. The slots before `whole` have a
-    bond in every lane.
+    Bonds s come from the points `base`; r, from `other`, is what the multipliers change: bonds to bring to the lengths
+    `given`, or relative velocities to bring to those rates along s. The slots before `whole` have a bond in every lane.
 
-    Returns whether all is well, the worst residual, its slot and lane, and the
-    number of solves.
+    A row has its bond s, what is changed r, what is wanted of it (`target`), and `pull`, the step of its multiplier.
+    The row before it in the order of a sweep has p and `pull_behind`, the next one n and `next_pull`; z and `pulls` are
+    those of the separators, q and `pull_final` of that at which the sweep ends, h those of the first row. The sweep
+    enters a row by an atom whose displacement is e (`weight` its inverse mass), and leaves by one of o
+    (`leave_weight`). Eliminated, a row says ``pull = right - ahead * next_pull - aside * pull_final``; the eliminated
+    rows of a lane add `head_diagonal`, `head_right` and `to_head` to the separator at which the sweep began.
+
+    Returns whether all is well, the worst residual, its place (slot and lane), and the number of solves.
     """
-    m = n_slots - 1
-    end, seam = first + m * WIDTH, m * SLOT
+    n_rows = n_slots - 1
+    end, seam = first + n_rows * WIDTH, n_rows * SLOT
     zero, one = splat(0.0), splat(1.0)
     driven = given.shape[0] > 0
 
@@ -159,35 +177,39 @@ def _solve(
     else:
         seam_target = seam_target * seam_target
 
-    shared = zero  # multipliers of the separators, each in the lane before it
+    pulls = zero  # multipliers of the separators, each in the lane before it
     ok, finite, iteration, least, peak, peak_slot = False, False, 0, zero, zero, zero
     for iteration in range(MAX_ITERATIONS + 1):
         opening, upward = iteration == 0, iteration % 2 == 0
         peak, peak_slot, least, total = splat(-1.0), zero, one, zero
-        # p: what lies before a row in the order of the sweep; q: after the last row.
-        px, py, pz, p = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(shared)
-        qx, qy, qz, q = zx, zy, zz, shared
+        # At first, what lies before a row is a separator; after the last row there is one again.
+        px, py, pz, pull_behind = from_previous(zx), from_previous(zy), from_previous(zz), from_previous(pulls)
+        qx, qy, qz, pull_final = zx, zy, zz, pulls
         slot, stride, atom, step, onward = 0, SLOT, first, WIDTH, WIDTH
         if not upward:
-            px, py, pz, p, qx, qy, qz, q = qx, qy, qz, q, px, py, pz, p
+            px, py, pz, pull_behind, qx, qy, qz, pull_final = qx, qy, qz, pull_final, px, py, pz, pull_behind
             slot, stride, atom, step, onward = seam - SLOT, -SLOT, end - WIDTH, -WIDTH, 0
         sign = 1.0 if upward else -1.0
         if opening:
-            sx, sy, sz, now = ux, uy, uz, zero
+            sx, sy, sz, pull = ux, uy, uz, zero
         else:
             sx, sy, sz = load_triple(work, slot + _S)
-            now = load(work, slot + _F) - load(work, slot + _C) * p - load(work, slot + _L) * q
-        w = load(weights, atom + WIDTH - onward)
-        w_first, hx, hy, hz = w, sx, sy, sz
+            pull = (
+                load(work, slot + _RIGHT)
+                - load(work, slot + _AHEAD) * pull_behind
+                - load(work, slot + _ASIDE) * pull_final
+            )
+        weight = load(weights, atom + WIDTH - onward)
+        head_weight, hx, hy, hz = weight, sx, sy, sz
         # Displacement, times sign, of the atom between two rows.
-        ex = w * product_difference(sx, now, px, p)
-        ey = w * product_difference(sy, now, py, p)
-        ez = w * product_difference(sz, now, pz, p)
+        ex = weight * product_difference(sx, pull, px, pull_behind)
+        ey = weight * product_difference(sy, pull, py, pull_behind)
+        ez = weight * product_difference(sz, pull, pz, pull_behind)
         fx, fy, fz = ex, ey, ez
-        f, c, l = zero, zero, splat(-1.0)
-        gamma, head_diagonal, head_right = one, zero, zero
-        for row in range(m):
-            nx, ny, nz, then = qx, qy, qz, q
+        right, ahead, aside = zero, zero, splat(-1.0)
+        to_head, head_diagonal, head_right = one, zero, zero
+        for row in range(n_rows):
+            nx, ny, nz, next_pull = qx, qy, qz, pull_final
             if opening:
                 rx, ry, rz = vx, vy, vz
                 real = load(present, atom)
@@ -197,7 +219,7 @@ def _solve(
                 target = target * (square_root(dot(sx, sy, sz, sx, sy, sz)) if tangent is not None else target)
                 store_triple(work, slot + _S, sx, sy, sz)
                 store(work, slot + _TARGET, target)
-                if row + 1 < m:
+                if row + 1 < n_rows:
                     ax, ay, az = bx, by, bz
                     bx, by, bz = gather_points(base, atoms, atom + 2 * WIDTH)
                     nx, ny, nz = ax - bx, ay - by, az - bz
@@ -212,20 +234,24 @@ def _solve(
                 rx, ry, rz = load_triple(work, slot + _R)
                 target = load(work, slot + _TARGET)
                 if iteration == 1:
-                    store(work, slot + _FIRST, now)
+                    store(work, slot + _FIRST, pull)
                 elif iteration == 2:
-                    store(work, slot + _LATER, now)
+                    store(work, slot + _LATER, pull)
                 else:
-                    store(work, slot + _LATER, load(work, slot + _LATER) + now)
+                    store(work, slot + _LATER, load(work, slot + _LATER) + pull)
                 real = one if atom < whole else load(present, atom)
-                if row + 1 < m:
-                    ahead = slot + stride
-                    nx, ny, nz = load_triple(work, ahead + _S)
-                    then = load(work, ahead + _F) - load(work, ahead + _C) * now - load(work, ahead + _L) * q
-            w_exit = load(weights, atom + onward)
-            ox = w_exit * product_difference(nx, then, sx, now)
-            oy = w_exit * product_difference(ny, then, sy, now)
-            oz = w_exit * product_difference(nz, then, sz, now)
+                if row + 1 < n_rows:
+                    there = slot + stride
+                    nx, ny, nz = load_triple(work, there + _S)
+                    next_pull = (
+                        load(work, there + _RIGHT)
+                        - load(work, there + _AHEAD) * pull
+                        - load(work, there + _ASIDE) * pull_final
+                    )
+            leave_weight = load(weights, atom + onward)
+            ox = leave_weight * product_difference(nx, next_pull, sx, pull)
+            oy = leave_weight * product_difference(ny, next_pull, sy, pull)
+            oz = leave_weight * product_difference(nz, next_pull, sz, pull)
             rx, ry, rz = rx + (ex - ox), ry + (ey - oy), rz + (ez - oz)
             store_triple(work, slot + _R, rx, ry, rz)
             if tangent is not None:
@@ -237,18 +263,18 @@ def _solve(
             total = total + ratio
             peak_slot = where_greater(ratio, peak, splat(float(slot)), peak_slot)
             peak = where_greater(ratio, peak, ratio, peak)
-            both = (w + w_exit) * real
-            back = w * dot(rx, ry, rz, px, py, pz)
-            pivot = 1.0 / (where_zero(both, 1.0, both * inner) + back * c)
-            f = (error + back * f) * pivot
-            l = flushed(back * l * pivot)
-            c = -w_exit * dot(rx, ry, rz, nx, ny, nz) * pivot
-            store_triple(work, slot + _F, f, c, l)
-            head_diagonal = head_diagonal + gamma * l
-            head_right = head_right + gamma * f
-            gamma = flushed(-gamma * c)
-            px, py, pz, sx, sy, sz, now = sx, sy, sz, nx, ny, nz, then
-            ex, ey, ez, w = ox, oy, oz, w_exit
+            masses = (weight + leave_weight) * real
+            lower = weight * dot(rx, ry, rz, px, py, pz)
+            pivot = 1.0 / (where_zero(masses, 1.0, masses * inner) + lower * ahead)
+            right = (error + lower * right) * pivot
+            aside = flushed(lower * aside * pivot)
+            ahead = -leave_weight * dot(rx, ry, rz, nx, ny, nz) * pivot
+            store_triple(work, slot + _RIGHT, right, ahead, aside)
+            head_diagonal = head_diagonal + to_head * aside
+            head_right = head_right + to_head * right
+            to_head = flushed(-to_head * ahead)
+            px, py, pz, sx, sy, sz, pull = sx, sy, sz, nx, ny, nz, next_pull
+            ex, ey, ez, weight = ox, oy, oz, leave_weight
             slot += stride
             atom += step
         # The separators: move, measure, and add what the pieces pass on.
@@ -261,11 +287,11 @@ def _solve(
         rx, ry, rz = rx + real * (gx - fx), ry + real * (gy - fy), rz + real * (gz - fz)
         store_triple(work, seam + _R, rx, ry, rz)
         if iteration == 1:
-            store(work, seam + _FIRST, shared)
+            store(work, seam + _FIRST, pulls)
         elif iteration == 2:
-            store(work, seam + _LATER, shared)
+            store(work, seam + _LATER, pulls)
         elif iteration > 2:
-            store(work, seam + _LATER, load(work, seam + _LATER) + shared)
+            store(work, seam + _LATER, load(work, seam + _LATER) + pulls)
         real = load(present, end)
         if tangent is not None:
             error, inner, positive, ratio = _rate_error(rx, ry, rz, zx, zy, zz, seam_target, real)
@@ -285,36 +311,29 @@ def _solve(
         ok = finite and all_within(peak, limit)
         if ok or not finite or iteration == MAX_ITERATIONS:
             break
-        both = (load(weights, end) + from_next(load(weights, first))) * real
+        masses = (load(weights, end) + from_next(load(weights, first))) * real
         # Couplings of the rows at both ends of a lane: A(head, first), A(tail, last).
         gx, gy, gz = from_previous(rx), from_previous(ry), from_previous(rz)
         if upward:
             rx, ry, rz, gx, gy, gz = gx, gy, gz, rx, ry, rz
-        head = -w_first * dot(rx, ry, rz, hx, hy, hz)
-        tail = -w * dot(gx, gy, gz, px, py, pz)
-        store(small, 0, where_zero(both, 1.0, both * inner))
+        head = -head_weight * dot(rx, ry, rz, hx, hy, hz)
+        tail = -weight * dot(gx, gy, gz, px, py, pz)
+        store(small, 0, where_zero(masses, 1.0, masses * inner))
         store(small, WIDTH, error)
-        store_triple(small, 2 * WIDTH, -head * head_diagonal, -head * head_right, head * gamma)
-        store_triple(small, 5 * WIDTH, -tail * c, -tail * f, -tail * l)
+        store_triple(small, 2 * WIDTH, -head * head_diagonal, -head * head_right, head * to_head)
+        store_triple(small, 5 * WIDTH, -tail * ahead, -tail * right, -tail * aside)
         _reduce(small.reshape(8, WIDTH), upward)
-        shared = load(small, WIDTH)
+        pulls = load(small, WIDTH)
     store(small, 0, peak)
     store(small, WIDTH, peak_slot)
     lane = np.argmax(small[:WIDTH])
-    worst, place = small[lane], int(small[WIDTH + lane]) // SLOT
+    worst, place = small[lane], int(small[WIDTH + lane]) // SLOT * WIDTH + lane
     kept = all_within(TINY, least)
     if not (finite and kept):
-        # NaN escapes comparisons, and a bond turned round has no residual: look.
-        for k in range(n_slots * WIDTH):
-            at = (k // WIDTH) * SLOT + k % WIDTH
-            inner_product = 0.0
-            for axis in range(0, 3 * WIDTH, WIDTH):
-                s, r = work[at + _S + axis], work[at + _R + axis]
-                inner_product += s * s + 0.0 * r if tangent is not None else s * r
-            if present[first + k] > 0.0 and not inner_product > 0.0:
-                worst, place, lane = np.inf, k // WIDTH, k % WIDTH
-                break
-    return ok and kept, worst, place * WIDTH + lane, iteration
+        bad = _first_bad(work, present, first, n_slots, tangent)
+        if bad >= 0:
+            worst, place = np.inf, bad
+    return ok and kept, worst, place, iteration
 
 
 @njit(fastmath=FASTMATH)
@@ -362,14 +381,14 @@ def _shift(points, velocities, inverse_dt, atoms, owned, full, weights, work, fi
         else:
             # Slots beyond a chain's end repeat its last atom; only its own slot writes it.
             store_triple(work, slot + _R, x, y, z)
-            store_triple(work, slot + _F, vx, vy, vz)
+            store_triple(work, slot + _RIGHT, vx, vy, vz)
             for lane in range(WIDTH):
                 if owned[at + lane]:
                     target = atoms[at + lane] // 3
                     for axis in range(3):
                         points[target, axis] = work[slot + _R + axis * WIDTH + lane]
                         if move:
-                            velocities[target, axis] = work[slot + _F + axis * WIDTH + lane]
+                            velocities[target, axis] = work[slot + _RIGHT + axis * WIDTH + lane]
 
 
 @njit(fastmath=FASTMATH)
@@ -396,26 +415,9 @@ def _report(multipliers, rows, present, work, first, n_slots, solves, sign):
 
 @njit(cache=True, fastmath=FASTMATH, error_model="numpy")
 def project(
-    points,
-    references,
-    velocities,
-    inverse_dt,
-    tangent,
-    starts,
-    atoms,
-    owned,
-    full,
-    rows,
-    present,
-    weights,
-    wholes,
-    given,
-    lattice,
-    kind,
-    multipliers,
-    work,
-    undo,
-):
+    points, references, velocities, inverse_dt, tangent, starts, atoms, owned, full, rows, present, weights, wholes,
+    given, lattice, kind, multipliers, work, undo,
+):  # type: ignore[no-untyped-def]  # fmt: skip
     """Project one strip after another.
 
     `tangent` is None where `points` are positions, and anything else where

@@ -6,15 +6,17 @@ positions change once, after every cluster has converged, so that a failure leav
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import Outcome, Request
+from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.kernels.aligned_memory import aligned
 from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
 from kcons.solvers.kernels.two_and_four_wide import (
@@ -34,20 +36,17 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_line,
     store_quad,
 )
-from kcons.solvers.sparse.elimination import FAST, UIntArray, make_pattern, make_small_pattern
+from kcons.solvers.sparse import step_control
+from kcons.solvers.sparse.elimination import FAST, make_pattern, make_small_pattern
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 
-#: Newton stops at this relative error of a length in relative coordinates (a few roundings).
-LENGTH_TOLERANCE = 4e-15
 #: |A v - c| allowed after a velocity projection, relative to the largest relative speed of the cluster.
 SPEED_TOLERANCE = 1e-15
-MAX_ITERATIONS = 50
-#: Halvings of one Newton step by the step control.
-MAX_HALVINGS = 30
 _EPS = float(np.finfo(float).eps)
 
 
-class SparseDistances:
+class SparseDistances(DistanceClusters):
     """Solver for distance rows in clusters of any shape.
 
     Parameters
@@ -109,56 +108,34 @@ class SparseDistances:
         self._kept_moves = np.zeros(len(self._moves))
         self._kept_solution = np.zeros(len(rows))
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        lengths: FloatArray,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
+    def _project(
+        self, request: Request, given: FloatArray, tangent: Literal[True] | None, multipliers: FloatArray | None
     ) -> Outcome:
-        """Solve the SHAKE condition by true Newton, in place; `lengths` in the order of `rows`."""
-        for careful in (False, True):
-            failed, residual, iterations, worst = solve_positions(
-                careful, x_new, x_ref, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None,
-                *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
-                self._solution, self._kept_moves, self._kept_solution,
-            )  # fmt: skip
-            if not failed:
-                break
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        if velocities is None:
-            apply(x_new, self._atoms, self._moves)
-        else:
-            apply_both(x_new, velocities, inv_dt, self._atoms, self._moves)
-        if multipliers is not None:
-            _natural(self._state, self._solution, 1.0, multipliers)
-        return Outcome(True, residual, iterations, worst)
-
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-    ) -> Outcome:
-        """M-orthogonal projection of y onto u.(y_i - y_j) = rates, in place."""
-        failed, residual, iterations, worst = solve_tangents(
-            x, y, self.lengths if rates is None else rates, rates is not None,
-            NO_LATTICE if lattice is None else lattice, lattice is not None,
-            *self._tables, self._state, self._entries, self._pivots, self._starts, self._places, self._moves,
-            self._solution,
+        x, reference, _, lattice, _, _, velocities, inv_dt = request
+        cell, periodic = NO_LATTICE if lattice is None else lattice, lattice is not None
+        rooms = (
+            self._state, self._entries, self._pivots, self._starts, self._places, self._moves, self._solution,
         )  # fmt: skip
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        apply(y, self._atoms, self._moves)
-        if multipliers is not None:
-            _natural(self._state, self._solution, -1.0, multipliers)
-        return Outcome(True, residual, iterations, worst)
+        if tangent:
+            failed, residual, iterations, worst = solve_tangents(
+                reference, x, given, len(given) > 0, cell, periodic, *self._tables, *rooms
+            )
+        else:
+            for careful in (False, True):
+                failed, residual, iterations, worst = solve_positions(
+                    careful, x, reference, given, cell, periodic, *self._tables, *rooms,
+                    self._kept_moves, self._kept_solution,
+                )  # fmt: skip
+                if not failed:
+                    break
+        if not failed:
+            if velocities is None or tangent:
+                apply(x, self._atoms, self._moves)
+            else:
+                apply_both(x, velocities, inv_dt, self._atoms, self._moves)
+            if multipliers is not None:
+                _natural(self._state, self._solution, -1.0 if tangent else 1.0, multipliers)
+        return Outcome(not failed, residual, iterations, worst)
 
     def tables(self) -> tuple[tuple[NDArray[Any], ...], tuple[FloatArray, ...]]:
         """What `solve_positions` and `solve_tangents` are given of the rows, and the rooms that they work in."""
@@ -168,37 +145,23 @@ class SparseDistances:
 
     def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(x, np.zeros_like(x), None, lattice, None)
+        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice))
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
 
 
+def sparse_distances(
+    constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray, time: float = 0.0
+) -> SparseDistances:
+    """The sparse solver, which has step control, for distance rows."""
+    pairs = np.array([constraint_set.row_atoms(int(row)) for row in rows], dtype=np.int64)
+    return SparseDistances(rows, pairs, constraint_set.target(time)[rows], inverse_masses)
+
+
 def _plain(kernel: Any, plain: bool) -> Any:
     """A compiled function, or what it was made of."""
     return kernel.py_func if plain else kernel
-
-
-def lengths_resolved(x: FloatArray, pairs: UIntArray, lengths: FloatArray, lattice: FloatArray | None) -> bool:
-    """Whether each |sigma| at `x` is within max(1e-14 d, 2 eps (|x_i| + |x_j|))."""
-    return bool(resolved(x, pairs, lengths, NO_LATTICE if lattice is None else lattice, lattice is not None))
-
-
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def resolved(x, pairs, lengths, lattice, periodic):  # type: ignore[no-untyped-def]
-    for k in range(len(pairs)):
-        i, j = pairs[k, 0], pairs[k, 1]
-        ax, ay, az = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-        if periodic:
-            ax, ay, az = nearest_image(ax, ay, az, lattice)
-        d = lengths[k]
-        miss = abs(ax * ax + ay * ay + az * az - d * d) / (2.0 * d)
-        if not (miss <= 1e-14 * d):
-            reach = np.sqrt(x[i, 0] ** 2 + x[i, 1] ** 2 + x[i, 2] ** 2)
-            reach += np.sqrt(x[j, 0] ** 2 + x[j, 1] ** 2 + x[j, 2] ** 2)
-            if not (miss <= 2 * _EPS * reach):
-                return False
-    return True
 
 
 @nb.njit(cache=True)
@@ -321,20 +284,17 @@ def solve_positions(  # type: ignore[no-untyped-def]
         while True:
             if iteration > 0:
                 error, total = _measure(first, last, lengths, links, state, starts, moves)
-            if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
-                # Step control: go back half the way.
+            if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, _worst(first, last, state, lengths)
                 halvings += 1
-                for a in range(4 * first_atom, 4 * last_atom):
-                    moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
-                for k in range(first, last):
-                    solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
+                go_back(4 * first_atom, 4 * last_atom, moves, kept_moves)
+                go_back(first, last, solution, kept_solution)
                 continue
             # max() may drop a NaN; the sum cannot.
-            if not (total < np.inf) or iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
+            if not (total < np.inf) or hopeless(iteration, error, previous):
                 return True, error, iteration, _worst(first, last, state, lengths)
-            if error <= LENGTH_TOLERANCE:
+            if error <= step_control.NEWTON_TOLERANCE:
                 break
             # Rounding may stop short of it in ill-conditioned sets; what the positions resolve is enough.
             if error > 0.5 * previous and error < 1e-10 and _resolved(first, last, state, lengths, places, links):
@@ -342,13 +302,9 @@ def solve_positions(  # type: ignore[no-untyped-def]
             if careful:
                 best = total
                 halvings = 0
-                for a in range(4 * first_atom, 4 * last_atom):
-                    kept_moves[a] = moves[a]
-                for k in range(first, last):
-                    kept_solution[k] = solution[k]
-            # Reuse the factor while a step with it still gains enough for its lower price.
-            ratio = error / previous
-            if factored and (error * ratio <= LENGTH_TOLERANCE or ratio < 1e-4):
+                keep(4 * first_atom, 4 * last_atom, moves, kept_moves)
+                keep(first, last, solution, kept_solution)
+            if factor_serves(factored, error, previous):
                 forward(first, last, links, columns, state, entries)
             else:
                 factor(first, last, links, columns, targets, couplings, weights, state, entries, pivots)
@@ -442,8 +398,7 @@ def solve_tangents(  # type: ignore[no-untyped-def]
                 error = max(error, abs(miss))
             if not (total < np.inf):
                 return True, error, iteration, _first_bad(first, last, state)
-            # One refinement more as long as it helps; the floor itself is accepted.
-            if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
+            if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             forward(first, last, links, columns, state, entries)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome
+from kcons.solvers.cluster_solver import Outcome, Request
 from kcons.solvers.kernels.aligned_memory import aligned
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 from kcons.solvers.kernels.two_and_four_wide import (
@@ -36,13 +36,12 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
     swapped,
 )
+from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
-MAX_ITERATIONS = 50
-#: Halvings of one Newton step by the step control.
-MAX_HALVINGS = 30
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
 SPEED_TOLERANCE = 1e-15
 _EPS = float(np.finfo(float).eps)
@@ -110,63 +109,44 @@ class SparseRows:
         self._kept_solution = np.zeros(n)
         self._speeds = aligned(4 * len(self._atoms))
 
-    def positions(
-        self,
-        x_new: FloatArray,
-        x_ref: FloatArray,
-        targets: FloatArray | None,
-        lattice: FloatArray | None,
-        velocities: FloatArray | None,
-        inv_dt: float,
-        multipliers: FloatArray | None,
-        time: float,
-        reference_time: float,
-    ) -> Outcome:
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        wanted = self._targets if targets is None else targets[self.rows]
+        x, reference, wanted, lattice, _, _, velocities, inv_dt = request
+        targets = self._targets if wanted is None else wanted[self.rows]
         for careful in (False, True):
             failed, residual, iterations, worst = _positions(
-                careful, x_new, x_ref, wanted, NO_LATTICE if lattice is None else lattice, lattice is not None,
+                careful, x, reference, targets, NO_LATTICE if lattice is None else lattice, lattice is not None,
                 *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
                 self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             if not failed:
                 break
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        _apply(x_new, 1.0, self._atoms, self._moves)
-        if velocities is not None:
-            _apply(velocities, inv_dt, self._atoms, self._moves)
-        if multipliers is not None:
-            multipliers[:] = self._solution
-        return Outcome(True, residual, iterations, worst)
+        if not failed:
+            _apply(x, 1.0, self._atoms, self._moves)
+            if velocities is not None:
+                _apply(velocities, inv_dt, self._atoms, self._moves)
+            if multipliers is not None:
+                multipliers[:] = self._solution
+        return Outcome(not failed, residual, iterations, worst)
 
-    def tangents(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        rates: FloatArray | None,
-        lattice: FloatArray | None,
-        multipliers: FloatArray | None,
-        time: float,
-    ) -> Outcome:
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        wanted = self._targets if rates is None else rates[self.rows]
+        y, x, wanted, lattice, *_ = request
+        rates = self._targets if wanted is None else wanted[self.rows]
         failed, residual, iterations, worst = _tangents(
-            x, y, wanted, rates is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
+            x, y, rates, wanted is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
             *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
             self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
-        if failed:
-            return Outcome(False, residual, iterations, worst)
-        _apply(y, 1.0, self._atoms, self._moves)
-        if multipliers is not None:
-            np.negative(self._solution, out=multipliers)
-        return Outcome(True, residual, iterations, worst)
+        if not failed:
+            _apply(y, 1.0, self._atoms, self._moves)
+            if multipliers is not None:
+                np.negative(self._solution, out=multipliers)
+        return Outcome(not failed, residual, iterations, worst)
 
     def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(x, np.zeros_like(x), None, lattice, None, 0.0)
+        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice))
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
@@ -340,6 +320,14 @@ def _measure(first, last, kinds, wanted, scale, floor, values, state):  # type: 
     return error, total, excess, bad
 
 
+@nb.njit(cache=True)
+def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
+        if not (abs(state[2 * k + 1]) < np.inf):
+            return k
+    return first
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
     careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters,
@@ -364,35 +352,27 @@ def _positions(  # type: ignore[no-untyped-def]
                 first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
             )
             error, total, excess, bad = _measure(first, last, kinds, wanted, scale, floor, values, state)
-            if careful and iteration > 0 and not (total < 0.999 * best) and error > 1e-10:
-                # Step control: go back half the way.
+            if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, bad
                 halvings += 1
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
-                    moves[a] = kept_moves[a] + 0.5 * (moves[a] - kept_moves[a])
-                for k in range(first, last):
-                    solution[k] = kept_solution[k] + 0.5 * (solution[k] - kept_solution[k])
+                go_back(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
+                go_back(first, last, solution, kept_solution)
                 error = previous
                 continue
             if not (total < np.inf):
-                for k in range(first, last):
-                    if not (abs(state[2 * k + 1]) < np.inf):
-                        return True, np.inf, iteration, k
-            if iteration >= MAX_ITERATIONS or error > 1e6 * max(previous, 1.0):
+                return True, np.inf, iteration, _first_not_finite(first, last, state)
+            if hopeless(iteration, error, previous):
                 return True, error, iteration, bad
             # Go on to the floor of the relative coordinates as long as Newton still gains.
-            if excess <= 1.0 and (error <= 4e-15 or error > 0.1 * previous):
+            if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
             if careful:
                 best = total
                 halvings = 0
-                for a in range(4 * atom_start[c], 4 * atom_start[c + 1]):
-                    kept_moves[a] = moves[a]
-                for k in range(first, last):
-                    kept_solution[k] = solution[k]
-            ratio = error / previous
-            if factored and (error * ratio <= 4e-15 or ratio < 1e-4):
+                keep(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
+                keep(first, last, solution, kept_solution)
+            if factor_serves(factored, error, previous):
                 _forward(first, last, links, columns, state, entries)
             else:
                 _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
@@ -448,10 +428,7 @@ def _tangents(  # type: ignore[no-untyped-def]
             total += size
             solution[k] = 0.0
         if not (total < np.inf):
-            for k in range(first, last):
-                if not (abs(state[2 * k + 1]) < np.inf):
-                    return True, np.inf, 0, k
-            return True, np.inf, 0, first
+            return True, np.inf, 0, _first_not_finite(first, last, state)
         _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
@@ -474,7 +451,7 @@ def _tangents(  # type: ignore[no-untyped-def]
                     bad = k
             if not (total < np.inf):
                 return True, np.inf, iteration, bad
-            if error <= allowed or iteration > 8 or not (error < 0.5 * previous):
+            if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             _forward(first, last, links, columns, state, entries)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.motion.motion import MANY_ITERATIONS, Motion
+from kcons.motion.local_projections import MANY_ITERATIONS
+from kcons.motion.motion import Motion
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
@@ -284,10 +285,10 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     for solver in plan.solvers:
         if not isinstance(solver, DistanceClusters):
             return None
-        if triangles is None and not compact and isinstance(solver.solver, RigidTriangles):
-            triangles = solver.solver
-        elif chains is None and isinstance(solver.solver, Chains):
-            chains = solver.solver
+        if triangles is None and not compact and isinstance(solver, RigidTriangles):
+            triangles = solver
+        elif chains is None and isinstance(solver, Chains):
+            chains = solver
         else:
             rows.append(solver.rows)
     if chains is not None and not _worth_it(chains, sum(map(len, rows))):

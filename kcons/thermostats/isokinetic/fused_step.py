@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
-from kcons.motion.motion import MANY_ITERATIONS
+from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import piece
 from kcons.steppers import System

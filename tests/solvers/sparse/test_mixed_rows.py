@@ -5,6 +5,7 @@ import pytest
 
 from kcons.constraints import Angle, Cylinder, Dihedral, Distance, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.solvers.cluster_solver import Request
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
 CONSTRAINTS = [
@@ -47,7 +48,7 @@ def test_matches_dense_newton(seed):
     c = Scene(seed=seed)
     solver = c.solver()
     x, velocities, found = c.x_new.copy(), c.velocities.copy(), np.full(c.set.n_rows, np.nan)
-    outcome = solver.positions(x, c.x_ref, None, None, velocities, 500.0, found, 0.0, 0.0)
+    outcome = solver.positions(Request(x, c.x_ref, velocities=velocities, inv_dt=500.0), found)
     assert outcome.converged
     expected, multipliers = c.dense()
     np.testing.assert_allclose(x, expected, atol=1e-11)
@@ -63,7 +64,7 @@ def test_tangents_match_dense_solve(driven):
     rates = np.random.default_rng(2).normal(size=c.set.n_rows) if driven else None
     solver = c.solver()
     y, found = c.y.copy(), np.full(c.set.n_rows, np.nan)
-    assert solver.tangents(c.x_ref, y, rates, None, found, 0.0).converged
+    assert solver.tangents(Request(y, c.x_ref, rates), found).converged
     a = c.set.jacobian(c.x_ref).toarray()
     pull = np.repeat(c.inv_mass, 3)[:, None] * a.T
     wanted = rates if driven else 0.0
@@ -86,7 +87,7 @@ def test_periodic_equals_unwrapped():
         solver = SparseRows(given, np.arange(given.n_rows), np.ones(10))
         x = x_new + shift[0]
         lattice = None if box is None else given.lattice
-        assert solver.positions(x, x_ref + shift[1], None, lattice, None, 0.0, None, 0.0, 0.0).converged
+        assert solver.positions(Request(x, x_ref + shift[1], lattice=lattice)).converged
         results.append(x - shift[0])
     np.testing.assert_allclose(results[1], results[0], atol=1e-11)
 
@@ -96,8 +97,8 @@ def test_pinned_atoms_stay():
     c.inv_mass[2] = 0.0
     x, y = c.x_new.copy(), c.y.copy()
     x[2], y[2] = c.x_ref[2], 0.0
-    assert c.solver().positions(x, c.x_ref, None, None, None, 0.0, None, 0.0, 0.0).converged
-    assert c.solver().tangents(c.x_ref, y, None, None, None, 0.0).converged
+    assert c.solver().positions(Request(x, c.x_ref)).converged
+    assert c.solver().tangents(Request(y, c.x_ref)).converged
     np.testing.assert_array_equal(x[2], c.x_ref[2])
     np.testing.assert_array_equal(y[2], 0.0)
     assert np.all(np.abs(c.set.value(x)) <= c.set.tolerance(x))
@@ -114,7 +115,7 @@ def test_failure_changes_nothing(damage):
         c.x_ref[6] = c.x_ref[7]
     x, velocities = c.x_new.copy(), c.velocities.copy()
     solver = c.solver()
-    outcome = solver.positions(x, c.x_ref, None, None, velocities, 500.0, None, 0.0, 0.0)
+    outcome = solver.positions(Request(x, c.x_ref, velocities=velocities, inv_dt=500.0))
     assert not outcome.converged
     row = solver.rows[outcome.worst_row]
     assert (set(c.set.row_atoms(int(row))) <= {6, 7}) == (damage != "flipped")
@@ -126,7 +127,7 @@ def test_failed_tangents_change_nothing():
     c = Scene(seed=6)
     c.y[3, 1] = np.nan
     y = c.y.copy()
-    assert not c.solver().tangents(c.x_ref, y, None, None, None, 0.0).converged
+    assert not c.solver().tangents(Request(y, c.x_ref)).converged
     np.testing.assert_array_equal(y, c.y)
 
 
@@ -140,7 +141,7 @@ def test_dependent_rows_are_dropped():
     solver = SparseRows(given, np.arange(4 * n), 1 / masses)
     assert solver.rank(x, None) == 3 * n
     y = rng.normal(size=x.shape)
-    assert solver.tangents(x, y, None, None, None, 0.0).converged
+    assert solver.tangents(Request(y, x)).converged
     # As far as the worst of these triangles is from a line.
     rows = given.jacobian(x).toarray() / np.sqrt(np.repeat(masses, 3))
     s = np.linalg.svd(rows / np.linalg.norm(rows, axis=1)[:, None], compute_uv=False)

@@ -8,7 +8,8 @@ import pytest
 from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget, Plane
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
-from kcons.motion.motion import MANY_ITERATIONS, Motion
+from kcons.motion.local_projections import MANY_ITERATIONS
+from kcons.motion.motion import Motion
 from kcons.steppers import (
     BlanesMoan4,
     BlanesMoan6,

@@ -1,0 +1,56 @@
+"""Whole systems: where results go, and what of the system is looked at."""
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.motion import Motion
+from kcons.motion.projector import Projector
+
+
+@pytest.fixture(params=[0, 20], ids=["all atoms", "few among many"])
+def system(request):
+    """One bond, alone or among free atoms: then the engine works on a copy of two atoms."""
+    rng = np.random.default_rng(0)
+    x = np.concatenate([[[0.0, 0, 0], [1.0, 0.2, 0]], rng.normal(size=(request.param, 3)) + 5.0])
+    projector = Projector(ConstraintSet(Distance([[0, 1]]), x, np.ones(len(x))), x)
+    return projector, x, x + 0.05 * rng.normal(size=x.shape)
+
+
+@pytest.mark.parametrize("project", ["positions", "velocities"])
+def test_results_go_where_they_are_wanted(system, project):
+    projector, x, new = system
+
+    def call(given, out=None):
+        if project == "positions":
+            return projector.project_positions(given, x, out=out)
+        return projector.project_velocities(x, given, out=out)
+
+    before = new.copy()
+    fresh = call(new)
+    np.testing.assert_array_equal(new, before)
+    assert fresh is not new and np.abs(fresh[:2] - new[:2]).max() > 1e-4
+    np.testing.assert_array_equal(fresh[2:], new[2:])
+    other = np.full_like(new, np.nan)
+    assert call(new, other) is other
+    np.testing.assert_array_equal(other, fresh)
+    assert call(new, new) is new
+    np.testing.assert_array_equal(new, fresh)
+
+
+def test_the_reference_may_be_what_is_changed(system):
+    projector, x, _ = system
+    y = x * 1.01
+    expected = projector.project_positions(y.copy(), y.copy())
+    np.testing.assert_array_equal(projector.project_positions(y, y, out=y), expected)
+
+
+def test_velocities_follow_positions(system):
+    projector, x, new = system
+    v = np.ones_like(x)
+    y = projector.project_positions(new, x, velocities=v, dt=0.5)
+    np.testing.assert_allclose(v, 1.0 + (y - new) / 0.5, atol=1e-13)
+    projector.took(7)
+    assert isinstance(Motion(projector.constraint_set, x), Projector)
+    assert Motion(projector.constraint_set, x).rank == projector.rank == 1
