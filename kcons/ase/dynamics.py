@@ -26,6 +26,7 @@ from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
+from kcons.steppers.stepper import Listed
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 _FAR = 128.0
@@ -161,6 +162,11 @@ class ConstrainedDynamics(MolecularDynamics):
     def todict(self) -> dict[str, Any]:
         """As ASE stores it in trajectories."""
         return {**super().todict(), "stepper": repr(self.stepper)}
+
+    def listing(self) -> str:
+        """What a step consists of, a line for each operation; the name alone for steppers that have no list."""
+        system = self._systems()
+        return self.stepper.listing(system) if isinstance(self.stepper, Listed) else repr(self.stepper)
 
     # -- steps ----------------------------------------------------------------------------------
 

@@ -20,11 +20,21 @@ from ase_systems import (
     water,
 )
 
-from kcons.ase import ConstrainedDynamics, Constraints, constrain
+from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics, constrain
 from kcons.constraints import Distance, KnifeEdge, LinearVelocity
 from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Geodesic, ProjectedVerlet, Rattle, Suzuki4
 
 # -- right ------------------------------------------------------------------------------------------
+
+
+def test_the_listing_is_that_of_the_stepper():
+    atoms, _ = rigid()
+    for stepper in (Rattle(), Suzuki4(), Geodesic()):
+        dynamics = ConstrainedDynamics(atoms, FS, stepper=stepper)
+        assert dynamics.listing() == stepper.listing()
+    assert IsokineticDynamics(atoms, FS, temperature_K=300, momentum="free").listing().splitlines()[1].split()[0] == "turn"
+    assert ConstrainedDynamics(atoms, FS, stepper=ProjectedVerlet()).listing() == "ProjectedVerlet()"
 
 
 def test_follows_velocity_verlet():

@@ -31,7 +31,9 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion.motion import Motion
+from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.steppers.operations import Exchange
 from kcons.steppers.stages.compensated_steps import Point
 from kcons.steppers.stages.drifts import NonholonomicFlight
 
@@ -118,8 +120,9 @@ class Engine:
         scheme = getattr(integrator, "scheme", None)
         if scheme is not None:
             ensemble = getattr(integrator, "ensemble", None)
-            self._within = ensemble is not None and ensemble.halves
-            self._fractions = (0.5, 0.5) if self._within else tuple(a * w for a in scheme.drifts for w in scheme.flight)
+            operations = operations_of(scheme) if ensemble is None else ensemble.operations(scheme)
+            self._within = any(isinstance(operation, Exchange) for operation in operations)
+            self._fractions = tuple(stages_of(operations)[0])
             sums = np.cumsum(self._fractions)[:-1].tolist()
             self._nodes = (0.0, *sums, 1.0)
 

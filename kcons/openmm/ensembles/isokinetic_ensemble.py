@@ -19,8 +19,10 @@ from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
 from kcons.steppers.compositions import Composition
+from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import AT_REST, atom_numbers, positive
@@ -76,7 +78,6 @@ class Isokinetic(Value):
     """
 
     stays_tangent = True
-    halves = False
     adds_up = True
     temperature: float | None
     kinetic_energy: float | None
@@ -125,6 +126,16 @@ class Isokinetic(Value):
                 f"{scheme!r} loses its order with the isokinetic thermostat, whose kicks are not linear; use "
                 "'isokinetic4' or 'isokinetic6'"
             )
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        """The kicks of the scheme turn velocities, which are tangent before and stay so."""
+        done: list[Operation] = []
+        for operation in operations_of(scheme):
+            if isinstance(operation, Kick):
+                done += [Project(), Turn(operation.fraction)]
+            elif not (isinstance(operation, Project) and isinstance(done[-1], Turn)):
+                done.append(operation)
+        return tuple(done if scheme is None else done[isinstance(done[0], Project) :])
 
     # -- program --------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.program import Program
+from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 
 
@@ -43,7 +44,6 @@ class Langevin(ConstantEnergy):
     Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
 
-    halves = True
     adds_up = True
     temperature: float
     friction: float
@@ -70,6 +70,11 @@ class Langevin(ConstantEnergy):
             )
         if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
             raise UnsupportedError(f"Langevin splits the drift of scheme='rattle' in two; {scheme!r} has another form")
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        """Friction and noise act between two halves of the drift."""
+        first, second = drifts_of((0.5, 0.5))
+        return (Kick(0.5), first, Exchange(1.0), second, Evaluate(), Kick(0.5), Project())
 
     def declare(self, program: Program) -> None:
         kT, friction = self.settings().values()

@@ -10,6 +10,8 @@ import openmm
 from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import operations_of
+from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 
@@ -23,19 +25,20 @@ class Ensemble(Protocol):
     stays_tangent : bool
         Whether kicks leave v tangent to all constraints at x: a step that ends with a kick ends without a projection
         of its own then.
-    halves : bool
-        Whether `middle` does something, between two halves of the only drift.
     adds_up : bool
         Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
         divided into calls then changes the rounding of the motion.
     """
 
     stays_tangent: bool
-    halves: bool
     adds_up: bool
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
+        ...
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        """What a step consists of. Where there is an `Exchange`, `middle` writes it."""
         ...
 
     def declare(self, program: Program) -> None:
@@ -126,11 +129,13 @@ class ConstantEnergy(Value):
     """Newton's equations: v += h f/m."""
 
     stays_tangent = False
-    halves = False
     adds_up = False
 
     def check(self, scheme: Splitting | None) -> None:
         pass
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        return operations_of(scheme)
 
     def declare(self, program: Program) -> None:
         pass

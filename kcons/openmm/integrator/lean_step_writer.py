@@ -80,8 +80,8 @@ class LeanStepWriter(StepWriter):
         use(p, "behind", "kick")
         p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
         self._kick("kick*dt", tangent=True)
-        h = "(0.5*dt)" if ensemble.halves else "dt"
-        if ensemble.halves:
+        h = "(0.5*dt)" if self.halves else "dt"
+        if self.halves:
             ensemble.middle(p, self._drift(h), self._project)
         p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
         if ensemble.stays_tangent:

@@ -23,6 +23,7 @@ from kcons.openmm.integrator.states.hearing import listen
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
+from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 
@@ -126,7 +127,12 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
             held += f", {guard.precision}"
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
-        return f"{held}\n{self.program.listing()}"
+        step = "\n".join(f"  {operation}" for operation in self.operations())
+        return f"{held}\na step of {self!r}\n{step}\n{self.program.listing()}"
+
+    def operations(self) -> tuple[Operation, ...]:
+        """What a step consists of, as for steppers on arrays; `listing` adds how OpenMM computes it."""
+        return self._plan.operations
 
     def counts(self, *, seen: bool = True, iterations: int = 2) -> StepCounts:
         """What a step makes OpenMM do, where all goes well.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from kcons.errors import InputError
 from kcons.steppers import (
@@ -15,6 +15,7 @@ from kcons.steppers import (
     Suzuki4,
     Yoshida4,
 )
+from kcons.steppers.operations import Fly, Kick, Operation, Turn, drifts_of
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES as ISOKINETIC
 
@@ -60,14 +61,19 @@ def to_scheme(scheme: str | Splitting) -> Splitting | None:
     return SCHEMES[scheme]()
 
 
-def stages_of(scheme: Splitting | None) -> tuple[list[float], list[float]]:
+def operations_of(scheme: Splitting | None) -> tuple[Operation, ...]:
+    """What a step consists of at constant energy; velocities of the leapfrog belong to half a step before positions."""
+    return (Kick(1.0), *drifts_of((1.0,))) if scheme is None else scheme.operations()
+
+
+def stages_of(operations: Iterable[Operation]) -> tuple[list[float], list[float]]:
     """Drifts, and the kick before each of them and after the last, as fractions of the step."""
-    if scheme is None:
-        return [1.0], [1.0, 0.0]
-    drifts = [a * w for a in scheme.drifts for w in scheme.flight]
-    kicks = [0.0] * (len(drifts) + 1)
-    every = len(scheme.flight)
-    first = 0 if scheme.kick_first else every
-    for k, b in enumerate(scheme.kicks):
-        kicks[first + k * every] = b
+    drifts: list[float] = []
+    kicks = [0.0]
+    for operation in operations:
+        if isinstance(operation, Kick | Turn):
+            kicks[-1] += operation.fraction
+        elif isinstance(operation, Fly):
+            drifts += operation.flights
+            kicks += [0.0] * len(operation.flights)
     return drifts, kicks

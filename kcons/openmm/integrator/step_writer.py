@@ -9,6 +9,7 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import stages_of
 from kcons.openmm.integrator.step_variables import use
+from kcons.steppers.operations import Exchange
 from kcons.steppers.splitting import Splitting
 
 
@@ -17,8 +18,12 @@ class StepWriter:
 
     Attributes
     ----------
+    operations : tuple of Operation
+        What a step consists of.
     drifts, kicks : list of float
-        The stages of the scheme as fractions of the step; see `stages_of`.
+        Its stages as fractions of the step; see `stages_of`.
+    halves : bool
+        Whether a bath acts between two halves of the only drift.
     alone : int
         With parts: number of the stage that is a drift without kicks, for applying constraints outside of steps.
     kept : bool
@@ -28,7 +33,9 @@ class StepWriter:
 
     def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
         self.program, self.scheme, self.parts, self.ensemble = program, scheme, tuple(parts), ensemble
-        self.drifts, self.kicks = ([0.5, 0.5], [0.5, 0.0, 0.5]) if ensemble.halves else stages_of(scheme)
+        self.operations = ensemble.operations(scheme)
+        self.drifts, self.kicks = stages_of(self.operations)
+        self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
         self.alone = len(self.drifts) + 1
         self.kept = scheme is not None and any(part.evaluates for part in self.parts)
 
@@ -57,7 +64,7 @@ class StepWriter:
         p, drifts, kicks = self.program, self.drifts, self.kicks
         if kicks[0]:
             self._kick(_of_dt(kicks[0]), tangent=True)
-        if self.ensemble.halves:
+        if self.halves:
             self.ensemble.middle(p, self._drift("(0.5*dt)"), self._project)
             self._kick("0.5*dt", self._drift("(0.5*dt)"))
         elif len(drifts) == 1:
@@ -121,7 +128,7 @@ class StepWriter:
             if self.kicks[0]:
                 self._kick("dt*kick_share(first_stage)", tangent=True)
             p.let("stage", "first_stage", "first drift")
-            if self.ensemble.halves:
+            if self.halves:
                 with p.when("first_stage = 0", "a step"):
                     p.let("h", "dt*drift_share(0)", "length of the first drift")
                     self.ensemble.middle(p, self._drift("h"), self._project)
@@ -190,7 +197,7 @@ class StepWriter:
     @property
     def _last_drift_apart(self) -> bool:
         """Whether the last drift is written outside of a loop."""
-        return len(self.drifts) == 1 or self.ensemble.halves
+        return len(self.drifts) == 1 or self.halves
 
     @property
     def _ends_tangent(self) -> bool:
