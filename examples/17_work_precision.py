@@ -4,7 +4,7 @@
     python examples/17_work_precision.py --scene chain       another scene of `kcons compare --list`
     python examples/17_work_precision.py --redraw            the figure once more, from work_precision.json
 
-`kcons compare` does the same for all methods of all hosts, with budgets, tables and fronts.
+`kcons compare` does the same for all methods of all MD engines, with budgets, tables and fronts.
 """
 
 import argparse

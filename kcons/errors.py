@@ -205,4 +205,4 @@ class NonFiniteError(KconsError, FloatingPointError):
 
 
 class UnsupportedError(KconsError, NotImplementedError):
-    """The host or method cannot do this; the message says what to use instead."""
+    """The MD engine or method cannot do this; the message says what to use instead."""

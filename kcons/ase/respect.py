@@ -26,10 +26,10 @@ ADVICE = (
 
 
 class Watch:
-    """What a host has asked for and got, as far as it shows whether the host respects the constraints.
+    """What an MD engine has asked for and got, as far as it shows whether the MD engine respects the constraints.
 
     Only dynamics set momenta. So that is when positions must be on the constraints, and when it shows that the
-    host went on from its own copy of the positions instead of the corrected ones.
+    MD engine went on from its own copy of the positions instead of the corrected ones.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Watch:
         Raises
         ------
         UnsupportedError
-            The positions are off the constraints, or the host keeps asking for its own uncorrected ones.
+            The positions are off the constraints, or the MD engine keeps asking for its own uncorrected ones.
         """
         self._momenta_since = True
         accepted = self._accepted

@@ -352,7 +352,7 @@ def _flush_c_streams() -> None:
     library.fflush(None)
 
 
-# -- hosts ------------------------------------------------------------------------------------------
+# -- MD engines ------------------------------------------------------------------------------------------
 
 
 def write_ase(dynamics: Any, path: str | Path, interval: int = 1, **options: Any) -> TrajectoryWriter:

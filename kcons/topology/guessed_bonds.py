@@ -1,4 +1,4 @@
-"""Bonds for systems that come without: by distance and covalent radii, one way for all hosts."""
+"""Bonds for systems that come without: by distance and covalent radii, one way for all MD engines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraints in another unit of length: what is held in angstrom, given to a host that counts in nanometers."""
+"""Constraints in another unit of length: what is held in angstrom, given to an MD engine that counts in nanometers."""
 
 from __future__ import annotations
 

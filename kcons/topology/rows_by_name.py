@@ -1,6 +1,6 @@
 """Rows by name from any topology: bonds with hydrogens, all bonds, angles, rigid water, rigid groups.
 
-One function for all hosts, so that MDAnalysis, ASE and OpenMM give the same rows, in the same order, for the same
+One function for all MD engines, so that MDAnalysis, ASE and OpenMM give the same rows, in the same order, for the same
 system: bonds sorted by their atoms, angles by vertex and ends, water by residue, then rigid groups, then rows of one's
 own.
 """

@@ -1,4 +1,4 @@
-"""What a file says about a system: atoms, residues, bonds, masses; the same for every host.
+"""What a file says about a system: atoms, residues, bonds, masses; the same for every MD engine.
 
 `Topology` and `Snapshot` hold plain arrays, so that everything that is derived from them (which rows are held,
 where virtual sites go) is derived once, for MDAnalysis, ASE and OpenMM alike.

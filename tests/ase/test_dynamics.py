@@ -33,7 +33,9 @@ def test_the_listing_is_that_of_the_stepper():
     for stepper in (Rattle(), Suzuki4(), Geodesic()):
         dynamics = ConstrainedDynamics(atoms, FS, stepper=stepper)
         assert dynamics.listing() == stepper.listing()
-    assert IsokineticDynamics(atoms, FS, temperature_K=300, momentum="free").listing().splitlines()[1].split()[0] == "turn"
+    assert (
+        IsokineticDynamics(atoms, FS, temperature_K=300, momentum="free").listing().splitlines()[1].split()[0] == "turn"
+    )
     assert ConstrainedDynamics(atoms, FS, stepper=ProjectedVerlet()).listing() == "ProjectedVerlet()"
 
 

@@ -236,7 +236,7 @@ class Judge:
         return self.verdicts
 
     def elsewhere(self, chance: float) -> Array:
-        """The images of the atoms, or others that a host could as well have chosen."""
+        """The images of the atoms, or others that an MD engine could as well have chosen."""
         w = self.w
         if self.rng.random() > chance or not self.periodic:
             return w.images
@@ -397,7 +397,7 @@ class Judge:
                     self.say("restore_positions", "silent", "off its rows", float(off.max()))
 
     def steps(self) -> None:
-        """A run in parts; between them a host may choose other images, or another cell."""
+        """A run in parts; between them an MD engine may choose other images, or another cell."""
         w, rows, rng = self.w, self.rows, self.rng
         images, cell = w.images, w.cell
         stepper = _stepper(w.stepper)
@@ -467,7 +467,7 @@ class Judge:
         return -self.w.springs * (x - self.w.anchors)
 
     def _between(self, state: State, images: Array, cell: Array, winds: bool) -> tuple[Array, Array, State]:
-        """Wrap the atoms, or change the cell, as hosts and barostats do."""
+        """Wrap the atoms, or change the cell, as MD engines and barostats do."""
         w, rng = self.w, self.rng
         whole = state.positions - images @ cell
         if rng.random() < 0.5 or winds or self._far():

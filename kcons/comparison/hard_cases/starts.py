@@ -185,7 +185,7 @@ def wrapping(program: Program, quick: bool) -> Outcome:
     plain = program.run(free, 0.01, steps).x
     limit, remark = 1e-11, f"{steps} steps"
     if not isinstance(program, Core):
-        # Hosts keep positions in double precision and nothing else: their own rounding, seen by a shift of the whole.
+        # MD engines keep positions as doubles and nothing else: their own rounding, seen by a shift of the whole.
         shift = TRICLINIC.sum(axis=0)
         own = np.abs(program.run(free.but(positions=x + shift), 0.01, steps).x - shift - plain).max()
         limit = max(limit, 10 * own)

@@ -1,4 +1,4 @@
-"""The isokinetic thermostat in the core and in both hosts, which have none themselves, and the fluid that tests it."""
+"""The isokinetic thermostat in the core and in both MD engines, which have none, and the fluid that tests it."""
 
 from __future__ import annotations
 

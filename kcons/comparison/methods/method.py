@@ -149,10 +149,10 @@ class Run(ABC):
         """Other positions, such as those wrapped into a cell, and the velocities as they are."""
         raise NotImplementedError
 
-    # -- what only a host knows that runs by itself ----------------------------------------------
+    # -- what only an MD engine knows that runs by itself ----------------------------------------------
 
     def own_energy(self) -> float | None:
-        """Total energy as the host states it; None where it follows from positions and velocities."""
+        """Total energy as the MD engine states it; None where it follows from positions and velocities."""
         return None
 
     def own_evaluations(self) -> int | None:

@@ -149,7 +149,7 @@ def from_file(
 ) -> Scene:
     """The molecules of a file at 300 K.
 
-    Angles are held as distances of their ends, which all hosts can do.
+    Angles are held as distances of their ends, which all MD engines can do.
 
     Parameters
     ----------

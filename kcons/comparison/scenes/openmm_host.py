@@ -1,4 +1,4 @@
-"""OpenMM as a host of scenes: a System with the scene's forces and masses, and what its units are in the scene's."""
+"""OpenMM as an MD engine of scenes: a System with the scene's forces and masses, and its units in the scene's."""
 
 from __future__ import annotations
 

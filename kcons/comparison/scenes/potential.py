@@ -1,6 +1,6 @@
 """Energies and forces of a scene, the same for every method that runs it.
 
-A `Potential` remembers its last point, so that a host asking twice pays once, and counts and times what
+A `Potential` remembers its last point, so that an MD engine asking twice pays once, and counts and times what
 it evaluates. `PotentialCalculator` hands it to ASE.
 """
 

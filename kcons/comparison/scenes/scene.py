@@ -91,7 +91,7 @@ class Scene:
     angle_bonds : ndarray of int, shape (n, 2), or None
         The bonds that go with `angles`; None takes `bonds`.
     fixed : ndarray of int, shape (n,)
-        Atoms that the constraint set holds by FixedAtoms; hosts that hold `bonds` fix them in their own way.
+        Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
     refusals : mapping
         Method name -> why it cannot run this scene.
     solution : callable, optional

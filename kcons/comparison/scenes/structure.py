@@ -298,7 +298,7 @@ def _scene(
     _refuse_torn(rows, x, topology)
     if relax:
         x = _relaxed(system_of(topology, field, None, False), x, platform, relax)
-    # SETTLE's lengths are rounded to single precision: with the same ones, all hosts run the same system.
+    # SETTLE's lengths are rounded to single precision: with the same ones, all MD engines run the same system.
     held = ConstraintSet(Distance(rows.pairs, rows.lengths / ASE_LENGTH), x / ASE_LENGTH, rows.masses)
     motion = Motion(held, x / ASE_LENGTH)
     on = motion.restore_positions(x / ASE_LENGTH)

@@ -1,8 +1,8 @@
 """Who is on the front: no other method with the same forces is both cheaper and more accurate.
 
-Methods are judged among those of one host, which share forces and overhead. Costs are wall time and force evaluations,
+Methods are judged among those of one MD engine, which share forces and overhead. Costs are wall time and evaluations,
 both a simulated unit of time. Where forces take less than `NO_FORCE`, wall time is that of the interpreter, and
-evaluations decide. Evaluations can be compared across hosts as well.
+evaluations decide. Evaluations can be compared across MD engines as well.
 
 Wall times that differ by less than the margin are the same: that by which nine tenths of the medians over odd and over
 even rounds of timing differ (`kcons.comparison.work_precision.timing_rounds.margin`), and `LEAST_MARGIN` at least.
@@ -27,10 +27,10 @@ COSTS: dict[Cost, tuple[str, str]] = {
     "evaluations": ("evaluations_per_time", "force evaluations"),
 }
 
-#: Hosts with forces or overhead of their own; all others call the forces of the scene on plain arrays.
+#: MD engines with forces or overhead of their own; all others call the forces of the scene on plain arrays.
 HOSTS = {"openmm": "OpenMM", "ase": "ASE"}
 ARRAYS = "arrays"
-EVERY_HOST = "all hosts"
+EVERY_HOST = "all MD engines"
 
 #: Forces that take less, beyond the call itself, do not count in a step: evaluations decide, in seconds.
 NO_FORCE = 1e-6
@@ -69,7 +69,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class Standing:
-    """Who is on the front of one host, for one cost.
+    """Who is on the front of one MD engine, for one cost.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Verdict:
         Wall times that differ by less are the same.
     standings : list of Standing
     without_forces : frozenset of str
-        Hosts that compute the forces themselves, and in less than `NO_FORCE`: evaluations decide there.
+        MD engines that compute the forces themselves, and in less than `NO_FORCE`: evaluations decide there.
     """
 
     decides: Cost
@@ -123,7 +123,7 @@ class Verdict:
     without_forces: frozenset[str] = frozenset()
 
     def decides_on(self, host: str) -> Cost:
-        """What decides among the methods of one host."""
+        """What decides among the methods of one MD engine."""
         return "evaluations" if host == EVERY_HOST or host in self.without_forces else self.decides
 
     @property
@@ -159,7 +159,7 @@ def floor_of(comparison: Comparison) -> float:
 
 
 def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[Measurement]:
-    """Measurements with an error and a cost, of one host or of all."""
+    """Measurements with an error and a cost, of one MD engine or of all."""
     return [
         m
         for m in comparison.measurements
@@ -216,7 +216,7 @@ def cheapest(curves: Iterable[Sequence[Measurement]], cost: Cost, error: float) 
 
 
 def verdict(comparison: Comparison) -> Verdict:
-    """Fronts of every host and of evaluations across hosts, and where another method beats every one of kcons."""
+    """Fronts of each MD engine, and of evaluations across them, and where another method beats every one of kcons."""
     timing = comparison.timing
     no_force = timing.get("force_seconds") is not None and timing["force_seconds"] < NO_FORCE
     margin = max(LEAST_MARGIN, float(timing.get("margin") or 0.0))
@@ -277,7 +277,7 @@ def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measu
     """Points on kcons' own front, each with one of another method that is both cheaper and more accurate.
 
     Cheaper by more than `LEAST_MARGIN` (evaluations: `SAME_EVALUATIONS`), more accurate by more than `SAME_ERROR`; by
-    host, in what decides there. Hosts without rivals are left out.
+    MD engine, in what decides there. MD engines without rivals are left out.
     """
     judged, floor = verdict(comparison), floor_of(comparison)
     found: dict[str, list[tuple[Measurement, Measurement]]] = {}
@@ -326,7 +326,7 @@ def together(losses: Sequence[Loss], length: str) -> str:
 
 
 def summary(comparison: Comparison) -> list[dict[str, Any]]:
-    """One row a host: who is on the front of what decides, what kcons gains, and what it loses."""
+    """One row an MD engine: who is on the front of what decides, what kcons gains, and what it loses."""
     found = verdict(comparison)
     length = comparison.scene["units"]["length"]
     rows = []

@@ -37,7 +37,7 @@ REPEAT_SHARE, REPEAT_SECONDS = 0.2, 2.0
 #: Points at which the forces are timed, and for how many seconds at most.
 FORCE_POINTS, FORCE_SECONDS = 15, 0.5
 
-#: A host is interrupted within a step after so many budgets.
+#: An MD engine is interrupted within a step after so many budgets.
 PATIENCE = 3
 
 
@@ -305,7 +305,7 @@ def _about(scene: Scene, method: Method, setting: float) -> dict[str, Any]:
 
 @dataclass
 class _Log:
-    """What is written down at every advance: by one step, or by several of a host that runs by itself."""
+    """What is written down at every advance: by one step, or by several of an MD engine that runs by itself."""
 
     times: list[float] = field(default_factory=list)
     energies: list[float] = field(default_factory=list)
@@ -397,7 +397,7 @@ def _too_slow(step_seconds: float, budget: float) -> str:
 def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str, float | None]:
     if run is None or not log.seconds or run.time <= 0:
         return {}
-    # The first step pays for what a host sets up lazily.
+    # The first step pays for what an MD engine sets up lazily.
     counted = slice(1, None) if len(log.seconds) > 1 else slice(None)
     run.constraints.release()
     step = run.own_step_seconds() or float(np.median(log.seconds[counted]))

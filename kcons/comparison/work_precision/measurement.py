@@ -29,7 +29,7 @@ class Measurement:
     energy_slope, energy_slope_error : float
         Linear fit of the total energy against time and its standard error, a degree of freedom and `long_time`.
     step_seconds, constraint_seconds : float
-        Median wall time of a step, and of the constraints' part of it where a host tells.
+        Median wall time of a step, and of the constraints' part of it where an MD engine tells.
     setup_seconds : float
         Before the first step, and what the first step took beyond the others.
     evaluations_per_time, seconds_per_time : float

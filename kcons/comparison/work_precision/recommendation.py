@@ -2,7 +2,7 @@
 
 From the measured points, the step at which each method makes that error is predicted by its observed order. Those that
 promise to be the cheapest are run there, and again with shorter or longer steps, until the cheapest one that was seen
-to reach the error is known. The default of its host is asked for the same error.
+to reach the error is known. The default of its MD engine is asked for the same error.
 """
 
 from __future__ import annotations
@@ -290,7 +290,7 @@ def _facts(m: Measurement) -> dict[str, Any]:
 def _default(
     bench: Bench, comparison: Comparison, best: Measurement, target: float
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
-    """What the host of the best method does unless told otherwise: at its usual step, and at this error."""
+    """What the MD engine of the best method does unless told otherwise: at its usual step, and at this error."""
     scene = bench.scene
     name = default_method(scene, METHODS[best.method].host)
     if name is None:
@@ -336,7 +336,7 @@ def _default(
 
 
 def default_method(scene: Scene, host: str) -> str | None:
-    """What a user of this host takes who has not thought about it; None if it cannot run the scene."""
+    """What a user of this MD engine takes who has not thought about it; None if it cannot run the scene."""
     names = ("openmm-verlet",) if host == "openmm" else ("ase-bonds", "dop853")
     return next((name for name in names if METHODS[name].refuses(scene) is None), None)
 

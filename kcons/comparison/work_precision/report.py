@@ -199,7 +199,7 @@ def plot(comparison: Comparison, path: Path) -> None:
 
 
 def figure(comparison: Comparison) -> Figure:
-    """Error against force evaluations and against wall time, all axes logarithmic, the fronts of each host marked."""
+    """Error against force evaluations and wall time, all axes logarithmic, the fronts of each MD engine marked."""
     units, environment = comparison.scene["units"], comparison.environment
     standings = judge(comparison).standings
     names = len({m.method for m in comparison.measurements})
@@ -232,7 +232,7 @@ def figure(comparison: Comparison) -> Figure:
     return drawn
 
 
-#: Bands behind the curves, one a host.
+#: Bands behind the curves, one an MD engine.
 FRONT_STYLES = {ARRAYS: "#999999", "ASE": "#D9B38C", "OpenMM": "#B3A2C7"}
 BAND: Mapping[str, Any] = {
     "linewidth": 9,
@@ -245,7 +245,7 @@ BAND: Mapping[str, Any] = {
 
 
 def _errors(comparison: Comparison, standings: Sequence[Standing], cost: Cost) -> list[Curve]:
-    """Error against a cost: a curve for each method, and a broad pale band along the front of each host."""
+    """Error against a cost: a curve for each method, and a broad pale band along the front of each MD engine."""
     found = []
     for name in dict.fromkeys(m.method for m in comparison.measurements):
         colour, marker = style(name)

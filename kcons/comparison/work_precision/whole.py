@@ -185,8 +185,8 @@ def scene_of(item: Item, quick: bool) -> Scene:
 def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[str, str]]:
     """Names of the methods that run, and of those that are left out though they could, with the reasons.
 
-    All steppers of kcons on arrays, in a quick run the usual ones; of other hosts the usual ones, those that refuse
-    with their reasons; of OpenMM and of guests those that can run the scene.
+    All steppers of kcons on arrays, in a quick run the usual ones; of other MD engines the usual ones, those that
+    refuse with their reasons; of OpenMM and of guests those that can run the scene.
     """
     kept: list[str] = []
     out: dict[str, str] = {}

@@ -35,11 +35,11 @@ INTRODUCTION = (
     "Every scene is run through every method that can run it: the same start, the same forces, the same reference "
     "solution at the same moment, so early that chaos has not begun to decide. Each point is one method at one time "
     "step or tolerance, after kernels were compiled, on one thread; times are medians over steps. Every method has its "
-    "own best settings: steps of high-order methods are longer, tolerances of hosts are varied.",
-    "Fronts are drawn for each host, whose methods share forces and overhead: plain arrays, ASE, OpenMM. A "
-    "point is on the front if no other one of its host is both cheaper and more accurate. Across hosts, force "
-    f"evaluations can be compared. Where forces take less than {1e6 * NO_FORCE:g} µs beyond the call from Python, "
-    "evaluations decide and wall time stands beside.",
+    "own best settings: steps of high-order methods are longer, tolerances of MD engines are varied.",
+    "Fronts are drawn for each MD engine, whose methods share forces and overhead: plain arrays, ASE, OpenMM. A "
+    "point is on the front if no other one of its MD engine is both cheaper and more accurate. Across MD engines, "
+    f"force evaluations can be compared. Where forces take less than {1e6 * NO_FORCE:g} µs beyond the call from "
+    "Python, evaluations decide and wall time stands beside.",
 )
 
 WINNERS_NOTE = (
@@ -156,10 +156,10 @@ def _machines(parts: Sequence[Part]) -> Table:
 
 
 def winners(parts: Sequence[Part]) -> Table:
-    """Who wins where: a line for each scene and host with a method of kcons and another one."""
+    """Who wins where: a line for each scene and MD engine with a method of kcons and another one."""
     headings = [
         "scene",
-        "host",
+        "MD engine",
         "decided by",
         "times repeat to",
         "gain",

@@ -1,4 +1,4 @@
-"""OpenMM as a host of scenes: the same system, the same trajectories, and costs that are counted right."""
+"""OpenMM as an MD engine of scenes: the same system, the same trajectories, and costs that are counted right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes start on their constraints, know their solution, and offer every host the same forces."""
+"""Scenes start on their constraints, know their solution, and offer every MD engine the same forces."""
 
 from __future__ import annotations
 
@@ -375,7 +375,7 @@ def test_thermal_velocities():
     assert not np.allclose(v, thermal_velocities(scene.motion, scene.positions, 300.0, seed=4))
 
 
-# -- potentials and hosts ---------------------------------------------------------------------------
+# -- potentials and MD engines ---------------------------------------------------------------------------
 
 
 def test_potential_counts_points_not_calls():

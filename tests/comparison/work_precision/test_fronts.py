@@ -131,7 +131,7 @@ def test_evaluations_decide_where_forces_take_no_time():
 
 
 def test_hosts_are_judged_by_themselves():
-    # Within ASE nothing beats kcons, though OpenMM is cheaper; across hosts evaluations are compared.
+    # Within ASE nothing beats kcons, though OpenMM is cheaper; across MD engines evaluations are compared.
     points = (
         point("ase-kcons", "ASE Verlet + kcons", 1e-2, 100, 3.0),
         point("ase-bonds", "ASE Verlet + FixBondLengths", 1e-2, 100, 30.0),

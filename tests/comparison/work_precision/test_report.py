@@ -186,7 +186,7 @@ def test_methods_differ_in_colour_and_marker(monkeypatch):
     others = [name for name in many if name not in report.STYLES][: len(report.SPARE)]
     styles = {name: report.style(name) for name in known + others}
     assert len({colour for colour, _ in styles.values()}) == len(styles)
-    # Methods of OpenMM may share markers with those of other hosts, which are of other colours.
+    # Methods of OpenMM may share markers with those of other MD engines, which are of other colours.
     hosted = [styles[name][1] for name in known if name.startswith("openmm")]
     rest = [styles[name][1] for name in [*known, *others] if name not in known or not name.startswith("openmm")]
     assert len(set(hosted)) == len(hosted)

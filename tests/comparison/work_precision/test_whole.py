@@ -160,7 +160,7 @@ def test_winners_name_host_and_gain(finished):
         assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
     assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
     text = tables.markdown(table.of((0, 1, 4)))
-    assert text.splitlines()[0] == "| scene | host | gain |"
+    assert text.splitlines()[0] == "| scene | MD engine | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
 
@@ -293,7 +293,7 @@ def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, 
     assert whole_page.fill(page, parts_of_the_whole) == [page, tmp_path / "figures" / "report-sphere.png"]
     first = page.read_text(encoding="utf-8")
     assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
-    assert "| scene | host | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
+    assert "| scene | MD engine | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
     assert "full run" in first
     whole_page.fill(page, parts_of_the_whole)
     assert page.read_text(encoding="utf-8") == first
