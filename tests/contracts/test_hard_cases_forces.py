@@ -1,4 +1,4 @@
-"""Hard cases of the core (docs/hard-cases.md): forces, habits of MD engines, symmetries, H25 to H42; the global rule."""
+"""Hard cases of the core (docs/hard-cases.md): forces, habits of engines, symmetries, H25 to H42; the global rule."""
 
 from __future__ import annotations
 
