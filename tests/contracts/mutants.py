@@ -244,14 +244,14 @@ MUTANTS = [
     ),
     (
         "models/growth/orthogonal_rows.py",
-        "RANK_TOLERANCE = 1e-12",
-        "RANK_TOLERANCE = 1e-11",
+        "LOST = 1e-12",
+        "LOST = 1e-11",
         "tests/models/growth/test_orthogonal_rows.py::test_rows_count_as_dependent_below_a_part_in_a_million_million",
     ),
     (
         "models/growth/orthogonal_rows.py",
-        "RANK_TOLERANCE = 1e-12",
-        "RANK_TOLERANCE = 1e-13",
+        "LOST = 1e-12",
+        "LOST = 1e-13",
         "tests/models/growth/test_orthogonal_rows.py::test_rows_count_as_dependent_below_a_part_in_a_million_million",
     ),
     (

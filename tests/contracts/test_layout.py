@@ -182,3 +182,18 @@ def test_what_is_inside_a_moved_folder_is_found_too():
     with pytest.raises(ImportError, match=r"kcons\.models\.flows\.nothing"):
         importlib.import_module("kcons.flows.nothing")
     assert importlib.util.find_spec("kcons.nothing") is None
+
+
+def test_there_is_one_tolerance_of_ranks():
+    """Outside the oracle; other limits are of other quantities, and have names of their own."""
+    defined = re.compile(r"^_?RANK_TOLERANCE\b.*=", re.MULTILINE)
+    places = [
+        path.relative_to(PACKAGE).as_posix() for path in FILES if defined.search(path.read_text(encoding="utf-8"))
+    ]
+    assert [place for place in places if place != "projection.py"] == ["solvers/rank_revealing.py"]
+
+
+def test_there_is_one_digest_of_the_code():
+    calls = re.compile(r"\bhashlib\.(?!new)\w+\(")
+    places = {path.relative_to(PACKAGE).as_posix() for path in FILES if calls.search(path.read_text(encoding="utf-8"))}
+    assert {place for place in places if place.startswith("comparison/")} == {"comparison/study/machine.py"}

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from kcons.models.growth.model import FloatArray
 
-#: A row counts as dependent on those before it where less than this part of its length is its own.
-RANK_TOLERANCE = 1e-12
+#: A row depends on those before it where less than this part of its length is its own: rounding of sums, no rank of a
+#: matrix, whose limit is that of `kcons.solvers.rank_revealing`.
+LOST = 1e-12
 #: A dependent row contradicts the others where its right side is off by more than this part of its terms.
 SOLVABILITY_TOLERANCE = 1e-9
 
@@ -66,7 +67,7 @@ def solve(
             q = np.array(rows[k])
             b = right[k]
             squared = (x * q * q).sum(axis=0)
-            smallest = RANK_TOLERANCE**2 * squared
+            smallest = LOST**2 * squared
             for j in range(k):
                 mixing[j, k] = (x * q * units[j]).sum(axis=0)
                 q -= mixing[j, k] * units[j]
