@@ -15,7 +15,7 @@ PAGE = (DOCS / "openmm.md").read_text(encoding="utf-8")
 
 
 def test_listing_on_the_page_is_that_of_the_integrator():
-    (shown,) = re.findall(r"^```text\n(variables\n.*?)\n```", PAGE, re.MULTILINE | re.DOTALL)
+    (shown,) = re.findall(r"^```text\n(constraints of the System\b.*?)\n```", PAGE, re.MULTILINE | re.DOTALL)
     assert shown == ProjectedIntegrator(0.002).listing()
 
 
