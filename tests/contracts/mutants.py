@@ -225,9 +225,9 @@ MUTANTS = [
     ),
     (
         "openmm/integrator/schemes.py",
-        "first = 0 if scheme.kick_first else every",
-        "first = 0",
-        "tests/openmm/test_accuracy.py",
+        "            kicks[-1] += operation.fraction",
+        "            kicks[0] += operation.fraction",
+        "tests/openmm/integrator/test_schemes.py",
     ),
     (
         "openmm/carried/carried_constraints.py",
