@@ -36,7 +36,7 @@ import sys, time, resource, json, warnings
 warnings.simplefilter("ignore")
 import MDAnalysis as mda
 u = mda.Universe.empty(int(sys.argv[2]))
-u.load_new(sys.argv[1])
+u.load_new(sys.argv[1], format=sys.argv[3])
 for ts in u.trajectory[:3]: pass
 cpu, wall = time.process_time(), time.perf_counter()
 for ts in u.trajectory: pass
@@ -82,7 +82,12 @@ def rows(molecules: int) -> Distance:
 
 def reading(path: str, atoms: int) -> dict[str, float]:
     """The reader alone, in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", READ, path, str(atoms)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", READ, path, str(atoms), Path(path).suffix[1:]],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return dict(json.loads(done.stdout))
 
 
@@ -148,7 +153,8 @@ def check(path: str, molecules: int, workers: int) -> None:
 
     universe = mda.Universe.empty(3 * molecules, trajectory=False)
     universe.add_TopologyAttr("masses", np.tile([15.999, 1.008, 1.008], molecules))
-    universe.load_new(path)
+    # Without the format, MDAnalysis imports OpenMM and its platforms, which may take 80 MB.
+    universe.load_new(path, format=Path(path).suffix[1:])
     job = ConstraintCheck(universe, rows(molecules))
     job.run(stop=3)  # compile
     start = time.perf_counter()

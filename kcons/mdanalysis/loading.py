@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import MDAnalysis
+from MDAnalysis.lib.util import guess_format
 
 from kcons.errors import InputError, UnreadableError
 
@@ -78,7 +79,9 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
     failure = None
     with quiet(), _failing_quietly():
         try:
-            universe = MDAnalysis.Universe(str(topology), **options)
+            # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its
+            # own, which imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
+            universe = MDAnalysis.Universe(str(topology), **{"topology_format": guess_format(str(topology))} | options)
         except READ_ERRORS as error:
             failure = _first_line(error)
     if failure is not None:
@@ -106,7 +109,7 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
     failure = None
     with quiet(), _failing_quietly():
         try:
-            universe.load_new(str(trajectory))
+            universe.load_new(str(trajectory), format=guess_format(str(trajectory)))
             # Some readers look at the file only now.
             n_frames = universe.trajectory.n_frames
         except READ_ERRORS as error:
@@ -167,7 +170,7 @@ def _stored_atoms(path: Path) -> int | None:
     """Number of atoms that a trajectory says it has."""
     with quiet(), _failing_quietly():
         try:
-            reader = MDAnalysis.coordinates.core.get_reader_for(str(path))
+            reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=guess_format(str(path)))
             return int(reader.parse_n_atoms(str(path)))
         except (*READ_ERRORS, NotImplementedError, AttributeError):
             return None
