@@ -106,7 +106,7 @@ def run(full: bool) -> dict[str, Any]:
 def show(results: dict[str, Any], console: Console) -> None:
     """Table and explanation of each scene."""
     for found in results.values():
-        result = read(found)
+        result = Comparison.from_dict(found)
         console.print(report.table(result))
         console.print(report.explanation(result), highlight=False, markup=False)
 
@@ -129,11 +129,6 @@ def summary(results: dict[str, Any]) -> str:
         for name, row in found["steps in turn"].items():
             lines.append(f"  {name:<32}{row['ms']:>9.4g} ms, {row['ratio']:.2f} of the steps a second")
     return "\n".join(lines)
-
-
-def read(found: dict[str, Any]) -> Comparison:
-    parts = {key: found[key] for key in ("scene", "reference", "settings", "environment", "remarks")}
-    return Comparison(**parts, measurements=[Measurement(**m) for m in found["measurements"]])
 
 
 def slim(value: Any) -> Any:

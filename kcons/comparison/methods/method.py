@@ -191,7 +191,7 @@ class Method(ABC):
     ----------
     name, title : str
     holds : bool
-        False for the floor, which holds nothing: its cost is the least there is. It makes the first step
+        False for the baseline, which holds nothing: its cost is the least there is. It makes the first step
         again and again, since with nothing held the system would soon fly apart.
     adaptive : bool
         Whether its setting is a tolerance instead of a time step.

@@ -342,8 +342,8 @@ METHODS: Mapping[str, Method] = {
         AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
         ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
         ProjectedOde("dop853-projected", "kcons + DOP853, projected", adaptive=True, damps=True, project=True),
-        CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
-        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
+        CoreVerlet("verlet", "baseline: Verlet, nothing held", holds=False),
+        AseVerlet("ase-verlet", "baseline: ASE Verlet, nothing held", holds=False, host="ase"),
         *OPENMM_METHODS,
         *PEERS,
     )

@@ -423,5 +423,5 @@ def _of_kcons() -> list[OpenMMMethod]:
 OPENMM_METHODS: tuple[OpenMMMethod, ...] = (
     *_built_in(),
     *_of_kcons(),
-    BuiltIn("openmm-free", "floor: OpenMM Verlet, nothing held", holds=False),
+    BuiltIn("openmm-free", "baseline: OpenMM Verlet, nothing held", holds=False),
 )

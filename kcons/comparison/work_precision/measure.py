@@ -327,7 +327,7 @@ def _judged(
 ) -> Measurement:
     """What a run that made steps says of its method."""
     if not method.holds:
-        return Measurement(status="floor" if status == "ok" else status, note=note, **common)
+        return Measurement(status="baseline" if status == "ok" else status, note=note, **common)
     x, v = run.positions, run.velocities
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
         return Measurement(status="failed", note="positions are not finite", **common)
