@@ -28,7 +28,7 @@ from kcons.cli.progress import Bars
 from kcons.comparison import Comparison, Measurement, Scene, json_files, measure, report, scenes, scripts
 from kcons.openmm import ProjectedIntegrator, hold
 
-#: Scenes, the errors in Å that they are asked for, and steps a turn.
+#: Test systems, the errors in Å that they are asked for, and steps a turn.
 FULL = {"alanine": (1e-3, 1e-5, 1e-7), "dhfr": (1e-3, 1e-4, 1e-5), "villin": (1e-3, 1e-4, 2e-5)}
 TURN = {"alanine": 500, "dhfr": 5, "villin": 5}
 QUICK_METHODS = ("openmm-verlet", "openmm-middle-bath", "openmm-kcons-rattle", "openmm-kcons-blanes-moan6")

@@ -27,7 +27,7 @@ COSTS: dict[Cost, tuple[str, str]] = {
     "evaluations": ("evaluations_per_time", "force evaluations"),
 }
 
-#: MD engines with forces or overhead of their own; all others call the forces of the scene on plain arrays.
+#: MD engines with forces or overhead of their own; all others call the forces of the test system on plain arrays.
 HOSTS = {"openmm": "OpenMM", "ase": "ASE"}
 ARRAYS = "arrays"
 EVERY_HOST = "all MD engines"
@@ -109,7 +109,7 @@ class Verdict:
     Attributes
     ----------
     decides : {'wall', 'evaluations'}
-        What decides in this scene, where its forces are those of the scene.
+        What decides in this test system, where its forces are those of the test system.
     margin : float
         Wall times that differ by less are the same.
     standings : list of Standing

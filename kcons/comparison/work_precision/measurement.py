@@ -18,7 +18,7 @@ class Measurement:
     Attributes
     ----------
     setting : float
-        Time step in the scene's shown unit, or relative tolerance of an adaptive method.
+        Time step in the test system's shown unit, or relative tolerance of an adaptive method.
     status : {'ok', 'baseline', 'thermostat', 'partial', 'failed', 'not run'}
         'baseline': nothing is held, only the cost is stated. 'thermostat': the trajectory is not to be that of the
         reference, so that there is no error. 'partial': stopped for the budget; cost only.

@@ -56,7 +56,7 @@ class Prediction:
     ----------
     method : str
     setting : float
-        Time step in the scene's shown unit, or tolerance.
+        Time step in the test system's shown unit, or tolerance.
     order : float
         Slope of the logarithms, error against setting.
     wall, evaluations : float
@@ -130,13 +130,13 @@ def recommend(
     ----------
     scene : Scene
     comparison : Comparison
-        Of this scene.
+        Of this test system.
     target : float
-        Root-mean-square distance an atom from the reference, in the scene's unit of length.
+        Root-mean-square distance an atom from the reference, in the test system's unit of length.
     reference : Reference
         The one of the comparison.
     made_by : str
-        The expression that makes the scene, for the lines of code.
+        The expression that makes the test system, for the lines of code.
     budget : float
         Seconds for a run.
     watcher : Watcher, optional
@@ -192,7 +192,7 @@ def recommend(
 def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
     """Where another method seems to be ahead of kcons: the step of kcons that makes the same error is tried.
 
-    Steps of a scene are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
+    Steps of a test system are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
     beyond those of the others, and nothing could be said of who is cheaper there.
 
     Parameters
@@ -345,7 +345,7 @@ def _default(
 
 
 def default_method(scene: Scene, host: str) -> str | None:
-    """What a user of this MD engine takes who has not thought about it; None if it cannot run the scene."""
+    """What a user of this MD engine takes who has not thought about it; None if it cannot run the test system."""
     names = ("openmm-verlet",) if host == "openmm" else ("ase-bonds", "dop853")
     return next((name for name in names if METHODS[name].refuses(scene) is None), None)
 

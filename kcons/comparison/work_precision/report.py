@@ -87,7 +87,7 @@ def style(name: str) -> tuple[str, str | int]:
     return SPARE[others.index(name) % len(SPARE)] if name in others else ("black", "x")
 
 
-#: What the error is, unless the scene says something else.
+#: What the error is, unless the test system says something else.
 ERROR = "root-mean-square distance an atom from the reference"
 
 EXPLANATION = (

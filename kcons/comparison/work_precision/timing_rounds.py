@@ -45,7 +45,7 @@ class Rounds:
     pass_seconds: float = 0.01
 
 
-#: Those of the whole comparison, of one scene, and of a quick run.
+#: Those of the whole comparison, of one test system, and of a quick run.
 FULL_ROUNDS = Rounds()
 ROUNDS = Rounds(least=2, most=8, seconds=0.3)
 QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002)

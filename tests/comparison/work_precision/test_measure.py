@@ -225,7 +225,7 @@ def test_bad_arguments(chain, options, text):
         measure.compare(chain, **options)
 
 
-# -- every small scene ------------------------------------------------------------------------------
+# -- every small test system ------------------------------------------------------------------------------------
 
 PIVOT, SURFACE, TIME = "the pivot is a point", "ASE has no constraint that holds an atom on", "cannot move"
 REFUSED = {
