@@ -47,7 +47,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
         'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator, for Systems with virtual sites.
+        openmm.VerletIntegrator.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional
@@ -222,7 +222,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
 
     def _run_block(self, guard: Guard, steps: int) -> None:
         """Where the program can do less in steps whose end nobody looks at, let it."""
-        unseen = steps - self._plan.observed if self._plan.lazy else 0
+        unseen = steps - self._plan.observed if self._plan.lazy and not guard.in_parts else 0
         if self._plan.lean:
             self.program.write("lean", guard.undisturbed)
             self.program.write("moving", guard.moving)
@@ -242,7 +242,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         for part in self.parts:
             part.begin_run()
         try:
-            super().step(steps)
+            self.program.run(context, steps, self._plan.phases if guard.in_parts else 1)
         except openmm.OpenMMException as error:
             guard.put_back()
             if "NaN" not in str(error):
