@@ -82,8 +82,7 @@ class Guard:
     """
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context = weakref.ref(context)
-        self._integrator = weakref.ref(integrator)
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
         check_system(self.system)
         self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
