@@ -62,6 +62,7 @@ class StepWriter:
 
     def _write_plain(self) -> None:
         p, drifts, kicks = self.program, self.drifts, self.kicks
+        self.ensemble.open(p)
         if kicks[0]:
             self._kick(_of_dt(kicks[0]), tangent=True)
         if self.halves:
@@ -87,6 +88,7 @@ class StepWriter:
                     self._kick("dt*kick_share(stage)")
         if self.scheme is not None and not self._ends_tangent:
             self._project()
+        self.ensemble.close(p)
 
     # -- a step that is taken back when a part fails --------------------------------------------
 
@@ -125,6 +127,7 @@ class StepWriter:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
             p.each("v_last", "v", "to come back to")
+            self.ensemble.open(p)
             if self.kicks[0]:
                 self._kick("dt*kick_share(first_stage)", tangent=True)
             p.let("stage", "first_stage", "first drift")
@@ -149,12 +152,14 @@ class StepWriter:
                         self._kick_after("per_h*(x-xu)")
                     if not self._ends_tangent:
                         self._project()
+                    self.ensemble.close(p)
                     p.let("good_steps", "good_steps+delta(failed)", "count it")
                     if self.kept:
                         p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
             with p.when("failed != 0", "a solve failed"):
                 p.each("x", "x_last", "back to where the step began")
                 p.each("v", "v_last", "back to where the step began")
+                self.ensemble.take_back(p)
                 p.let("stale", "1", "forces are those of elsewhere")
 
     def _write_single(self) -> None:
