@@ -20,8 +20,9 @@ from kcons.errors import CertificateError, InputError
 
 #: Steps from one certificate to the next, if nothing else is asked for ...
 CHECK_EVERY = 1000
-#: ... and the part of a run's time that certificates may then take; where steps take microseconds, they come later.
-SHARE = 0.01
+#: ... and the part of a run's time that certificates may then take: less than the one per cent that is promised, since
+#: what the next one takes is not known. Where steps take microseconds, they come later.
+SHARE = 0.009
 #: That many times later at most, and then again.
 MOST = 100
 #: |A v - c| that counts as held, in parts of what the atoms of the row, or of the fastest row, move with: so many times
