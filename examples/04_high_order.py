@@ -5,7 +5,7 @@
     python examples/04_high_order.py --show F         the tables of an earlier result
     python examples/04_high_order.py --plot P --show F    draw its figure into P (.png, .svg)
 
-The error is the root-mean-square distance an atom from the scene's own solution at its horizon, t = 5. The
+The error is the root-mean-square distance an atom from the test system's own solution at its horizon, t = 5. The
 evaluations at a given error are found on the line between two points of the curve, both axes logarithmic.
 """
 

@@ -28,7 +28,7 @@ from kcons.cli.progress import Bars
 from kcons.comparison import Comparison, Measurement, Scene, json_files, measure, report, scenes, scripts
 from kcons.openmm import ProjectedIntegrator, hold
 
-#: Scenes, the errors in Å that they are asked for, and steps a turn.
+#: Test systems, the errors in Å that they are asked for, and steps a turn.
 FULL = {"alanine": (1e-3, 1e-5, 1e-7), "dhfr": (1e-3, 1e-4, 1e-5), "villin": (1e-3, 1e-4, 2e-5)}
 TURN = {"alanine": 500, "dhfr": 5, "villin": 5}
 QUICK_METHODS = ("openmm-verlet", "openmm-middle-bath", "openmm-kcons-rattle", "openmm-kcons-blanes-moan6")
@@ -106,7 +106,7 @@ def run(full: bool) -> dict[str, Any]:
 def show(results: dict[str, Any], console: Console) -> None:
     """Table and explanation of each scene."""
     for found in results.values():
-        result = read(found)
+        result = Comparison.from_dict(found)
         console.print(report.table(result))
         console.print(report.explanation(result), highlight=False, markup=False)
 
@@ -129,11 +129,6 @@ def summary(results: dict[str, Any]) -> str:
         for name, row in found["steps in turn"].items():
             lines.append(f"  {name:<32}{row['ms']:>9.4g} ms, {row['ratio']:.2f} of the steps a second")
     return "\n".join(lines)
-
-
-def read(found: dict[str, Any]) -> Comparison:
-    parts = {key: found[key] for key in ("scene", "reference", "settings", "environment", "remarks")}
-    return Comparison(**parts, measurements=[Measurement(**m) for m in found["measurements"]])
 
 
 def slim(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """A work-precision diagram from nothing but a loop: error against force evaluations and time. Read it, and change it.
 
     python examples/17_work_precision.py                     a colliding pair of dumbbells, some seconds
-    python examples/17_work_precision.py --scene chain       another scene of `kcons compare --list`
+    python examples/17_work_precision.py --scene chain       another test system of `kcons compare --list`
     python examples/17_work_precision.py --redraw            the figure once more, from work_precision.json
 
 `kcons compare` does the same for all methods of all MD engines, with budgets, tables and fronts.

@@ -24,7 +24,7 @@ STEP_METHODS = ("rattle", "blanes-moan4", "blanes-moan6")
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 #: Gauss-Seidel sweeps, and OpenMM's SETTLE (water) or CCMA; kcons has no tolerance to choose.
 SOLVERS = ("shake", "openmm-verlet")
-#: Small and full sizes, and the step at which tolerances are compared, in units of the scene's longest.
+#: Small and full sizes, and the step at which tolerances are compared, in units of the test system's longest.
 SYSTEMS = {"water": (8, 64, 0.25), "chain": (20, 100, 0.125), "dumbbells": (2, 2, 0.125)}
 ROUNDING = {"RATTLE": steppers.Rattle(), "BlanesMoan6": steppers.BlanesMoan6()}
 BUDGET = 60.0

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+
+# There is a worker of pytest-xdist for each core: a BLAS with threads of its own waits for them in every small matrix.
+# Set before NumPy is loaded; processes that tests start have it as well.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 HERE = Path(__file__).parent
 #: Modules of the package and of its tests, as they are called when they are imported.

@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
-    scene_help = "one of the built-in scenes, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
+    scene_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("scene", nargs="?", help=scene_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
@@ -85,19 +85,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     files.add_argument("--select", metavar="WORDS", help="hold only what is within this selection of MDAnalysis")
     files.add_argument("--rigid-residues", nargs="+", metavar="NAME", help="residues held rigid")
-    common.add_argument("--list", action="store_true", help="list scenes and methods, and leave")
+    common.add_argument("--list", action="store_true", help="list test systems and methods, and leave")
 
     compare = commands.add_parser(
         "compare",
         parents=[common],
         help="how much error each method makes, for how much time",
-        description="Run a scene through several methods; table, plot and JSON of error against cost. Trajectories "
-        "are compared, or averages of the scenes at a temperature.",
+        description="Run a test system through several methods: a table, a plot and a JSON file of error against cost. "
+        "Trajectories are compared, or averages at a temperature.",
     )
     compare.add_argument(
         "--dt",
         type=numbers,
-        help="time steps, comma separated, in the unit the scene shows; "
+        help="time steps, comma separated, in the unit that tables show; "
         "steppers with several force evaluations a step take longer ones at the same cost",
     )
     compare.add_argument(
@@ -118,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument(
         "--all",
         action="store_true",
-        help="every scene, into one page (default ./compare-all; --quick: five minutes); goes on where it stopped",
+        help="every test system, on one page (default ./compare-all; --quick: five minutes); resumes what stopped",
     )
     report.add_argument(
         "--only", type=names, metavar="PARTS", help="of these, comma separated (--all --list shows them)"
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
         "plan",
         parents=[common],
         help="clusters, rank, degrees of freedom and the solver picked for each kind of cluster",
-        description="What the engine will do for a scene, before any run.",
+        description="What the engine will do for a system, before any run.",
     )
     plan.set_defaults(run=_plan)
     check.add(commands)
@@ -172,7 +172,7 @@ def _compare(chosen: argparse.Namespace) -> int:
     _check_scene(chosen)
     with Bars() as watcher:
         compiling = "" if measure.kernels_cached() else "; compiling kernels (once)"
-        with watcher.piece(f"building the scene{compiling}", 1):
+        with watcher.piece(f"building the test system{compiling}", 1):
             scene = _scene(chosen, quick=chosen.quick)
         if chosen.dt is not None:
             scene = scene.with_time_steps(chosen.dt)
@@ -209,7 +209,7 @@ def _compare(chosen: argparse.Namespace) -> int:
 
 
 def _expression(chosen: argparse.Namespace) -> str:
-    """Python that makes the scene, after `from kcons.comparison import scenes`."""
+    """Python that makes the test system, after `from kcons.comparison import scenes`."""
     from kcons.comparison import scenes
 
     said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}
@@ -239,7 +239,7 @@ def _compare_all(chosen: argparse.Namespace) -> int:
             print(f"  {item.key:<22} {item.heading}")
         return 0
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
-        raise InputError("--all runs all scenes and methods; choose parts of it by --only", item="all")
+        raise InputError("--all runs all test systems and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
         say_written(whole.redraw(chosen.redraw, chosen.into))
         return 0
@@ -283,14 +283,16 @@ def _check_scene(chosen: argparse.Namespace) -> None:
 
     known = ", ".join((*scenes.SCENES, *scenes.FLUIDS))
     if chosen.scene is None:
-        raise InputError(f"name a scene: {known}; or a PDB file", item="scene")
+        raise InputError(f"name a test system: {known}; or a PDB file", item="scene")
     if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
         if not Path(chosen.scene).is_file():
             raise InputError(f"there is no file {chosen.scene}", item="scene")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
     elif chosen.scene not in scenes.SCENES and chosen.scene not in scenes.FLUIDS:
-        raise InputError(f"there is no scene {chosen.scene!r}; there are {known}; or give a PDB file", item="scene")
+        raise InputError(
+            f"there is no test system {chosen.scene!r}; there are {known}; or give a PDB file", item="scene"
+        )
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")
 
@@ -325,7 +327,7 @@ def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
     if chosen.add_hydrogens:
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
     for name in sorted(scenes.FILE_OPTIONS & set(_molecules(chosen))):
-        raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in scenes", item=name)
+        raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
     return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
@@ -382,7 +384,7 @@ def _list() -> int:
     from kcons.comparison.averages import sampling
     from kcons.comparison.methods import methods
 
-    print("scenes")
+    print("test systems")
     for name, entry in scenes.SCENES.items():
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
     print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
@@ -390,7 +392,7 @@ def _list() -> int:
     print("methods")
     for name, method in methods.METHODS.items():
         print(f"  {name:<27} {method.title}{_when(method)}")
-    print("scenes at a temperature, whose averages are compared")
+    print("test systems at a temperature, whose averages are compared")
     for name, entry in scenes.FLUIDS.items():
         print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
     print("thermostats for these")
@@ -403,4 +405,4 @@ def _when(method: Method) -> str:
     """When a method runs."""
     if not method.usual:
         return " (only when named)"
-    return "" if method.host != "openmm" or method.guest else " (in OpenMM's scenes, or when named)"
+    return "" if method.host != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"

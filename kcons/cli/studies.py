@@ -25,7 +25,7 @@ def add(commands: Any) -> None:
     stability = commands.add_parser(
         "stability",
         help="largest stable steps, drift of the energy, reversibility, random molecules",
-        description="How far each method can be pushed on small scenes, and what it does beyond.",
+        description="How far each method can be pushed on small test systems, and what it does beyond.",
     )
     stability.add_argument("--quick", action="store_true", help="shorter runs, some minutes")
     stability.add_argument("--out", type=Path, default=Path("stability"), help="folder (default ./stability)")

@@ -238,8 +238,8 @@ class ConstraintSet(InCell):
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
         x = self._positions(x)
         y = self.whole(x)
-        floor = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
-        return np.maximum(1e-14 * self.scale, floor)
+        rounding = 2 * np.finfo(float).eps * self._rows(lambda c: self._reach(c, x, y, time))
+        return np.maximum(1e-14 * self.scale, rounding)
 
     def residuals(self, x: FloatArray, v: FloatArray | None = None, time: float = 0.0) -> Residuals:
         """sigma, and A v - c, with what counts as held, in one pass over the constraint objects."""

@@ -104,7 +104,7 @@ class GeneralClusters:
         b.reshape(-1)[batch.places] = data[batch.entries]
         return b * self._root_w[batch.columns][:, None, :]
 
-    def _floor(self, batch: _Batch, data: FloatArray, state: FloatArray) -> FloatArray:
+    def _rounding(self, batch: _Batch, data: FloatArray, state: FloatArray) -> FloatArray:
         """Relative residual that rounding allows: max(1e-14, 2 eps sum |dq/dx_i| |x_i| / scale), (n, K)."""
         gradient = np.zeros((*batch.rows.shape, batch.columns.shape[1]))
         gradient.reshape(-1)[batch.places] = data[batch.entries]
@@ -175,7 +175,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = _each(relative <= self._floor(batch, data, state))
+            settled = _each(relative <= self._rounding(batch, data, state))
             done |= settled & (polished | (error == 0.0))
             if done.all():
                 turned = held & ~(np.einsum("nkc,nkc->nk", b, b0) > 0)
@@ -199,7 +199,7 @@ class GeneralClusters:
                 flat[batch.columns] = here + factor[:, None] * shift
                 trial = self._sigma(batch, state, time) * held
                 trial_error = _rms(trial / scale)
-                # Clusters at their floor take one more step only if it gains.
+                # Clusters at the rounding error take one more step only if it gains.
                 worse = ~(trial_error < error) & (factor > 0)
                 if not worse.any():
                     break
@@ -242,7 +242,7 @@ class GeneralClusters:
             data = self._data(state, time)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
-            settled = _each(relative <= self._floor(batch, data, state))
+            settled = _each(relative <= self._rounding(batch, data, state))
             if settled.all():
                 where = np.unravel_index(int(np.argmax(relative)), relative.shape)
                 return Outcome(True, float(relative[where]), iteration, int(batch.rows[where]))

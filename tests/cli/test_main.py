@@ -125,9 +125,9 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["compare"], "name a scene: water"),
-        (["compare", "wat"], "there is no scene 'wat'"),
-        (["plan", "wat"], "there is no scene 'wat'"),
+        (["compare"], "name a test system: water"),
+        (["compare", "wat"], "there is no test system 'wat'"),
+        (["plan", "wat"], "there is no test system 'wat'"),
         (["compare", "chain", "--methods", "shake"], "there is no method 'shake'"),
         (["compare", "chain", "--methods", ","], "no method"),
         (["compare", "thermostat", "--methods", "rattle"], "there is no thermostat 'rattle'"),

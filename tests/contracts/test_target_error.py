@@ -58,7 +58,7 @@ def test_prediction_uses_the_points_around_the_error():
 def test_nothing_is_predicted_from_a_plateau_one_point_or_too_far():
     assert recommendation.predicted([point(1e-2, 4.0), point(1e-2, 2.0)], 1e-4) is None
     assert recommendation.predicted([point(1e-2, 4.0)], 1e-4) is None
-    assert recommendation.predicted([point(1e-2, 4.0), point(1e-9, 2.0)], 1e-4, floor=1e-8) is None
+    assert recommendation.predicted([point(1e-2, 4.0), point(1e-9, 2.0)], 1e-4, resolution=1e-8) is None
     assert recommendation.predicted([point(1e-2, 4.0), point(2.5e-3, 2.0)], 1e-9) is None
 
 

@@ -92,7 +92,7 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
     assert status == 2
     assert f"{broken} cannot be read" in " ".join(err.split())
     assert plan("missing.gro", capsys=capsys)[2] == "kcons: there is no file missing.gro\n"
-    assert "there is no scene 'watr'" in plan("watr", capsys=capsys)[2]
+    assert "there is no test system 'watr'" in plan("watr", capsys=capsys)[2]
     assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]
 
 

@@ -130,11 +130,11 @@ def test_wrong_positions_are_refused():
 
 
 @pytest.mark.parametrize("precision", ["single", "mixed", "double"])
-def test_gpus_carry_positions_in_double_precision_only(precision):
-    if precision == "double":
+def test_gpus_carry_positions_of_more_than_single_numbers(precision):
+    if precision != "single":
         refuse_single_precision(Precision("CUDA", precision))
         return
-    with pytest.raises(UnsupportedError, match=rf"CUDA, {precision} precision hands .* or hold the rows by Coll"):
+    with pytest.raises(UnsupportedError, match=r"CUDA, single precision hands .*'mixed'.* or hold the rows by Coll"):
         refuse_single_precision(Precision("CUDA", precision))
 
 

@@ -1,4 +1,4 @@
-"""docs/compare.md lists every scene and every method, with the tolerances of those that have many."""
+"""docs/compare.md lists every test system and every method, with the tolerances of those that have many."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ class Run(ABC):
         return None
 
     def own_evaluations(self) -> int | None:
-        """Force evaluations so far; None where the scene's potential counts them."""
+        """Force evaluations so far; None where the test system's potential counts them."""
         return None
 
     def own_step_seconds(self) -> float | None:
@@ -185,13 +185,13 @@ class Steps(Run):
 
 @dataclass(frozen=True)
 class Method(ABC):
-    """A way to run a scene.
+    """A way to run a test system.
 
     Attributes
     ----------
     name, title : str
     holds : bool
-        False for the floor, which holds nothing: its cost is the least there is. It makes the first step
+        False for the baseline, which holds nothing: its cost is the least there is. It makes the first step
         again and again, since with nothing held the system would soon fly apart.
     adaptive : bool
         Whether its setting is a tolerance instead of a time step.
@@ -206,7 +206,7 @@ class Method(ABC):
     remark : str
         What a reader of its numbers should know.
     damps : bool
-        Whether it can run scenes with friction.
+        Whether it can run test systems with friction.
     marches : bool
         Of the class: whether its runs can `march` and `rewind`, so that steps can be timed with nobody looking on.
         Otherwise whole runs are timed.
@@ -226,7 +226,7 @@ class Method(ABC):
     damps: bool = False
 
     def refuses(self, scene: Scene) -> str | None:
-        """Why this method cannot run the scene, or None."""
+        """Why this method cannot run the test system, or None."""
         if scene.friction and self.holds and not self.damps:
             return "it knows no friction"
         return scene.refusals.get(self.name)
@@ -244,7 +244,7 @@ class Method(ABC):
 
 
 def matched_steps(scene: Scene, evaluations: int) -> tuple[float, ...]:
-    """Time steps that cost as many force evaluations as the scene's steps cost RATTLE."""
+    """Time steps that cost as many force evaluations as the test system's steps cost RATTLE."""
     steps = scene.time_steps
     first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
     counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
@@ -252,7 +252,7 @@ def matched_steps(scene: Scene, evaluations: int) -> tuple[float, ...]:
 
 
 def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> ConstraintSet:
-    """The scene's set, or an equivalent one, without the rows that others imply at the start (last in a pivoted QR)."""
+    """The constraint set, or an equivalent one, without rows that others imply at the start (last in a pivoted QR)."""
     if held is None:
         held = scene.constraint_set
     if scene.motion.rank == held.n_rows:

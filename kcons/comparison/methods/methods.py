@@ -342,8 +342,8 @@ METHODS: Mapping[str, Method] = {
         AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
         ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
         ProjectedOde("dop853-projected", "kcons + DOP853, projected", adaptive=True, damps=True, project=True),
-        CoreVerlet("verlet", "floor: Verlet, nothing held", holds=False),
-        AseVerlet("ase-verlet", "floor: ASE Verlet, nothing held", holds=False, host="ase"),
+        CoreVerlet("verlet", "baseline: Verlet, nothing held", holds=False),
+        AseVerlet("ase-verlet", "baseline: ASE Verlet, nothing held", holds=False, host="ase"),
         *OPENMM_METHODS,
         *PEERS,
     )
@@ -351,9 +351,9 @@ METHODS: Mapping[str, Method] = {
 
 
 def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> list[Method]:
-    """Methods by name, by default the usual ones for the scene.
+    """Methods by name, by default the usual ones for the test system.
 
-    'all' alone stands for all, 'openmm' for the usual ones of OpenMM that can run the scene.
+    'all' alone stands for all, 'openmm' for the usual ones of OpenMM that can run the test system.
 
     Raises
     ------
@@ -382,9 +382,9 @@ def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> li
 
 
 def usual(scene: Scene | None = None) -> list[Method]:
-    """What runs where no method is named: the usual ones, of guests only those that can run the scene.
+    """What runs where no method is named: the usual ones, of guests only those that can run the test system.
 
-    All of OpenMM's on scenes that are at home there, and nothing else.
+    All of OpenMM's on test systems that are at home there, and nothing else.
     """
     found = [method for method in METHODS.values() if method.usual]
     if scene is not None and scene.openmm is not None and scene.openmm.home:

@@ -1,6 +1,7 @@
 """Methods of OpenMM: its own integrators over tolerances, and those of kcons in it.
 
-OpenMM runs by itself, several steps at a time; its Context starts where the scene does, on the platform of the scene.
+OpenMM runs by itself, several steps at a time; its Context has the start and the platform of the test
+system.
 """
 
 from __future__ import annotations
@@ -174,11 +175,11 @@ class OpenMMMethod(Method):
         if find_spec("openmm") is None:
             return "OpenMM is not installed; python -m pip install openmm"
         if scene.openmm is None:
-            return "the scene has no OpenMM System"
+            return "the test system has no OpenMM System"
         return self._lacks(scene)
 
     def _lacks(self, scene: Scene) -> str | None:
-        """What of the scene the method cannot hold."""
+        """What of the test system the method cannot hold."""
         return None if scene.bonds is not None else "a System holds distances only"
 
 
@@ -255,7 +256,7 @@ class BuiltIn(OpenMMMethod):
 
     def _lacks(self, scene: Scene) -> str | None:
         if not self.follows and scene.units.energy != "eV":
-            return "the units of the scene know no kelvin"
+            return "the units of the test system know no kelvin"
         return super()._lacks(scene) if self.holds else None
 
 
@@ -423,5 +424,5 @@ def _of_kcons() -> list[OpenMMMethod]:
 OPENMM_METHODS: tuple[OpenMMMethod, ...] = (
     *_built_in(),
     *_of_kcons(),
-    BuiltIn("openmm-free", "floor: OpenMM Verlet, nothing held", holds=False),
+    BuiltIn("openmm-free", "baseline: OpenMM Verlet, nothing held", holds=False),
 )

@@ -128,7 +128,7 @@ def build_fluid(name: str, size: int | None = None, seed: int = 1, *, quick: boo
 
 
 def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:
-    """The scene called `name`.
+    """The test system called `name`.
 
     Parameters
     ----------
@@ -140,17 +140,17 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
     quick : bool
         A smaller default size, half the horizon.
     **options
-        What the scene's own `build` takes, for example ``forces='ase'`` for water.
+        What the test system's own `build` takes, for example ``forces='ase'`` for water.
 
     Raises
     ------
     InputError
-        Unknown name; a size the scene cannot be built at.
+        Unknown name; a size the test system cannot be built at.
     """
     try:
         entry = SCENES[name]
     except KeyError:
-        raise InputError(f"there is no scene {name!r}; there are {', '.join(SCENES)}", item="scene") from None
+        raise InputError(f"there is no test system {name!r}; there are {', '.join(SCENES)}", item="scene") from None
     if size is None:
         size = entry.quick_size if quick else entry.size
     if entry.module != "structure" and set(options) & STRUCTURE_OPTIONS:
@@ -200,10 +200,10 @@ def by_mdanalysis(name: str, options: Mapping[str, Any]) -> bool:
 
 
 def is_file(name: str) -> bool:
-    """Whether a name is that of a structure file and not of a scene."""
+    """Whether a name is that of a structure file and not of a test system."""
     return name not in SCENES and Path(name).suffix.lower() in SUFFIXES
 
 
 def is_other_file(name: str) -> bool:
-    """Whether a name is that of a file that MDAnalysis may read: one that exists, or has a suffix and is no scene."""
+    """Whether a name is that of a file that MDAnalysis may read: it exists, or has a suffix and is no test system."""
     return name not in SCENES and name not in FLUIDS and (Path(name).is_file() or Path(name).suffix != "")

@@ -1,4 +1,4 @@
-"""OpenMM as an MD engine of scenes: a System with the scene's forces and masses, and its units in the scene's."""
+"""OpenMM as an MD engine of test systems: a System with the same forces and masses, and units to convert."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ ASE_LENGTH, ASE_TIME = 0.1, 1e-3 / units.fs
 
 @dataclass
 class OpenMMHost:
-    """What OpenMM needs to run a scene.
+    """What OpenMM needs to run a test system.
 
     Attributes
     ----------
     build : callable
-        Makes the System: masses, forces, and as its constraints those rows of the scene that are distances.
+        Makes the System: masses, forces, and as its constraints those rows of the test system that are distances.
     length, time : float
-        One unit of length of the scene in nm, one unit of time in ps.
+        One unit of length of the test system in nm, one unit of time in ps.
     platform : str
         Where it runs. 'Reference' computes forces in double, 'CPU' in single precision.
     surfaces : sequence of Constraint
         Spheres and other surfaces that hold particles, in nm.
     home : bool
-        Whether the scene belongs to OpenMM: its forces are OpenMM's, and its methods are the usual ones.
+        Whether the test system belongs to OpenMM: its forces are OpenMM's, and its methods are the usual ones.
     patience : float
         Seconds that the set-up of OpenMM's own constraints may take before a second one is refused.
     """
@@ -68,7 +68,7 @@ class OpenMMHost:
         return system
 
     def context(self, system: openmm.System, integrator: openmm.Integrator) -> openmm.Context:
-        """A Context on the platform of the scene, on one thread.
+        """A Context on the platform of the test system, on one thread.
 
         Raises
         ------
@@ -96,11 +96,11 @@ class OpenMMHost:
 
     @property
     def speed(self) -> float:
-        """One unit of velocity of the scene in nm/ps."""
+        """One unit of velocity of the test system in nm/ps."""
         return self.length / self.time
 
     def potential(self) -> Potential:
-        """The forces of the System as the scene's own, on the same platform."""
+        """The forces of the System as the test system's own, on the same platform."""
         import openmm
         from openmm import unit
 

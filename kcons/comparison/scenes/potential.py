@@ -1,4 +1,4 @@
-"""Energies and forces of a scene, the same for every method that runs it.
+"""Energies and forces of a test system, the same for every method that runs it.
 
 A `Potential` remembers its last point, so that an MD engine asking twice pays once, and counts and times what
 it evaluates. `PotentialCalculator` hands it to ASE.
@@ -113,7 +113,7 @@ class PotentialCalculator:
             return self.get_potential_energy(atoms)
         if name == "forces":
             return self.get_forces(atoms)
-        raise NotImplementedError(f"a scene has energy and forces, no {name}")
+        raise NotImplementedError(f"a test system has energy and forces, no {name}")
 
     def calculation_required(self, atoms: Atoms, properties: list[str]) -> bool:
         return True

@@ -21,7 +21,7 @@ from kcons.steppers import BlanesMoan6, State, System
 
 @dataclass(frozen=True)
 class Units:
-    """Names of the units that a scene's numbers carry, and how long their units of time are internally.
+    """Names of the units that a test system's numbers carry, and how long their units of time are internally.
 
     Time steps are shown in `time`; costs and slopes are stated per `long_time`.
     """
@@ -36,9 +36,9 @@ class Units:
 
 #: What ASE computes in; times are shown in femtoseconds.
 ASE_UNITS = Units("Å", "eV", "fs", units.fs, "ps", 1000 * units.fs)
-#: Radius, m v0² and R/v0 of the scenes that have no unit of their own.
+#: Radius, m v0² and R/v0 of the test systems that have no unit of their own.
 REDUCED = Units("R", "ε", "τ", 1.0, "τ", 1.0)
-#: For scenes that are given by bare numbers.
+#: For test systems that are given by bare numbers.
 BARE = Units("length", "energy", "τ", 1.0, "τ", 1.0)
 
 #: Progress: called with (steps done, steps in all).
@@ -93,9 +93,9 @@ class Scene:
     fixed : ndarray of int, shape (n,)
         Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
     refusals : mapping
-        Method name -> why it cannot run this scene.
+        Method name -> why it cannot run this test system.
     solution : callable, optional
-        The reference at a given time, in closed form or by an independent integrator; without it the scene is
+        The reference at a given time, in closed form or by an independent integrator; without it the test system is
         converged at a step far below those compared.
     cell : ndarray, shape (3,) or (3, 3), or None
     openmm : OpenMMHost, optional
@@ -103,7 +103,7 @@ class Scene:
     reference_pace : float
         The finest step compared, times this, decides about the work of a converged reference.
     friction : float
-        Rate at which velocities die away, beside the forces; methods that have no friction cannot run the scene.
+        Rate at which velocities die away, beside the forces; methods that have no friction cannot run the test system.
     shortfall : callable, optional
         Where the goal is known and not the way: what is taken for the error, as a function of the positions.
     """
@@ -133,7 +133,7 @@ class Scene:
 
     @cached_property
     def motion(self) -> Motion:
-        """The engine for this scene, set up once."""
+        """The engine for this test system, set up once."""
         return Motion(self.constraint_set, self.positions)
 
     @property
@@ -145,7 +145,7 @@ class Scene:
         return len(self.positions)
 
     def atoms(self) -> Atoms:
-        """ASE atoms at the start, with the scene's forces and nothing held."""
+        """ASE atoms at the start, with the test system's forces and nothing held."""
         atoms = Atoms(self.symbols, positions=self.positions, masses=self.masses)
         if self.cell is not None:
             atoms.set_cell(self.cell)
@@ -155,7 +155,7 @@ class Scene:
         return atoms
 
     def with_time_steps(self, shown: Sequence[float]) -> Scene:
-        """The same scene with other steps, in the unit of time it shows.
+        """The same test system with other steps, in the unit of time it shows.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class Scene:
         return replace(self, time_steps=tuple(sorted(set(steps), reverse=True)))
 
     def shortened(self, factor: int) -> Scene:
-        """The same scene with its horizon divided by `factor` and only the steps that still divide it."""
+        """The same test system with its horizon divided by `factor` and only the steps that still divide it."""
         horizon = self.horizon / factor
         steps = tuple(dt for dt in self.time_steps if abs(horizon / dt - round(horizon / dt)) < 1e-6 and dt < horizon)
         return replace(self, horizon=horizon, time_steps=steps or (horizon / 4, horizon / 8))
@@ -195,7 +195,7 @@ class Scene:
         return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
 
     def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
-        """Root-mean-square distance an atom; the shortfall where the scene has one."""
+        """Root-mean-square distance an atom; the shortfall where the test system has one."""
         if self.shortfall is not None:
             return self.shortfall(positions)
         return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))

@@ -47,7 +47,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool
         No particle.
     """
     if size < 1:
-        raise InputError(f"a scene needs at least one particle, not {size}", item="size")
+        raise InputError(f"a test system needs at least one particle, not {size}", item="size")
     rng = np.random.default_rng(seed)
     n: FloatArray = rng.standard_normal((size, 3))
     n /= np.linalg.norm(n, axis=1)[:, None]

@@ -175,7 +175,7 @@ def from_file(
 
 def _need_openmm() -> None:
     if find_spec("openmm") is None:
-        raise UnsupportedError("this scene needs OpenMM; python -m pip install openmm")
+        raise UnsupportedError("this test system needs OpenMM; python -m pip install openmm")
 
 
 def _nanometers(molecule: Any) -> FloatArray:
@@ -263,7 +263,7 @@ def _box(topology: Any) -> FloatArray | None:
     return None if np.diag(box).max() < 0.2 else box
 
 
-# -- the scene --------------------------------------------------------------------------------------
+# -- the test system --------------------------------------------------------------------------------------
 
 
 def _scene(

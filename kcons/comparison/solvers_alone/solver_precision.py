@@ -37,7 +37,7 @@ PATIENCE, QUICK_PATIENCE = 20.0, 1.0
 #: What stands for both stages where neither was done.
 BOTH = "P and V"
 #: Below this there is nothing but rounding.
-FLOOR = 1e-17
+LEAST_RESIDUAL = 1e-17
 #: Colour and marker of each solver.
 LOOKS: Mapping[str, Mapping[str, str]] = {
     "kcons": {"color": "#0072B2", "marker": "o"},
@@ -151,7 +151,7 @@ def _panel(result: Mapping[str, Any], name: str, stage: str) -> Panel:
         points = [p for p in _of(result, name, candidate.name, stage) if p["status"] == "ok"]
         if points:
             cost = [p["ns_per_row"] for p in points]
-            left = [max(p["residual"], FLOOR) for p in points]
+            left = [max(p["residual"], LEAST_RESIDUAL) for p in points]
             curves.append(Curve(cost, left, candidate.title, LOOKS[candidate.name]))
     what, residual = ("positions", "max |r/d - 1|") if stage == "P" else ("velocities", "max |Av|/v_rms")
     return Panel(curves, "time a constraint, ns", residual, f"{result['systems'][name]['title']}: {what}")

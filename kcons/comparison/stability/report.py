@@ -26,12 +26,12 @@ def _piece(result: Mapping[str, Any], *name: str) -> Mapping[str, Any] | None:
 
 
 def steps_table(result: Mapping[str, Any]) -> Table:
-    """Largest stable step by scene and method; what ends it."""
+    """Largest stable step by test system and method; what ends it."""
     return _by_method(result, "steps", _largest)
 
 
 def _by_method(result: Mapping[str, Any], part: str, told: Callable[[Mapping[str, Any] | None], str]) -> Table:
-    """A row a method, a column a scene; methods without any piece are left out."""
+    """A row a method, a column a test system; methods without any piece are left out."""
     rows = [[method, *(told(_piece(result, part, scene, method)) for scene in SCENES)] for method in METHODS]
     return Table(["method", *SCENES], [row for row in rows if any(row[1:])])
 
@@ -74,7 +74,7 @@ def drift_table(result: Mapping[str, Any]) -> Table:
                     f"{piece['residual']:.1e}",
                 ]
             )
-    return Table(["scene", "step", "steps", "seeds", "slope per unit time", "rms", "residual"], rows)
+    return Table(["test system", "step", "steps", "seeds", "slope per unit time", "rms", "residual"], rows)
 
 
 def reversal_table(result: Mapping[str, Any]) -> Table:
@@ -117,7 +117,7 @@ def markdown(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _lengths(result: Mapping[str, Any], part: str, words: str) -> str:
-    """How long the runs of each scene were, with Rattle."""
+    """How long the runs of each test system were, with Rattle."""
     found = {scene: _piece(result, part, scene, "Rattle") for scene in SCENES}
     told = ", ".join(f"{scene} {piece['steps']}" for scene, piece in found.items() if piece and "steps" in piece)
     return f"\n\n{words}: {told}." if told else ""
@@ -154,7 +154,7 @@ def _silent(piece: Mapping[str, Any]) -> float:
 
 
 def picture(result: Mapping[str, Any]) -> Figure:
-    """Largest stable step a force evaluation, by scene and method."""
+    """Largest stable step a force evaluation, by test system and method."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 4.8), layout="constrained")

@@ -34,7 +34,7 @@ METHODS = (*STEPPERS, *PEERS)
 #: Relative residual above which a run that ends without an error has failed silently. (SETTLE of OpenMM keeps lengths
 #: in single precision, 3e-8.)
 SILENT = 1e-7
-#: Change of the energy, relative to the largest kinetic energy of the scene, that is an explosion.
+#: Change of the energy, relative to the largest kinetic energy of the test system, that is an explosion.
 EXPLOSION = 1.0
 
 
@@ -88,7 +88,7 @@ _LOWEST: dict[str, float] = {}
 
 
 def _lowest(scene: str) -> float:
-    """About the lowest potential energy that the scene passes through."""
+    """About the lowest potential energy that the test system passes through."""
     if scene not in _LOWEST:
         problem = SCENES[scene](1)
         seen: list[float] = []
@@ -149,7 +149,7 @@ def _silent(before: float, end: str, residual: float) -> float:
     return max(before, residual) if math.isfinite(residual) and math.isfinite(before) else math.nan
 
 
-#: Time step of drift and reversal for each scene.
+#: Time step of drift and reversal for each test system.
 TIME_STEPS = {"water": 0.02, "chain": 0.02, "dumbbells": 0.02, "rotor": 0.05, "pendulum": 0.02, "butane": 0.02}
 
 
@@ -188,7 +188,7 @@ def drift(scene: str, seeds: int, steps: int, every: int = 20) -> dict[str, Any]
 
 
 class Copies:
-    """Several problems of one scene as one system, with forces for all of them at once."""
+    """Several problems of one test system as one system, with forces for all of them at once."""
 
     def __init__(self, problems: list[Problem]) -> None:
         self.n, self.each = len(problems), problems[0].n_atoms

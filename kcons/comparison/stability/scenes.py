@@ -1,4 +1,4 @@
-"""Small scenes for long runs: cheap forces, known kinds of motion, the same problem for every program."""
+"""Small test systems for long runs: cheap forces, known kinds of motion, the same problem for every program."""
 
 from __future__ import annotations
 

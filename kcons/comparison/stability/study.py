@@ -47,10 +47,10 @@ def run(
     Raises
     ------
     InputError
-        An unknown part or scene.
+        An unknown part or test system.
     """
     parts = picked(only, PARTS, "part", "only")
-    chosen = picked(scenes, SCENES, "scene", "scenes")
+    chosen = picked(scenes, SCENES, "test system", "scenes")
     file = Kept(kept, stamp(quick=quick), form=FORMAT)
     result: dict[str, Any] = {**file.head, "pieces": file.earlier().get("pieces", {})}
 

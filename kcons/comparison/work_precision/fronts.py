@@ -27,7 +27,7 @@ COSTS: dict[Cost, tuple[str, str]] = {
     "evaluations": ("evaluations_per_time", "force evaluations"),
 }
 
-#: MD engines with forces or overhead of their own; all others call the forces of the scene on plain arrays.
+#: MD engines with forces or overhead of their own; all others call the forces of the test system on plain arrays.
 HOSTS = {"openmm": "OpenMM", "ase": "ASE"}
 ARRAYS = "arrays"
 EVERY_HOST = "all MD engines"
@@ -109,7 +109,7 @@ class Verdict:
     Attributes
     ----------
     decides : {'wall', 'evaluations'}
-        What decides in this scene, where its forces are those of the scene.
+        What decides in this test system, where its forces are those of the test system.
     margin : float
         Wall times that differ by less are the same.
     standings : list of Standing
@@ -153,7 +153,7 @@ def cost_of(m: Measurement, cost: Cost) -> float:
     return math.nan if value is None else float(value)
 
 
-def floor_of(comparison: Comparison) -> float:
+def resolution_of(comparison: Comparison) -> float:
     """The error below which methods cannot be told apart."""
     return max(RESOLVED * float(comparison.reference["error"]), ROUNDING)
 
@@ -171,20 +171,20 @@ def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[
     ]
 
 
-def front(measurements: Iterable[Measurement], cost: Cost, floor: float = 0.0) -> list[Measurement]:
+def front(measurements: Iterable[Measurement], cost: Cost, resolution: float = 0.0) -> list[Measurement]:
     """Those that no other dominates, cheapest first: none costs as little and errs less, beyond `SAME_ERROR`.
 
     Parameters
     ----------
     measurements : iterable of Measurement
     cost : {'wall', 'evaluations'}
-    floor : float
-        Errors below are taken as this one.
+    resolution : float
+        Errors below it are taken as equal to it.
     """
     kept: list[Measurement] = []
     for m in sorted(measurements, key=lambda m: (cost_of(m, cost), float(m.error or 0.0))):
-        last = max(float(kept[-1].error or 0.0), floor) if kept else math.inf
-        if max(float(m.error or 0.0), floor) < last * (1 - SAME_ERROR):
+        last = max(float(kept[-1].error or 0.0), resolution) if kept else math.inf
+        if max(float(m.error or 0.0), resolution) < last * (1 - SAME_ERROR):
             kept.append(m)
     return kept
 
@@ -232,23 +232,23 @@ def verdict(comparison: Comparison) -> Verdict:
 
 def _hosts_without_forces(comparison: Comparison) -> frozenset[str]:
     """Hosts whose steps with nothing held take less than `NO_FORCE`, forces and all."""
-    floors = [
+    baselines = [
         (host_of(m.method), m.step_seconds)
         for m in comparison.measurements
-        if m.status == "floor" and m.step_seconds is not None and host_of(m.method) == HOSTS["openmm"]
+        if m.status == "baseline" and m.step_seconds is not None and host_of(m.method) == HOSTS["openmm"]
     ]
-    return frozenset(host for host, seconds in floors if seconds < NO_FORCE)
+    return frozenset(host for host, seconds in baselines if seconds < NO_FORCE)
 
 
 def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> Standing:
-    floor = floor_of(comparison)
+    resolution = resolution_of(comparison)
     here = points(comparison, cost, None if host == EVERY_HOST else host)
     curves: dict[str, list[Measurement]] = {}
     for m in here:
         curves.setdefault(m.method, []).append(m)
     ours = [curve for curve in curves.values() if is_ours(curve[0])]
     theirs = [curve for curve in curves.values() if not is_ours(curve[0])]
-    on_front = front(here, cost, floor)
+    on_front = front(here, cost, resolution)
     if not ours or not theirs:
         return Standing(host, cost, on_front, False, [])
     allowed = 1 + (margin if cost == "wall" else SAME_EVALUATIONS)
@@ -257,7 +257,7 @@ def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> S
     for curve in theirs:
         lost: list[tuple[float, float]] = []
         for m in curve:
-            error = max(float(m.error or 0.0), floor)
+            error = max(float(m.error or 0.0), resolution)
             price, winner = cheapest(ours, cost, error * (1 + SAME_ERROR))
             factor = price / cost_of(m, cost)
             if factor > allowed:
@@ -279,7 +279,7 @@ def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measu
     Cheaper by more than `LEAST_MARGIN` (evaluations: `SAME_EVALUATIONS`), more accurate by more than `SAME_ERROR`; by
     MD engine, in what decides there. MD engines without rivals are left out.
     """
-    judged, floor = verdict(comparison), floor_of(comparison)
+    judged, least = verdict(comparison), resolution_of(comparison)
     found: dict[str, list[tuple[Measurement, Measurement]]] = {}
     for standing in judged.standings:
         host, cost = standing.host, standing.cost
@@ -289,11 +289,11 @@ def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measu
         cheaper = 1 + (LEAST_MARGIN if cost == "wall" else SAME_EVALUATIONS)
         found[host] = [
             (mine, other)
-            for mine in front([m for m in here if is_ours(m)], cost, floor)
+            for mine in front([m for m in here if is_ours(m)], cost, least)
             for other in here
             if not is_ours(other)
             and cost_of(other, cost) * cheaper < cost_of(mine, cost)
-            and max(float(other.error or 0.0), floor) < max(float(mine.error or 0.0), floor) * (1 - SAME_ERROR)
+            and max(float(other.error or 0.0), least) < max(float(mine.error or 0.0), least) * (1 - SAME_ERROR)
         ]
     return found
 

@@ -1,4 +1,4 @@
-"""Run a scene through methods and measure, for each, what error it makes for what cost.
+"""Run a test system through methods and measure, for each, what error it makes for what cost.
 
 Every method starts from the same state with the same forces and is compared with the same reference
 solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded; with `rounds`,
@@ -58,7 +58,7 @@ def compare(
     scene : Scene
     methods : iterable of str, optional
         Names out of `methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
-        ones for the scene.
+        ones for the test system.
     budget : float
         Seconds for each method over all its time steps. One that is predicted to exceed it is stopped
         after a step, which is reported as such.
@@ -130,7 +130,7 @@ def reference_of(scene: Scene, watcher: Watcher) -> Reference:
 
 
 def force_seconds(scene: Scene) -> float:
-    """Median wall time of the scene's forces beyond that of a spring on one atom, which is that of a call of NumPy.
+    """Median wall time of the forces beyond that of a spring on one atom, which is that of a call of NumPy.
 
     They take turns: a machine that slows down in between does it to both.
     """
@@ -153,7 +153,7 @@ def force_seconds(scene: Scene) -> float:
 
 
 def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
-    """Compile or load every kernel that the scene and these methods need, outside of any timing."""
+    """Compile or load every kernel that the test system and these methods need, outside of any timing."""
     motion = scene.motion
     x, v = scene.positions, scene.velocities
     f = scene.potential.forces(x)
@@ -168,7 +168,7 @@ def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
 
 @dataclass(frozen=True)
 class Bench:
-    """Where the methods that run one scene are measured; `warm_up` comes first.
+    """Where the methods that run one test system are measured; `warm_up` comes first.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class Bench:
                     found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
                     continue
             found.append(self.measure(method, setting, begun=begun))
-            if found[-1].status == "not run":  # it cannot run this scene at any step
+            if found[-1].status == "not run":  # it cannot run this test system at any step
                 break
             if found[-1].status == "partial":
                 given_up = found[-1]
@@ -327,7 +327,7 @@ def _judged(
 ) -> Measurement:
     """What a run that made steps says of its method."""
     if not method.holds:
-        return Measurement(status="floor" if status == "ok" else status, note=note, **common)
+        return Measurement(status="baseline" if status == "ok" else status, note=note, **common)
     x, v = run.positions, run.velocities
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
         return Measurement(status="failed", note="positions are not finite", **common)

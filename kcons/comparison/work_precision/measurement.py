@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-Status = Literal["ok", "floor", "thermostat", "partial", "failed", "not run"]
+Status = Literal["ok", "baseline", "thermostat", "partial", "failed", "not run"]
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,9 @@ class Measurement:
     Attributes
     ----------
     setting : float
-        Time step in the scene's shown unit, or relative tolerance of an adaptive method.
-    status : {'ok', 'floor', 'thermostat', 'partial', 'failed', 'not run'}
-        'floor': nothing is held, only the cost is stated. 'thermostat': the trajectory is not to be that of the
+        Time step in the test system's shown unit, or relative tolerance of an adaptive method.
+    status : {'ok', 'baseline', 'thermostat', 'partial', 'failed', 'not run'}
+        'baseline': nothing is held, only the cost is stated. 'thermostat': the trajectory is not to be that of the
         reference, so that there is no error. 'partial': stopped for the budget; cost only.
     error : float
         Root-mean-square distance an atom from the reference at the horizon.
@@ -102,8 +102,8 @@ class Comparison:
         """
         if "error" in self.scene:
             return None
-        floor = 5 * float(self.reference["error"])
-        used = [m for m in self.of(method) if not m.adaptive and m.error is not None and m.error > max(floor, 1e-12)]
+        least = max(5 * float(self.reference["error"]), 1e-12)
+        used = [m for m in self.of(method) if not m.adaptive and m.error is not None and m.error > least]
         if len(used) < 2:
             return None
         steps, errors = np.log([(m.setting, float(m.error or 0)) for m in used[-2:]]).T
@@ -127,8 +127,20 @@ class Comparison:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Comparison:
-        """What `to_dict` wrote; entries that are missing are None, unknown ones are left out."""
+        """What `to_dict` wrote; entries that are missing are None, unknown ones are left out.
+
+        Older files say 'floor' where 'baseline' stands now; both are read.
+        """
         known = {f.name for f in fields(Measurement)}
-        measurements = [Measurement(**{k: v for k, v in m.items() if k in known}) for m in data["measurements"]]
+        measurements = [
+            Measurement(**{k: v for k, v in _named_as_now(m).items() if k in known}) for m in data["measurements"]
+        ]
         parts = {f.name: data[f.name] for f in fields(cls) if f.name in data and f.name != "measurements"}
         return cls(**parts, measurements=measurements)
+
+
+def _named_as_now(entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A measurement from a file, with the words of this version."""
+    if entry["status"] != "floor":
+        return entry
+    return {**entry, "status": "baseline", "title": entry["title"].replace("floor: ", "baseline: ", 1)}

@@ -1,4 +1,4 @@
-"""The parts of the whole comparison: scenes and sizes, what is left out of them and why."""
+"""The parts of the whole comparison: test systems and sizes, what is left out of them and why."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Item:
         A key of `scenes.SCENES`; '' for a part with a module of its own.
     size : int or None
     options : mapping
-        For the scene.
+        For the test system.
     steps : sequence of float or None
-        Time steps in the unit the scene shows, instead of its own.
+        Time steps in the unit the test system shows, instead of its own.
     pace : float
         The finest step times this decides about the work of a converged reference.
     without : mapping of str to str
@@ -38,9 +38,9 @@ class Item:
     quick_seconds : float
         The same in a quick run; 0 where it is left out of it.
     quick_size : int or None
-        Size in a quick run, by default what the scene says.
+        Size in a quick run, by default what the test system says.
     module : str
-        Where `measure`, `figure` and `table` are, for a part that is no scene.
+        Where `measure`, `figure` and `table` are, for a part that is no test system.
     """
 
     key: str
@@ -188,7 +188,7 @@ PLAN: tuple[Item, ...] = (
 
 
 def chosen(keys: Sequence[str] | None = None) -> list[Item]:
-    """Parts by key; all by default. A name of a scene stands for all its parts.
+    """Parts by key; all by default. A name of a test system stands for all its parts.
 
     Raises
     ------

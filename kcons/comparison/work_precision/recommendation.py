@@ -18,7 +18,16 @@ from kcons.comparison.methods.snippets import code
 from kcons.comparison.scenes import Reference, Scene
 from kcons.comparison.study.study import Watcher
 from kcons.comparison.study.tables import duration
-from kcons.comparison.work_precision.fronts import COSTS, EVERY_HOST, Cost, cost_of, floor_of, host_of, is_ours, verdict
+from kcons.comparison.work_precision.fronts import (
+    COSTS,
+    EVERY_HOST,
+    Cost,
+    cost_of,
+    host_of,
+    is_ours,
+    resolution_of,
+    verdict,
+)
 from kcons.comparison.work_precision.measure import Bench, warm_up
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
 from kcons.comparison.work_precision.timing_rounds import Rounds
@@ -47,7 +56,7 @@ class Prediction:
     ----------
     method : str
     setting : float
-        Time step in the scene's shown unit, or tolerance.
+        Time step in the test system's shown unit, or tolerance.
     order : float
         Slope of the logarithms, error against setting.
     wall, evaluations : float
@@ -63,7 +72,7 @@ class Prediction:
         return self.wall if cost == "wall" else self.evaluations
 
 
-def predicted(curve: Sequence[Measurement], error: float, floor: float = 0.0) -> Prediction | None:
+def predicted(curve: Sequence[Measurement], error: float, resolution: float = 0.0) -> Prediction | None:
     """Predict the setting of one method for `error` from its measured points, by the slope next to it.
 
     Parameters
@@ -71,16 +80,16 @@ def predicted(curve: Sequence[Measurement], error: float, floor: float = 0.0) ->
     curve : sequence of Measurement
         Of one method, in the order of its settings, all with errors.
     error : float
-    floor : float
+    resolution : float
         Points with smaller errors say nothing about the slope.
 
     Returns
     -------
     prediction : Prediction or None
-        None where fewer than two points are above the floor, or the error does not fall with the setting.
+        None where fewer than two points are above the resolution, or the error does not fall with the setting.
     """
     used = sorted((m for m in curve if m.error), key=lambda m: -m.setting)
-    above = [m for m in used if float(m.error or 0.0) > floor]
+    above = [m for m in used if float(m.error or 0.0) > resolution]
     if len(above) < 2:
         return None
     # The pair around the error, else the two nearest to it.
@@ -121,13 +130,13 @@ def recommend(
     ----------
     scene : Scene
     comparison : Comparison
-        Of this scene.
+        Of this test system.
     target : float
-        Root-mean-square distance an atom from the reference, in the scene's unit of length.
+        Root-mean-square distance an atom from the reference, in the test system's unit of length.
     reference : Reference
         The one of the comparison.
     made_by : str
-        The expression that makes the scene, for the lines of code.
+        The expression that makes the test system, for the lines of code.
     budget : float
         Seconds for a run.
     watcher : Watcher, optional
@@ -148,13 +157,13 @@ def recommend(
         raise InputError(f"the target error is {target}; give a positive number", item="target_error")
     bench = Bench(scene, reference, budget, watcher or Watcher(), rounds)
     decides = verdict(comparison).decides
-    floor = floor_of(comparison)
+    resolution = resolution_of(comparison)
     curves = _curves(comparison)
     found: list[Measurement] = []
-    if target >= floor:
+    if target >= resolution:
         warm_up(scene, [METHODS[name] for name in curves])
         promising = sorted(
-            (p for curve in curves.values() if (p := predicted(curve, SAFETY * target, floor)) is not None),
+            (p for curve in curves.values() if (p := predicted(curve, SAFETY * target, resolution)) is not None),
             key=lambda p: p.cost(decides),
         )
         for prediction in promising[:FINALISTS]:
@@ -163,7 +172,7 @@ def recommend(
                 found += reach(bench, prediction, target)
     found, _ = bench.timed_again(found)
     everything = [*(m for curve in curves.values() for m in curve), *found]
-    able = [m for m in everything if target >= floor and _reaches(m, target)]
+    able = [m for m in everything if target >= resolution and _reaches(m, target)]
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
         best = min(able, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
@@ -172,10 +181,10 @@ def recommend(
         entry["default"] = default
         found += more
     else:
-        entry["why"] = _why_not(scene, comparison, target, floor, everything)
+        entry["why"] = _why_not(scene, comparison, target, resolution, everything)
         usable = [m for m in everything if m.error]
         if usable:
-            entry["best"] = _facts(min(usable, key=lambda m: max(float(m.error or 0.0), floor)))
+            entry["best"] = _facts(min(usable, key=lambda m: max(float(m.error or 0.0), resolution)))
     measurements = [*comparison.measurements, *found]
     return replace(comparison, measurements=_sorted(measurements), recommendation=entry)
 
@@ -183,7 +192,7 @@ def recommend(
 def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
     """Where another method seems to be ahead of kcons: the step of kcons that makes the same error is tried.
 
-    Steps of a scene are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
+    Steps of a test system are the same for all. Where a method needs far fewer of them, or gets farther, its points lie
     beyond those of the others, and nothing could be said of who is cheaper there.
 
     Parameters
@@ -192,7 +201,7 @@ def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
         That of the comparison.
     comparison : Comparison
     """
-    floor = floor_of(comparison)
+    resolution = resolution_of(comparison)
     curves = _curves(comparison)
     judged = verdict(comparison)
     found: list[Measurement] = []
@@ -201,8 +210,8 @@ def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
         ours = [c for c in curves.values() if is_ours(c[0]) and standing.host in (host_of(c[0].method), EVERY_HOST)]
         if standing.cost not in (judged.decides_on(standing.host), "evaluations") or not ours:
             continue
-        for target in sorted({max(error, floor) for loss in standing.losses for error in loss.errors}):
-            predictions = [p for c in ours if (p := predicted(c, SAFETY * target, floor)) is not None]
+        for target in sorted({max(error, resolution) for loss in standing.losses for error in loss.errors}):
+            predictions = [p for c in ours if (p := predicted(c, SAFETY * target, resolution)) is not None]
             best = min(predictions, key=lambda p: p.cost(standing.cost), default=None)
             if best is not None and (best.method, target) not in tried:
                 tried.add((best.method, target))
@@ -311,7 +320,7 @@ def _default(
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
     points = _sorted([*curve, *(m for m in found if m.status == "ok" and m.error)])
     reached = [m for m in points if _reaches(m, target)]
-    prediction = predicted(points, SAFETY * target, floor_of(comparison))
+    prediction = predicted(points, SAFETY * target, resolution_of(comparison))
     if prediction is not None:
         more, _ = bench.timed_again(reach(bench, prediction, target))
         found += more
@@ -319,7 +328,7 @@ def _default(
     if reached:
         cheapest = min(reached, key=lambda m: cost_of(m, "wall"))
         entry["needs"] = {**_facts(cheapest), "measured": True}
-    elif (far := predicted(points, target, floor_of(comparison))) is not None:
+    elif (far := predicted(points, target, resolution_of(comparison))) is not None:
         entry["needs"] = {
             "setting": far.setting,
             "seconds_per_time": far.wall,
@@ -336,20 +345,20 @@ def _default(
 
 
 def default_method(scene: Scene, host: str) -> str | None:
-    """What a user of this MD engine takes who has not thought about it; None if it cannot run the scene."""
+    """What a user of this MD engine takes who has not thought about it; None if it cannot run the test system."""
     names = ("openmm-verlet",) if host == "openmm" else ("ase-bonds", "dop853")
     return next((name for name in names if METHODS[name].refuses(scene) is None), None)
 
 
 def _why_not(
-    scene: Scene, comparison: Comparison, target: float, floor: float, everything: Sequence[Measurement]
+    scene: Scene, comparison: Comparison, target: float, resolution: float, everything: Sequence[Measurement]
 ) -> str:
     length = comparison.scene["units"]["length"]
     good = float(comparison.reference["error"])
-    if target < floor:
+    if target < resolution:
         return (
             f"the reference itself ({comparison.reference['how']}) is good to {good:.1g} {length}, so that errors "
-            f"below {floor:.1g} {length} cannot be told from none; the forces are {comparison.scene['forces']}"
+            f"below {resolution:.1g} {length} cannot be told from none; the forces are {comparison.scene['forces']}"
         )
     late = [m for m in comparison.measurements if m.status in ("partial", "not run") and "budget" in m.note]
     more = f"; {len(late)} runs were stopped for the budget, which --budget raises" if late else ""

@@ -87,7 +87,7 @@ def style(name: str) -> tuple[str, str | int]:
     return SPARE[others.index(name) % len(SPARE)] if name in others else ("black", "x")
 
 
-#: What the error is, unless the scene says something else.
+#: What the error is, unless the test system says something else.
 ERROR = "root-mean-square distance an atom from the reference"
 
 EXPLANATION = (
@@ -98,7 +98,7 @@ EXPLANATION = (
     "in brackets where below twice its standard error.",
     "time, constraints: median wall time of a step and of its constraints. "
     "forces, wall: force evaluations and wall time for one simulated {long_time}.",
-    "floor: the first step with nothing held, again and again: what a step costs before any constraint.",
+    "baseline: the first step with nothing held, again and again: what a step costs before any constraint.",
 )
 
 #: Characters that all columns take, usually.
@@ -150,7 +150,7 @@ def _cells(m: Measurement, note: int | None) -> dict[str, str]:
         "max |Av|": "" if m.velocity_residual is None else f"{m.velocity_residual:.0e}",
         "slope": slope,
         "time": "" if m.step_seconds is None else duration(m.step_seconds),
-        "constraints": "" if m.constraint_seconds is None or m.status == "floor" else duration(m.constraint_seconds),
+        "constraints": "" if m.constraint_seconds is None or m.status == "baseline" else duration(m.constraint_seconds),
         "forces": "" if m.evaluations_per_time is None else _count(m.evaluations_per_time),
         "wall": "" if m.seconds_per_time is None else duration(m.seconds_per_time),
     }
@@ -160,7 +160,7 @@ def _error(m: Measurement, note: int | None) -> str:
     """The error, or in a word why there is none and which note tells more."""
     if m.status == "ok":
         return "" if m.error is None else f"{m.error:.2e}"
-    if m.status in ("floor", "thermostat"):
+    if m.status in ("baseline", "thermostat"):
         return "-"
     word = f"{m.steps} step{'s' if m.steps > 1 else ''} only" if m.status == "partial" and m.steps else m.status
     return verdict(m.status, word, note)
@@ -290,9 +290,9 @@ def _costs_without_error(comparison: Comparison) -> list[Curve]:
 
     for name in dict.fromkeys(m.method for m in comparison.measurements):
         colour, marker = style(name)
-        floors = [m for m in comparison.of(name, "floor") if m.seconds_per_time]
-        if floors:
-            mark(floors, 0.03, "cost only", marker=marker, markersize=7)
+        baselines = [m for m in comparison.of(name, "baseline") if m.seconds_per_time]
+        if baselines:
+            mark(baselines, 0.03, "cost only", marker=marker, markersize=7)
         for m in comparison.of(name, "partial")[:1]:
             if m.seconds_per_time:
                 label = f"{m.title} (stopped for the budget, cost only)"
@@ -327,7 +327,7 @@ def page_table(comparison: Comparison) -> Table:
     rows, marks = [], []
     for m in comparison.measurements:
         cells = _cells(m, None)
-        each = m.constraint_seconds / rank if m.constraint_seconds is not None and m.status != "floor" else None
+        each = m.constraint_seconds / rank if m.constraint_seconds is not None and m.status != "baseline" else None
         front = on_front.get(id(m), [])
         rows.append(
             [

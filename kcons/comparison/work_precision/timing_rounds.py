@@ -22,7 +22,7 @@ from kcons.errors import KconsError
 #: Steps before the clock starts, of runs short enough.
 WARM_STEPS = 4
 #: What holds nothing goes back to the start after so many steps: it would fly apart.
-FLOOR_BLOCK = 4
+BASELINE_BLOCK = 4
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Rounds:
     pass_seconds: float = 0.01
 
 
-#: Those of the whole comparison, of one scene, and of a quick run.
+#: Those of the whole comparison, of one test system, and of a quick run.
 FULL_ROUNDS = Rounds()
 ROUNDS = Rounds(least=2, most=8, seconds=0.3)
 QUICK_ROUNDS = Rounds(least=1, most=4, seconds=0.02, pass_seconds=0.002)
@@ -188,7 +188,7 @@ def marched(run: Run, m: Measurement, holds: bool, pass_seconds: float) -> float
     step_seconds = float(m.step_seconds or 0.0)
     run.march(min(m.steps, WARM_STEPS) if WARM_STEPS * step_seconds < pass_seconds else 1)
     if not holds:
-        return _passes(run, min(m.steps, FLOOR_BLOCK), pass_seconds)
+        return _passes(run, min(m.steps, BASELINE_BLOCK), pass_seconds)
     longer = run.stretch(max(step_seconds, 1e-9), pass_seconds)
     if longer > m.steps:
         try:
@@ -229,6 +229,6 @@ def margin(times: Iterable[Sequence[float]]) -> float | None:
 
 
 def _short(m: Measurement, limit: float) -> bool:
-    if m.status not in ("ok", "floor") or not m.step_seconds:
+    if m.status not in ("ok", "baseline") or not m.step_seconds:
         return False
     return m.step_seconds * m.steps + float(m.setup_seconds or 0.0) <= limit

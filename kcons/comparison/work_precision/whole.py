@@ -1,7 +1,7 @@
-"""The whole comparison: every scene through every method, into one folder and one page.
+"""The whole comparison: every test system through every method, into one folder and one page.
 
-What is measured is written after every part, and is not measured again while code, scene and settings stay the same:
-an interrupted run goes on where it stopped.
+What is measured is written after every part. It is not measured again while code, test system and settings are the
+same: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def run(
     items : sequence of Item
     folder : path
     quick : bool
-        Smaller scenes, short budgets, large scenes left out; five minutes in all.
+        Smaller test systems, short budgets, large test systems left out; five minutes in all.
     fresh : bool
         Measure again what is there.
     watcher : Watcher, optional
@@ -99,7 +99,7 @@ def run(
 
 
 def key_of(item: Item, quick: bool) -> dict[str, Any]:
-    """What a measurement depends on: code, scene, settings."""
+    """What a measurement depends on: code, test system, settings."""
     part = asdict(item)
     for name in ("heading", "seconds", "quick_seconds"):
         part.pop(name)
@@ -145,14 +145,14 @@ def _excluded(item: Item, quick: bool) -> str:
     if item.module and find_spec(item.module) is None:
         return f"this version of kcons has no {item.module}"
     if item.scene and item.scene not in scenes.SCENES:
-        return f"this version of kcons has no scene {item.scene!r}"
+        return f"this version of kcons has no test system {item.scene!r}"
     if item.needs and find_spec(item.needs) is None:
         return f"{item.needs} is not installed; python -m pip install {item.needs}"
     return ""
 
 
 def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
-    with watcher.piece("building the scene", 1):
+    with watcher.piece("building the test system", 1):
         scene = scene_of(item, quick)
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
     names, left_out = methods_of(item, scene, quick)
@@ -174,7 +174,7 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
 
 
 def scene_of(item: Item, quick: bool) -> Scene:
-    """The scene of a part."""
+    """The test system of a part."""
     size = item.quick_size if quick and item.quick_size is not None else item.size
     scene = scenes.build(item.scene, size, quick=quick, **item.options)
     if item.steps is not None and not quick:
@@ -186,7 +186,7 @@ def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[s
     """Names of the methods that run, and of those that are left out though they could, with the reasons.
 
     All steppers of kcons on arrays, in a quick run the usual ones; of other MD engines the usual ones, those that
-    refuse with their reasons; of OpenMM and of guests those that can run the scene.
+    refuse with their reasons; of OpenMM and of guests those that can run the test system.
     """
     kept: list[str] = []
     out: dict[str, str] = {}

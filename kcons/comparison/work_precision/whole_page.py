@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 TITLE = "Constraints in molecular dynamics: error against cost"
 
 INTRODUCTION = (
-    "Every scene is run through every method that can run it: the same start, the same forces, the same reference "
+    "Every method runs every test system that it can run: the same start, the same forces, the same reference "
     "solution at the same moment, so early that chaos has not begun to decide. Each point is one method at one time "
     "step or tolerance, after kernels were compiled, on one thread; times are medians over steps. Every method has its "
     "own best settings: steps of high-order methods are longer, tolerances of MD engines are varied.",
@@ -156,9 +156,9 @@ def _machines(parts: Sequence[Part]) -> Table:
 
 
 def winners(parts: Sequence[Part]) -> Table:
-    """Who wins where: a line for each scene and MD engine with a method of kcons and another one."""
+    """Who wins where: a line for each test system and MD engine with a method of kcons and another one."""
     headings = [
-        "scene",
+        "test system",
         "MD engine",
         "decided by",
         "times repeat to",
@@ -253,7 +253,7 @@ def _lost_and_won(parts: Sequence[Part]) -> tuple[list[str], list[str]]:
     compared = [(part.heading, part.comparison) for part in parts if part.comparison is not None]
     judged = [row for _, found in compared for row in summary(found) if row["rivals"]]
     if not judged:
-        return ["No scene has both a method of kcons and another one yet."], []
+        return ["No test system has both a method of kcons and another one yet."], []
     won = sum(not row["losses"] for row in judged)
     both = sum(bool(pairs) for _, found in compared for pairs in overtaken(found).values())
     close = [

@@ -1,7 +1,9 @@
 """The constraint objects of kcons in OpenMM: PythonForces that carry positions to the engine and corrections back.
 
-A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. Three of
-them, each in a force group of its own, serve one set of rows:
+A PythonForce gets positions and returns forces, both as exact doubles on the CPU and Reference platforms. On GPUs
+they are rounded on their way, see `carried.passage`.
+
+Three of these forces, each in a force group of its own, serve one set of rows:
 
 * `remember`: the positions at the start of a drift, where gradients are taken. Returns no force. Left out where the
   last drift has ended there for sure.
@@ -31,6 +33,8 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, KconsError
 from kcons.motion.motion import Motion
+from kcons.openmm.carried.passage import Passage
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.openmm.integrator.system_checks import ROW_NAME
 from kcons.steppers.operations import Exchange
@@ -44,8 +48,6 @@ SPEED_SCALE = 1024.0
 #: What that takes from v is carried after it, multiplied by this: less than a thousandth of a nanometer at 100 nm from
 #: the origin.
 LOW_SCALE = 2.0**27
-#: Corrections are carried multiplied by this: on GPUs forces are whole multiples of 2^-32.
-CARRY_SCALE = 2.0**20
 
 PHASES = ("remember", "land", "project")
 PREFIX = f"{ROW_NAME}s"
@@ -80,6 +82,9 @@ class Engine:
         self._moved = np.zeros((n, 3))
         #: Where the carried particles are, in step with OpenMM's own positions to the last bit.
         self._x, self._read = np.zeros(local), np.zeros(local)
+        #: To and from OpenMM.
+        self.passage = Passage(self.atoms, n)
+        self._landed = False
         rows = self.motion.constraint_set.n_rows
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
         #: Whether the time of a drift matters.
@@ -126,6 +131,12 @@ class Engine:
             sums = np.cumsum(self._fractions)[:-1].tolist()
             self._nodes = (0.0, *sums, 1.0)
 
+    def take_precision(self, precision: Precision) -> None:
+        """The Context is known. Where positions have 48 bits, what v loses on its way is less than forces know."""
+        self.passage.precision = precision
+        if precision.name != "double":
+            self.carries_rest = False
+
     def begin_run(self) -> None:
         """Whatever was asked between steps, the next call belongs to the beginning of one."""
         self._between_steps, self._rest_to_come = True, False
@@ -139,7 +150,7 @@ class Engine:
             if self.cell is not None:
                 self.follow_cell(state)
         self._stage += 1
-        _positions(state, self._x)
+        self.passage.take(state, self._x)
         self._begin_drift()
         return self._nothing
 
@@ -153,10 +164,10 @@ class Engine:
 
     def land(self, state: openmm.State) -> FloatArray:
         there, read = self._there, self._read
-        _positions(state, read)
+        self.passage.take(state, read)
         if self._landing is not None and np.array_equal(read, self._landing[0]):
             return self._landing[1]  # force and energy are asked for one by one
-        if not self.timed and np.array_equal(read, self._x):
+        if not self.timed and self.passage.same(read, self._x):
             return self._nothing  # at rest, or forces are asked for between steps
         if not self._begun:
             self._begin_drift()  # where the last drift ended: nobody has moved x since
@@ -185,14 +196,15 @@ class Engine:
         # What the velocity stage before found belongs to the same positions as this impulse.
         self._push, self._push_before = self._push_before, self._push
         self._push.fill(0.0)
-        np.add(read, change, out=self._x)
-        change *= CARRY_SCALE
+        change, arriving = self.passage.carried(change)
+        np.add(read, arriving, out=self._x)
+        self._landed = True
         self._landing = (read.copy(), change)
         return change
 
     def project(self, state: openmm.State) -> FloatArray:
         read = self._read
-        _positions(state, read)
+        self.passage.take(state, read)
         read -= self._x
         if self._rest_to_come:
             self._rest_to_come = False
@@ -204,9 +216,7 @@ class Engine:
         self._rest_to_come = self.carries_rest
         read *= SPEED_SCALE
         push = self._push if len(self._fractions) == 1 else None
-        change = self._tangent(read, push) - read
-        change *= CARRY_SCALE
-        return change
+        return self.passage.carried(self._tangent(read, push) - read)[0]
 
     def _project_rest(self, read: FloatArray) -> FloatArray:
         """The same for what was too small to be carried with v, as large as it comes: any factor will do."""
@@ -215,8 +225,7 @@ class Engine:
         if self.motion.plan.driven:
             # The rate that the rows demand is in v already.
             change -= self._tangent(np.zeros_like(read), None)
-        change *= CARRY_SCALE
-        return change
+        return self.passage.carried(change)[0]
 
     def _tangent(self, read: FloatArray, multipliers: FloatArray | None) -> FloatArray:
         """Velocities of the carried particles, projected."""
@@ -250,6 +259,7 @@ class Engine:
 
     def answer(self, phase: str, state: openmm.State) -> tuple[float, FloatArray]:
         """What the PythonForce of this phase returns. Nothing is raised: OpenMM would make a string of it."""
+        self.passage.open(state)
         try:
             change = self.remember(state) if phase == "remember" else None
             if self._error is None:
@@ -261,7 +271,17 @@ class Engine:
                 self._between_steps, self._rest_to_come = True, False
         except BaseException as error:
             self._error, change = error, None
-        return (0.0 if self._error is None else 1.0), (self._nothing if change is None else change)
+        return (0.0 if self._error is None else 1.0), self.passage.give(change)
+
+    def rounded(self, x: FloatArray) -> bool:
+        """Whether OpenMM may have moved carried particles back into the box since the last drift: it rounds them."""
+        if self.passage.precision.name != "mixed" or not self._landed:
+            return self.passage.precision.name == "mixed"
+        off = x[self.atoms] - self._x
+        if self.cell is not None:
+            off -= np.round(off @ np.linalg.inv(self.cell)) @ self.cell
+        reach = 2.0**-22 * np.abs(x[self.atoms]).max(initial=0.0)
+        return not self.passage.same(self._x + off, self._x) and bool(np.abs(off).max(initial=0.0) <= reach)
 
     # -- afterwards -----------------------------------------------------------------------------
 
@@ -333,11 +353,6 @@ def _restored(key: str, phase: str, recipe: tuple[Any, ...] | None) -> Callback:
 
 
 # -- what OpenMM gives ----------------------------------------------------------------------------
-
-
-def _positions(state: openmm.State, out: FloatArray) -> None:
-    # The public getPositions(asNumpy=True) makes the same call, and a Quantity: 20 times as slow.
-    state._getVectorAsNumpy(openmm.State.Positions, out)
 
 
 def _number(quantity: unit.Quantity) -> float:

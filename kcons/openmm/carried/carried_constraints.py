@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-import warnings
 from collections.abc import Iterable
 from typing import Literal
 
@@ -15,11 +14,10 @@ from openmm import unit
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import InfeasibleError, InputError, KconsError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, KconsError
 from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.carried.callbacks import (
-    CARRY_SCALE,
     LIVE,
     LOW_SCALE,
     PHASES,
@@ -30,23 +28,23 @@ from kcons.openmm.carried.callbacks import (
     cell_of,
     force_name,
 )
+from kcons.openmm.carried.passage import CARRY_SCALE, hands_over_all
 from kcons.openmm.carried.requirements import (
     free_groups,
     masses_of,
     nanometers,
     refuse_agents,
+    refuse_shared_atoms,
     refuse_single_precision,
+    refuse_some_particles,
     refuse_virtual_sites,
+    warned_of_rounding,
     with_massless_atoms,
 )
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.topology import bonds_of
-from kcons.steppers.state import START_TOLERANCE
-
-#: Rounding of positions, relative to the shortest row, that a run begins to show.
-COARSE = 1e-11
 
 
 class CarriedConstraints(Part):
@@ -133,7 +131,11 @@ class CarriedConstraints(Part):
                 f"the System carries {len(keys) or 'no'} sets of rows of kcons; expected one", item="system"
             )
         part = object.__new__(cls)
-        part._bind(LIVE[keys[0]], [found[force_name(phase, keys[0])].getForceGroup() for phase in PHASES])
+        mine = [found[force_name(phase, keys[0])] for phase in PHASES]
+        if hands_over_all():
+            for force in mine:
+                force.setParticles([])
+        part._bind(LIVE[keys[0]], [force.getForceGroup() for force in mine])
         part.alone = system.getNumConstraints() == 0
         return part
 
@@ -143,7 +145,7 @@ class CarriedConstraints(Part):
         engine = self._engine
         for phase in PHASES:
             force = openmm.PythonForce(Callback(engine, phase))
-            if not engine.whole:
+            if not (engine.whole or hands_over_all()):
                 force.setParticles(engine.atoms.tolist())
             force.setUsesPeriodicBoundaryConditions(engine.cell is not None)
             force.setForceGroup(self._groups[phase])
@@ -191,8 +193,11 @@ class CarriedConstraints(Part):
         self._early = self.lean or getattr(program.integrator, "scheme", None) is None
 
     def take_precision(self, program: Program, precision: Precision) -> None:
-        """Refuse platforms that do not carry doubles."""
+        """Refuse single precision; what passes through OpenMM is known now."""
         refuse_single_precision(precision)
+        self._engine.take_precision(precision)
+        if f"rest{self.code}" in program.settings:
+            program.set(f"rest{self.code}", float(self._engine.carries_rest))
 
     def begin_early(self, program: Program) -> None:
         """Where x is not where the last step ended, and velocities are projected before the first drift."""
@@ -239,13 +244,16 @@ class CarriedConstraints(Part):
         self._guard(program, "project", "carried rows: solve for velocities")
         carried = f"(x-xu)*{SPEED_SCALE!r}"
         if rest:
+            program.setting(f"rest{self.code}", "1 where the rest of v matters: forces are double", 1.0)
             program.vector("v_low", "what of v was too small to be carried together with x")
             program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
         program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
         if rest:
-            program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
-            self._guard(program, "project", "carried rows: the same for the rest")
-            program.each("v", f"v+v_low+{1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)!r}*{change}", "tangent, all of it")
+            with program.when(f"rest{self.code} != 0", "all digits"):
+                program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
+                self._guard(program, "project", "carried rows: the same for the rest")
+                back = 1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)
+                program.each("v", f"v+v_low+{back!r}*{change}", "tangent, all of it")
         program.each("x", "xu", "back")
 
     # -- in a context ---------------------------------------------------------------------------
@@ -260,9 +268,9 @@ class CarriedConstraints(Part):
         UnsupportedError
             Constraints left in the System, virtual sites or a barostat that do not go together with the rows.
         """
-        system = context.getSystem()
-        refuse_single_precision(Precision.of(context))
-        self._check_system(system)
+        system, precision = context.getSystem(), Precision.of(context)
+        refuse_single_precision(precision)
+        self._check_system(system, precision)
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
         self._tell_of_rounding(x)
@@ -277,7 +285,7 @@ class CarriedConstraints(Part):
             return
         tangent = self.motion.project_velocities(x, v, time=time)
         away = np.abs(tangent - v)
-        if away.max() > START_TOLERANCE * max(np.abs(v).max(), np.abs(tangent).max()):
+        if away.max() > self._engine.passage.limits[1] * max(np.abs(v).max(), np.abs(tangent).max()):
             atom = int(np.argmax(away.max(axis=1)))
             raise InputError(
                 f"velocities violate the rows: atom {atom} moves off them with {away[atom].max():.6g} nm/ps; "
@@ -294,32 +302,28 @@ class CarriedConstraints(Part):
     def _worst(self, x: FloatArray, v: FloatArray | None, time: float) -> Miss | None:
         held = self.motion.sources[0]
         found = held.residuals(x, v, time)
-        allowed = np.maximum(START_TOLERANCE * held.scale, found.allowed)
-        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
-        if miss is not None or found.rates is None or found.speeds is None:
-            return miss
+        near, slow = self._engine.passage.limits
+        allowed = np.maximum(near * held.scale, found.allowed)
+        reach = np.abs(x[held.touched]).max(initial=0.0)
         if self._slopes is None:
             gradients = held.jacobian(x, time)
             self._slopes = np.sqrt(gradients.multiply(gradients).sum(axis=1))
+        if self._engine.rounded(x):
+            allowed += 2.0**-22 * reach * self._slopes
+        miss = Miss.worst("positions", found.sigma, allowed, held.row_name, held.row_atoms, NEAR * held.scale)
+        if miss is not None or found.rates is None or found.speeds is None:
+            return miss
         size = found.speeds + 0.1 * np.max(found.speeds, initial=0.0)
         # What is taken from v where it is carried together with x: all there is of a body at rest.
-        lost = 4 * SPEED_SCALE * np.spacing(np.abs(x[held.touched]).max(initial=0.0)) * self._slopes
-        return Miss.worst("velocities", found.rates, START_TOLERANCE * size + lost, held.row_name, held.row_atoms)
+        lost = 4 * SPEED_SCALE * self._engine.passage.grain(reach) * self._slopes
+        return Miss.worst("velocities", found.rates, slow * size + lost, held.row_name, held.row_atoms)
 
     def _tell_of_rounding(self, x: FloatArray) -> None:
-        """Warn, once, of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+        """Once."""
         held = self.motion.constraint_set
-        if self._told or held.n_rows == 0:
-            return
-        reach = float(np.abs(x[held.touched]).max())
-        if np.spacing(reach) > COARSE * float(held.scale.min()):
-            self._told = True
-            warnings.warn(
-                f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to "
-                f"{np.spacing(reach):.1g} nm; each step turns this into velocity, and the energy wanders. Move the "
-                "origin nearer",
-                stacklevel=3,
-            )
+        if not self._told and held.n_rows:
+            reach = float(np.abs(x[held.touched]).max())
+            self._told = warned_of_rounding(reach, self._engine.passage.grain(reach), float(held.scale.min()))
 
     def apply_positions(self, context: openmm.Context) -> None:
         """Bring positions onto the rows, with other bonds and angles as they are. Velocities stay as they are.
@@ -364,34 +368,27 @@ class CarriedConstraints(Part):
         v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
         return x, v, state.getTime().value_in_unit(unit.picosecond)
 
-    def _check_system(self, system: openmm.System) -> None:
+    def _check_system(self, system: openmm.System, precision: Precision) -> None:
         engine = self._engine
-        missing = {force_name(phase, engine.key) for phase in PHASES} - {
-            force.getName() for force in system.getForces()
-        }
+        forces = {force.getName(): force for force in system.getForces()}
+        missing = {force_name(phase, engine.key) for phase in PHASES} - set(forces)
         if missing:
             raise InputError(
                 "the System has no forces that carry the rows; call add_to(system), or hold(system, ...), before "
                 "the Context is made",
                 item="system",
             )
+        refuse_some_particles(forces[force_name(PHASES[0], engine.key)], precision)
         now = masses_of(system)
         if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
             raise InputError("masses have changed since the rows were built; build them again", item="masses")
         refuse_virtual_sites(system, engine.atoms, now)
-        touched = set(engine.atoms.tolist())
         if self.alone and system.getNumConstraints():
             raise InputError(
                 "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
                 item="system",
             )
-        for k in range(system.getNumConstraints()):
-            i, j, _ = system.getConstraintParameters(k)
-            if touched & {i, j}:
-                raise UnsupportedError(
-                    f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
-                    "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
-                )
+        refuse_shared_atoms(system, set(engine.atoms.tolist()))
 
     # -- results --------------------------------------------------------------------------------
 

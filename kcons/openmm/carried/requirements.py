@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,9 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.precision import Precision
+
+#: Rounding of positions, relative to the shortest row, that a run begins to show.
+COARSE = 1e-11
 
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
@@ -65,12 +69,44 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
 
 
 def refuse_single_precision(precision: Precision) -> None:
-    """GPUs hand positions to PythonForces as they keep them: exact in double precision only."""
-    if precision.name != "double":
+    """GPUs hand positions to PythonForces as they keep them."""
+    if precision.name == "single":
         raise UnsupportedError(
             f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
-            "Context with {'Precision': 'double'}, or hold the rows by CollectiveRows, which the platform computes"
+            "Context with {'Precision': 'mixed'}, or hold the rows by CollectiveRows, which the platform computes"
         )
+
+
+def refuse_some_particles(force: openmm.PythonForce, precision: Precision) -> None:
+    """Of some particles, mixed precision hands over single numbers."""
+    if precision.name == "mixed" and force.getParticles():
+        raise UnsupportedError(
+            f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
+            "that are too coarse; read the System by CarriedConstraints.of(system) before the Context is made"
+        )
+
+
+def refuse_shared_atoms(system: openmm.System, touched: set[int]) -> None:
+    """Constraints of the System are solved by OpenMM, and must not share atoms with the rows."""
+    for k in range(system.getNumConstraints()):
+        i, j, _ = system.getConstraintParameters(k)
+        if touched & {i, j}:
+            raise UnsupportedError(
+                f"constraint {k} of the System, between atoms {i} and {j}, shares an atom with the rows; let "
+                "kcons hold it too: hold(system, ...) moves such constraints, or add take_constraints(system)"
+            )
+
+
+def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
+    """Warn of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+    if grain <= COARSE * scale:
+        return False
+    warnings.warn(
+        f"held particles are {reach:.3g} nm from the origin, where OpenMM rounds positions to {grain:.1g} nm; each "
+        "step turns this into velocity, and the energy wanders. Move the origin nearer",
+        stacklevel=4,
+    )
+    return True
 
 
 def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:

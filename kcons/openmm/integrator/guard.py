@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import openmm
+from numpy.typing import NDArray
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
@@ -144,7 +146,7 @@ class Guard:
             return
         miss = np.abs(self.rows.stretches(x))
         limit = self.limit(x)
-        if np.median(miss / limit) <= 1:  # few molecules cross the faces of the box at a time
+        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
             limit = self.limit(x, wrapped=True)
         excess = miss / limit
         row = int(np.argmax(excess))
@@ -410,6 +412,26 @@ class Guard:
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
         return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
+    """Whether what is off may be molecules that were just moved back into the box: few of them cross a face at a time.
+
+    Parameters
+    ----------
+    context : openmm.Context
+    first : ndarray of int, shape (n_rows,)
+        A particle of each row.
+    off : ndarray of bool, shape (n_rows,)
+        Rows that are off.
+    """
+    if not off.any():
+        return False
+    of_particle = np.zeros(context.getSystem().getNumParticles(), dtype=np.int64)
+    for number, molecule in enumerate(context.getMolecules()):
+        of_particle[list(molecule)] = number
+    molecules = of_particle[first]
+    return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:

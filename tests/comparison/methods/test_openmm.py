@@ -221,7 +221,7 @@ def test_force_evaluations_are_counted_right(counted, name):
     assert run.own_evaluations() <= made <= run.own_evaluations() + 2
 
 
-def test_floor_repeats_its_first_step(rotor):
+def test_baseline_repeats_its_first_step(rotor):
     run = methods.METHODS["openmm-free"].start(rotor, 0.1)
     ends = []
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Scenes start on their constraints, know their solution, and offer every MD engine the same forces."""
+"""Test systems start on their constraints, know their solution, and offer every MD engine the same forces."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from kcons.steppers import State, System, run
 from tests.contracts.test_reference_orders import EPS, sensitivities
 from tests.reference import cases
 
-#: Scenes that are stored reference cases, solved with 45 digits in minimal coordinates or closed form.
+#: Test systems that are stored reference cases, solved with 45 digits in minimal coordinates or closed form.
 STORED = {
     "butane": "A07_butane_bonds_angles_fixed",
     "dumbbells": "A05_two_dumbbells_lj",
@@ -415,7 +415,7 @@ def test_atoms_carry_the_scene(name):
 @pytest.mark.parametrize(
     ("name", "size", "options", "text"),
     [
-        ("waters", None, {}, "there is no scene 'waters'; there are water"),
+        ("waters", None, {}, "there is no test system 'waters'; there are water"),
         ("water", 3, {}, "too small"),
         ("water", 8, {"forces": "x"}, "no forces 'x' for water"),
         ("chain", 0, {}, "at least one bond"),

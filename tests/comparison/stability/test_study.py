@@ -164,5 +164,5 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
 
 
 def test_a_scene_that_is_not_there():
-    with pytest.raises(InputError, match="no scene 'methane'"):
+    with pytest.raises(InputError, match="no test system 'methane'"):
         run(only=["drift"], scenes=["methane"], quick=True)

@@ -52,7 +52,7 @@ def test_front_has_what_nothing_dominates():
     assert fronts.front([b, dominated, a, cheap], "wall") == [cheap, a, b]
 
 
-def test_front_takes_errors_as_one_below_the_floor_and_within_five_percent():
+def test_front_takes_errors_as_one_below_the_resolution_and_within_five_percent():
     a = point("rattle", "kcons RATTLE", 1e-8, 10, 1.0)
     b = point("rattle", "kcons RATTLE", 1e-9, 20, 2.0)
     assert fronts.front([a, b], "wall", 1e-7) == [a]
@@ -89,7 +89,7 @@ def test_what_is_more_accurate_than_anything_of_kcons_is_a_loss():
     assert "nothing of kcons was measured" in fronts.sentence(loss, "Å")
 
 
-def test_below_the_floor_of_the_reference_nothing_is_lost():
+def test_below_the_resolution_of_the_reference_nothing_is_lost():
     peer = point("dop853", "SciPy DOP853", 1e-6, 1e5, 1e5)
     assert fronts.verdict(comparison(*RATTLE, peer, reference=1e-4)).losses == []
 
@@ -145,10 +145,10 @@ def test_hosts_are_judged_by_themselves():
     assert [loss.method for loss in standings[fronts.EVERY_HOST, "evaluations"].losses] == ["openmm-verlet"]
 
 
-def test_floors_and_failures_are_no_points():
-    floor = point("verlet", "floor", None, 10, 0.1, status="floor")
+def test_baselines_and_failures_are_no_points():
+    baseline = point("verlet", "baseline", None, 10, 0.1, status="baseline")
     failed = point("dop853", "SciPy DOP853", None, 10, 0.1, status="failed")
-    assert fronts.points(comparison(*RATTLE, floor, failed), "wall") == list(RATTLE)
+    assert fronts.points(comparison(*RATTLE, baseline, failed), "wall") == list(RATTLE)
 
 
 def test_many_losses_in_one_sentence():
@@ -173,9 +173,9 @@ def test_evaluations_decide_on_a_host_that_computes_forces_in_no_time():
     ours = point("openmm-rattle", "OpenMM + kcons compiled RATTLE, 1e-12", 1e-3, 100, 2e-5)
     theirs = point("openmm-verlet", "OpenMM Verlet, 1e-5", 1e-3, 100, 1e-5)
     arrays = (point("rattle", "kcons RATTLE", 1e-3, 100, 1.0), point("shake-1e-8", "SHAKE", 1e-3, 100, 0.9))
-    for floor_step, decides, losses in ((2e-7, "evaluations", 0), (2e-6, "wall", 1)):
-        floor = point("openmm-free", "floor", None, 100, 1e-5, status="floor", step_seconds=floor_step)
-        found = fronts.verdict(comparison(ours, theirs, floor, *arrays, force=1e-5, margin=0.05))
+    for baseline_step, decides, losses in ((2e-7, "evaluations", 0), (2e-6, "wall", 1)):
+        baseline = point("openmm-free", "baseline", None, 100, 1e-5, status="baseline", step_seconds=baseline_step)
+        found = fronts.verdict(comparison(ours, theirs, baseline, *arrays, force=1e-5, margin=0.05))
         assert found.decides_on("OpenMM") == decides
         assert found.decides_on("arrays") == "wall"
         assert [loss.host for loss in found.losses if loss.host == "OpenMM"] == ["OpenMM"] * losses

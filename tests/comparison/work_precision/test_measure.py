@@ -34,7 +34,7 @@ def spheres():
 def test_all_methods_are_there(chain, result):
     usual = [method.name for method in methods.usual(chain)]
     assert list(dict.fromkeys(m.method for m in result.measurements)) == usual
-    assert {m.status for m in result.measurements} == {"ok", "floor"}
+    assert {m.status for m in result.measurements} == {"ok", "baseline"}
 
 
 @pytest.mark.parametrize("method", ["rattle", "ase-kcons", "ase-bonds"])
@@ -91,26 +91,26 @@ def test_adaptive_method_gets_better_with_its_tolerance(spheres):
     assert spheres.observed_order("dop853") is None
 
 
-def test_floor_states_no_error(result):
+def test_baseline_states_no_error(result):
     for name in ("verlet", "ase-verlet"):
-        (floor, *_) = result.of(name, "floor")
-        assert floor.error is None
-        assert floor.step_seconds > 0
+        (baseline, *_) = result.of(name, "baseline")
+        assert baseline.error is None
+        assert baseline.step_seconds > 0
 
 
 @pytest.mark.parametrize("name", ["verlet", "ase-verlet"])
-def test_floor_repeats_its_first_step_for_one_evaluation_each(chain, name):
-    floor = methods.METHODS[name].start(chain, chain.time_steps[0])
+def test_baseline_repeats_its_first_step_for_one_evaluation_each(chain, name):
+    baseline = methods.METHODS[name].start(chain, chain.time_steps[0])
     ends = []
     for _ in range(3):
-        floor.rewind()
+        baseline.rewind()
         before = chain.potential.evaluations
-        floor.advance()
+        baseline.advance()
         assert chain.potential.evaluations == before + 1
-        ends.append(floor.positions)
+        ends.append(baseline.positions)
     np.testing.assert_array_equal(ends[0], ends[1])
     np.testing.assert_array_equal(ends[0], ends[2])
-    assert floor.time == pytest.approx(3 * chain.time_steps[0])
+    assert baseline.time == pytest.approx(3 * chain.time_steps[0])
     # x + v dt + f dt^2/2m: nothing is held.
     dt = chain.time_steps[0]
     kick = chain.potential.forces(chain.positions) / chain.masses[:, None]
@@ -225,7 +225,7 @@ def test_bad_arguments(chain, options, text):
         measure.compare(chain, **options)
 
 
-# -- every small scene ------------------------------------------------------------------------------
+# -- every small test system ------------------------------------------------------------------------------------
 
 PIVOT, SURFACE, TIME = "the pivot is a point", "ASE has no constraint that holds an atom on", "cannot move"
 REFUSED = {

@@ -54,7 +54,7 @@ ROWS = (
     measured(method="ase-bonds", title="peer", setting=1.0, status="not run", error=None, note="too slow"),
     measured(method="ase-internals", title="other", status="failed", error=None, note="step 3: RuntimeError: oh"),
     measured(method="dop853", title="scipy", adaptive=True, setting=1e-5, error=1e-6),
-    measured(method="verlet", title="floor", status="floor", error=None, constraint_seconds=None),
+    measured(method="verlet", title="baseline", status="baseline", error=None, constraint_seconds=None),
 )
 
 
@@ -170,7 +170,7 @@ def test_plot_has_both_panels_with_units():
     assert list(curves["kcons RATTLE"].get_ydata()) == [1.25e-3, 3.126e-4]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "scipy" in labels
-    assert any(label.startswith("floor") for label in labels)
+    assert any(label.startswith("baseline") for label in labels)
     assert any("stopped for the budget" in label for label in labels)
     # Methods differ in colour and marker.
     assert len({colour for colour, _ in report.STYLES.values()}) == len(report.STYLES)
@@ -190,7 +190,7 @@ def test_methods_differ_in_colour_and_marker(monkeypatch):
     hosted = [styles[name][1] for name in known if name.startswith("openmm")]
     rest = [styles[name][1] for name in [*known, *others] if name not in known or not name.startswith("openmm")]
     assert len(set(hosted)) == len(hosted)
-    assert len(set(rest)) == len(rest) - 1  # both floors have the same
+    assert len(set(rest)) == len(rest) - 1  # both baselines have the same
     assert report.style("unheard of") == ("black", "x")
 
 

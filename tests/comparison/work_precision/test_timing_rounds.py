@@ -15,7 +15,7 @@ from kcons.comparison.methods.peers import lammps_shake, shake
 from kcons.comparison.work_precision import measure
 from kcons.comparison.work_precision.measurement import Measurement
 from kcons.comparison.work_precision.timing_rounds import (
-    FLOOR_BLOCK,
+    BASELINE_BLOCK,
     FULL_ROUNDS,
     QUICK_ROUNDS,
     WARM_STEPS,
@@ -202,7 +202,7 @@ def measurement(**more):
 
 @pytest.mark.parametrize(
     ("step_seconds", "holds", "warm", "block"),
-    [(1e-6, True, WARM_STEPS, 120), (1.0, True, 1, 120), (1e-6, False, WARM_STEPS, FLOOR_BLOCK)],
+    [(1e-6, True, WARM_STEPS, 120), (1.0, True, 1, 120), (1e-6, False, WARM_STEPS, BASELINE_BLOCK)],
 )
 def test_warm_first_and_every_pass_from_the_start(step_seconds, holds, warm, block):
     run = Noted()

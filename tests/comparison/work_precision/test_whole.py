@@ -22,7 +22,7 @@ from kcons.errors import InputError
 
 TINY = (
     Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
-    Item("gone", "A scene of the future", "no such scene", seconds=1),
+    Item("gone", "A later test system", "no such scene", seconds=1),
     Item("sphere", "Spheres", "sphere", 1, budget=5, seconds=1, quick_seconds=0),
     Item("later", "A part of the future", module="kcons.no_such_module", seconds=1),
 )
@@ -111,7 +111,7 @@ def test_numbers_come_back_as_they_were(finished):
 
 
 def test_what_cannot_be_run_is_said(finished):
-    assert whole.read(finished, "gone")["not run"] == "this version of kcons has no scene 'no such scene'"
+    assert whole.read(finished, "gone")["not run"] == "this version of kcons has no test system 'no such scene'"
     assert "kcons.no_such_module" in whole.read(finished, "later")["not run"]
 
 
@@ -136,7 +136,7 @@ def test_page_is_one_file_with_everything(finished):
     assert not {"script", "iframe", "object", "embed", "form"} & set(page.tags)
     assert "url(" not in source and "@import" not in source
     assert page.tags.count("img") == 2
-    for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A scene of the future", "not run: this version"):
+    for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A later test system", "not run: this version"):
         assert text in page.text
     environment = whole.read(finished, "sphere")["environment"]
     assert environment["cpu"] in page.text
@@ -147,7 +147,7 @@ def test_page_is_one_file_with_everything(finished):
 def test_winners_name_host_and_gain(finished):
     table = whole_page.winners(whole.parts(finished))
     cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
-    (sphere,) = [row for row in cells if row["scene"] == "Spheres"]
+    (sphere,) = [row for row in cells if row["test system"] == "Spheres"]
     assert sphere["decided by"] == "force evaluations" and sphere["over"] == "SciPy DOP853 on eq. 105"
     # Where times decide, how well they repeat is said.
     margins = {
@@ -157,10 +157,10 @@ def test_winners_name_host_and_gain(finished):
     }
     for row in cells:
         by_time = row["decided by"] == "wall time"
-        assert row["times repeat to"] == (f"{100 * margins[row['scene']]:.0f} %" if by_time else "")
+        assert row["times repeat to"] == (f"{100 * margins[row['test system']]:.0f} %" if by_time else "")
     assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
     text = tables.markdown(table.of((0, 1, 4)))
-    assert text.splitlines()[0] == "| scene | MD engine | gain |"
+    assert text.splitlines()[0] == "| test system | MD engine | gain |"
     assert text.splitlines()[1] == "| --- | --- | ---: |"
     assert len(text.splitlines()) == 2 + len(table.rows)
 
@@ -275,8 +275,8 @@ def test_command(tmp_path, capsys):
     ("arguments", "text"),
     [
         (["compare", "--all", "--only", "nothing"], "no part 'nothing'"),
-        (["compare", "chain", "--all"], "--all runs all scenes"),
-        (["compare", "--all", "--target-error", "1e-6"], "--all runs all scenes"),
+        (["compare", "chain", "--all"], "--all runs all test systems"),
+        (["compare", "--all", "--target-error", "1e-6"], "--all runs all test systems"),
     ],
 )
 def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
@@ -293,7 +293,7 @@ def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, 
     assert whole_page.fill(page, parts_of_the_whole) == [page, tmp_path / "figures" / "report-sphere.png"]
     first = page.read_text(encoding="utf-8")
     assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
-    assert "| scene | MD engine | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
+    assert "| test system | MD engine | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
     assert "full run" in first
     whole_page.fill(page, parts_of_the_whole)
     assert page.read_text(encoding="utf-8") == first

@@ -10,9 +10,10 @@ import openmm
 import pytest
 from openmm_systems import GPUS, PLATFORMS, alanine, context_of, loose_alanine, residuals, started, state_of, water_box
 
-from kcons.constraints import Distance, Sphere, Torus
+from kcons.constraints import Angle, Dihedral, Distance, Sphere, Torus
 from kcons.errors import CertificateError, ConvergenceError, UnsupportedError
 from kcons.openmm import (
+    CarriedConstraints,
     CollectiveRows,
     ExpressionSurface,
     Isokinetic,
@@ -28,6 +29,8 @@ from kcons.openmm.integrator.system_checks import SystemRows
 from kcons.openmm.surfaces.formulas import ImplicitRows
 
 gpus = pytest.mark.parametrize("platform", GPUS)
+more_than_single = pytest.mark.parametrize("platform", [p for p in GPUS if "single" not in str(p.id)])
+mixed = pytest.mark.parametrize("platform", [p for p in GPUS if str(p.id).endswith(("mixed", "none"))])
 #: Half a femtosecond, so that what is seen is rounding.
 STEP = 5e-4
 INTEGRATORS = {
@@ -302,16 +305,93 @@ def test_a_tolerance_that_forces_do_not_have_is_named(platform):
     del context
 
 
+# -- rows of constraint objects ---------------------------------------------------------------------
+
+
 @gpus
-def test_rows_of_constraint_objects_need_doubles(platform):
+def test_rows_of_constraint_objects_need_more_than_single_numbers(platform):
     precision = Precision(*platform.split())
     system, x, v = free_alanine()
     integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
     context = started(system, integrator, x, v, platform)
-    if precision.name == "double":
+    if precision.name != "single":
         integrator.step(5)
         integrator.check()
     else:
-        with pytest.raises(UnsupportedError, match="'Precision': 'double'"):
+        with pytest.raises(UnsupportedError, match="'Precision': 'mixed'"):
             integrator.step(1)
         np.testing.assert_allclose(state_of(context)[0], x, atol=1e-6)
+
+
+@more_than_single
+@pytest.mark.parametrize(
+    ("some", "kind"),
+    [(True, {}), (False, {"scheme": "suzuki4"}), (True, {"ensemble": Isokinetic(300, momentum="free")})],
+    ids=["rattle", "suzuki4", "isokinetic"],
+)
+def test_constraint_objects_are_held_in_mixed_precision(some, kind, platform):
+    """Bonds, angles and a dihedral at 2 fs to what single numbers leave of a correction, 1e-9; doubles to rounding."""
+    precision = Precision(*platform.split())
+    system, x, v = free_alanine()
+    rows = [Distance([[4, 5], [4, 6], [6, 7], [6, 8]]), Angle([[5, 4, 6], [4, 6, 8]]), Dihedral([[6, 8, 14, 16]])]
+    if not some:
+        rows.append(Distance([[k, k + 1] for k in (0, 9, 12, 18, 20)]))
+    part = hold(system, rows, x)
+    integrator = ProjectedIntegrator(2e-3, parts=[part], check_every=20, **kind)
+    context = started(system, integrator, x, v, platform)
+    held = part.motion.constraint_set
+    for _ in range(10):
+        integrator.step(10)
+        y, w = state_of(context)
+        assert np.abs(held.value(y)).max() < (1e-9 if precision.name == "mixed" else 1e-13)
+        assert np.abs(held.jacobian(y) @ w.ravel()).max() < (1e-6 if precision.name == "mixed" else 1e-12)
+    integrator.check()
+
+
+@more_than_single
+@pytest.mark.parametrize("periodic", [None, False])
+def test_carried_molecules_that_cross_a_face_of_the_box_are_no_failure(periodic, platform, caplog):
+    """As those of OpenMM: rounded to single numbers at the face, held to 1e-9 nm again one step later."""
+    precision = Precision(*platform.split())
+    system, x, v = water()
+    part = hold(system, [], x, take="all", keep_water=False, periodic=periodic)
+    integrator = ProjectedIntegrator(STEP, parts=[part], check_every=7)
+    context = started(system, integrator, x, v + np.array([40.0, 0.0, 0.0]), platform)
+    off = []
+    for _ in range(60):
+        integrator.step(10)
+        off.append(np.abs(part.motion.constraint_set.value(state_of(context)[0])).max())
+    assert np.median(off) < 1e-9
+    assert max(off) < (1e-6 if precision.name == "mixed" else 1e-13)
+    assert not caplog.records
+
+
+@mixed
+def test_a_system_made_where_no_gpu_was_is_made_fit_by_reading_it(platform, monkeypatch):
+    """Only mixed precision hands over less of some particles than of all."""
+    system, x, v = free_alanine()
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr("kcons.openmm.carried.carried_constraints.hands_over_all", lambda: False)
+        part = hold(system, Distance([4, 14]), x)
+    context = started(system, ProjectedIntegrator(STEP, parts=[part]), x, v, platform)
+    with pytest.raises(UnsupportedError, match=r"CarriedConstraints.of\(system\)"):
+        context.getIntegrator().step(1)
+    again = ProjectedIntegrator(STEP, parts=[CarriedConstraints.of(system)])
+    context = started(system, again, x, v, platform)
+    again.step(20)
+    assert np.abs(part.motion.constraint_set.value(state_of(context)[0])).max() < 1e-9
+
+
+def test_some_particles_or_all_are_the_same_motion(monkeypatch):
+    """What callbacks are given does not change a bit of what is computed."""
+    ends = []
+    for every in (False, True):
+        monkeypatch.setattr("kcons.openmm.carried.carried_constraints.hands_over_all", lambda every=every: every)
+        system, x, v = free_alanine()
+        integrator = ProjectedIntegrator(STEP, parts=[hold(system, Distance([4, 14]), x)])
+        context = started(system, integrator, x, v)
+        force = system.getForce(system.getNumForces() - 1)
+        assert len(force.getParticles()) == (0 if every else 2)
+        integrator.step(20)
+        ends.append(np.concatenate(state_of(context)))
+    np.testing.assert_array_equal(*ends)

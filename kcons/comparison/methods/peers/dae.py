@@ -195,7 +195,7 @@ class Dae(Method):
     package, module : str
         What to install, and what it is then called.
     make : callable
-        A run from the scene and the tolerance.
+        A run from the test system and the tolerance.
     """
 
     package: str = "scipy-dae"

@@ -1,4 +1,4 @@
-"""LAMMPS' fix shake and fix rattle, through its Python interface, with the scene's forces by fix external.
+"""LAMMPS' fix shake and fix rattle, through its Python interface, with the test system's forces by fix external.
 
 Both hold small clusters only: a centre with up to three partners, or a triangle with two equal sides (rigid water).
 LAMMPS runs in its units `lj`, in which every constant is 1, in a box without periodic boundaries: the forces know them.
@@ -191,7 +191,7 @@ class _LammpsRun(Steps):
 
 
 def by_tag(lammps: Any, what: str, count: int) -> FloatArray:
-    """Positions 'x' or velocities 'v' in the order of the scene, shape (count, 3)."""
+    """Positions 'x' or velocities 'v' in the order of the test system, shape (count, 3)."""
     found = np.empty((count, 3))
     found[lammps.numpy.extract_atom("id")[:count] - 1] = lammps.numpy.extract_atom(what)[:count]
     return found

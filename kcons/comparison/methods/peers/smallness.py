@@ -19,7 +19,7 @@ MOST_ATOMS, MOST_ROWS = 40, 60
 
 
 def too_much(scene: Scene) -> str | None:
-    """Why a dense solver cannot run the scene, or None."""
+    """Why a dense solver cannot run the test system, or None."""
     held = scene.constraint_set
     if held.moving:
         return "its constraints cannot move"
@@ -43,7 +43,7 @@ def one_thread(after: str) -> None:
 
 
 def plain_set(scene: Scene) -> ConstraintSet:
-    """What the scene holds as independent rows, by distances alone where that is the same."""
+    """What the test system holds as independent rows, by distances alone where that is the same."""
     if scene.bonds is None or len(scene.fixed) or scene.cell is not None:
         return independent_rows(scene)
     held = ConstraintSet(Distance(scene.bonds), scene.positions, scene.masses)

@@ -148,7 +148,8 @@ class LengthTable:
         n = len(block.words)
         side, place = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
         far = np.full(n, np.float32(np.nan).view(np.int32))
-        here = slice(k, k + n)
+        # Of its own, so that the kernel gets one type of array in one frame and in many.
+        by_frame = np.zeros((6, n))
         done = look_at(
             block.words,
             block.x,
@@ -159,10 +160,11 @@ class LengthTable:
             (0.0, *coefficients),
             self._triangles,
             self._singles,
-            (into.by_frame[0, :, here], side, place, far),
+            (by_frame, side, place, far),
         )
+        into.by_frame[0, :, k : k + done] = by_frame[:, :done]
         into.seen[0, k : k + done] -= self._filling
-        into.worst_row[0, here] = np.where(
+        into.worst_row[0, k : k + n] = np.where(
             side < 0, _row_of(self._single_rows, place), _row_of(self._triangle_rows, place, side)
         )
         return done, size_of(far)
