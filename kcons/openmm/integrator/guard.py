@@ -374,7 +374,7 @@ class Guard:
     def _remember(self, now: openmm.State) -> None:
         self.since_check = self._put_off = 0
         self._checked = perf_counter()
-        self._good = now
+        self._good, self._memory = now, self.integrator.program.remembered()
 
     def put_back(self) -> None:
         """The state that was checked last."""
@@ -385,8 +385,8 @@ class Guard:
             context.setVelocities(good.getVelocities(asNumpy=True))
             context.setTime(good.getTime())
             context.setStepCount(good.getStepCount())
-            self.since_check = 0
-            self.disturbed = False
+            self.integrator.program.recall(self._memory)
+            self.since_check, self.disturbed = 0, False
             self.integrator.refresh()
 
     def explosion(self, words: str, step: int) -> NonFiniteError:

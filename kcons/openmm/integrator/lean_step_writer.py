@@ -48,7 +48,8 @@ class LeanStepWriter(StepWriter):
         self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = self.ensemble.adds_up and not self.parts and isinstance(self.scheme, Rattle)
-        self.lazy = self.lean or self.joined or (self.scheme is None and not self.parts)
+        owing = self.ensemble.owes and not self.parts
+        self.lazy = self.lean or self.joined or owing or (self.scheme is None and not self.parts)
         self.observed = 2 if self.lean else 1
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:

@@ -49,7 +49,7 @@ VARIABLES = {
     # what was left out, and what is known
     "between": Variable("control", "1 if nobody looks at the velocities after this step"),
     "lean": Variable("control", "1 where v may do without half a kick between steps"),
-    "behind": Variable("number", "1 where v (or raw, where a call has ended) lacks half a kick"),
+    "behind": Variable("number", "1 where v (or raw, where a call has ended) lacks what ends a step"),
     "led": Variable("number", "the same when the last drift began"),
     "looked": Variable("number", "1 if somebody may have looked since the last step", 1.0),
     "moving": Variable("control", "1 where barostats may move x between steps"),

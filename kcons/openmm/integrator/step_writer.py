@@ -78,6 +78,7 @@ class StepWriter:
         h = "(0.5*dt)" if self.halves else "dt"
         with p.when("phase != 2", "up to the new positions"):
             p.let_others_act()
+            self.ensemble.open(p)
             if kicks[0]:
                 self._kick(_of_dt(kicks[0]), tangent=True)
             if self.halves:
@@ -90,6 +91,7 @@ class StepWriter:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
             if self.scheme is not None and not self._ends_tangent:
                 self._project()
+            self.ensemble.close(p)
 
     def _write_plain_loop(self) -> None:
         p, n = self.program, len(self.drifts)
@@ -100,6 +102,7 @@ class StepWriter:
         p.let("stop", f"select(phase, min(phase, {n}), {n})", "where to stop")
         with p.when("stage = 0", "a step begins"):
             p.let_others_act()
+            self.ensemble.open(p)
         # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
         with p.loop("stage < stop", "all drifts and kicks of the scheme"):
             with p.when("kick_share(stage) != 0", "a kick comes first"):
@@ -112,6 +115,7 @@ class StepWriter:
                 self._kick(_of_dt(self.kicks[-1]))
             if not self._ends_tangent:
                 self._project()
+            self.ensemble.close(p)
 
     # -- a step that is taken back when a part fails --------------------------------------------
 
@@ -150,6 +154,7 @@ class StepWriter:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
             p.each("v_last", "v", "to come back to")
+            self.ensemble.open(p)
             if self.kicks[0]:
                 self._kick("dt*kick_share(first_stage)", tangent=True)
             p.let("stage", "first_stage", "first drift")
@@ -174,12 +179,14 @@ class StepWriter:
                         self._kick_after("per_h*(x-xu)")
                     if not self._ends_tangent:
                         self._project()
+                    self.ensemble.close(p)
                     p.let("good_steps", "good_steps+delta(failed)", "count it")
                     if self.kept:
                         p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
             with p.when("failed != 0", "a solve failed"):
                 p.each("x", "x_last", "back to where the step began")
                 p.each("v", "v_last", "back to where the step began")
+                self.ensemble.take_back(p)
                 p.let("stale", "1", "forces are those of elsewhere")
 
     def _write_single(self) -> None:
