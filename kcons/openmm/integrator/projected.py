@@ -18,6 +18,7 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.states.calls import Calls
 from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
 from kcons.openmm.integrator.states.hearing import listen
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
@@ -27,7 +28,7 @@ from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 
-class ProjectedIntegrator(StatesOnConstraints, Settings):
+class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -47,7 +48,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
         'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator, for Systems with virtual sites.
+        openmm.VerletIntegrator.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional
@@ -193,76 +194,6 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         assert self._guard is not None
         return self._guard
 
-    def step(self, steps: int) -> None:
-        """Make `steps` steps.
-
-        Raises
-        ------
-        KconsError
-            A solve of one of the parts failed: positions, velocities, time and step count are those before that
-            step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
-            check failed, or a NaN appeared: they are those of the last check.
-        InputError, UnsupportedError
-            At the first step: the System cannot be propagated, or the start is not on the constraints.
-        """
-        guard = self._watch()
-        if guard.disturbed:
-            guard.begin()
-        if self._plan.kept and guard.surroundings_changed():
-            self.refresh()
-        guard.meet_others()
-        while steps > 0:
-            block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
-            self._run_block(guard, block)
-            guard.count(block)
-            steps -= block
-        guard.leave()
-        if self._plan.kept:
-            guard.note_surroundings()
-
-    def _run_block(self, guard: Guard, steps: int) -> None:
-        """Where the program can do less in steps whose end nobody looks at, let it."""
-        unseen = steps - self._plan.observed if self._plan.lazy else 0
-        if self._plan.lean:
-            self.program.write("lean", guard.undisturbed)
-            self.program.write("moving", guard.moving)
-        if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
-            self.program.write("between", 1.0)
-            try:
-                self._run(guard, unseen)
-            finally:
-                self.program.write("between", 0.0)
-            steps -= unseen
-        self._run(guard, steps)
-
-    def _run(self, guard: Guard, steps: int) -> None:
-        context = guard.context
-        time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
-        before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
-        for part in self.parts:
-            part.begin_run()
-        try:
-            super().step(steps)
-        except openmm.OpenMMException as error:
-            guard.put_back()
-            if "NaN" not in str(error):
-                raise
-            raise guard.explosion(str(error), first) from error
-        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
-        done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
-        # OpenMM's clock goes on with the first step size after setStepSize.
-        expected = time + done * self._dt
-        if code or abs(context.getTime().value_in_unit(unit.picosecond) - expected) > 1e-6 * self._dt:
-            context.setTime(expected)
-        if code:
-            context.setStepCount(first + done)
-            guard.since_check += done
-            failure = self._failure(code, first + done + 1)
-            if self._plan.lean and self.getGlobalVariableByName("loose"):
-                self.program.write("between", 0.0)
-                self.applyVelocityConstraints(context)
-            raise failure
-
     def _failure(self, code: int, step: int) -> KconsError:
         error = self.parts[code - 1].failure(self, step)
         self.program.write("failed", 0.0)
@@ -361,7 +292,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         program.write("first_stage", first)
         program.write("end_stage", end)
         try:
-            super().step(1)
+            openmm.CustomIntegrator.step(self, 1)
         finally:
             for name in ("first_stage", "end_stage"):
                 program.write(name, (program.settings | program.idle)[name])

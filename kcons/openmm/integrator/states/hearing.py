@@ -11,6 +11,8 @@ kcons, alone or within a CompoundIntegrator; for all others they do what they di
 * `Context.getState`: groups that carry rows are no part of energy and forces, unless asked for.
 * `LocalEnergyMinimizer.minimize`: knows no parts, so that `minimizeEnergy` of the integrator takes its place.
 * `updateParametersInContext` of all Forces: forces that were kept are old.
+* `Simulation.step`, `runForClockTime`: nobody sees the end of a call of `step` within them (see `calls`), and what an
+  integrator has put off there is made before the Context answers.
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ from collections.abc import Callable
 from typing import Any
 
 import openmm
+from openmm import app
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.states.calls import settle
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -207,6 +211,22 @@ def _update_parameters(original: Callable[..., None], force: openmm.Force, conte
             one.refresh()
 
 
+# -- Simulations ------------------------------------------------------------------------------------
+
+
+def _in_simulation(original: Callable[..., None], simulation: app.Simulation, *args: Any, **kwargs: Any) -> None:
+    context = simulation.context
+    heard = listeners(context)
+    for one in heard:
+        one.unseen = True
+    try:
+        original(simulation, *args, **kwargs)
+    finally:
+        for one in heard:
+            one.unseen = False
+        settle(context)
+
+
 # -- wrapping ---------------------------------------------------------------------------------------
 
 
@@ -214,6 +234,15 @@ def _wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable
     @functools.wraps(original)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         return call(original, *args, **kwargs)
+
+    return wrapper
+
+
+def _settled(original: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def wrapper(context: openmm.Context, *args: Any, **kwargs: Any) -> Any:
+        settle(context)
+        return original(context, *args, **kwargs)
 
     return wrapper
 
@@ -243,6 +272,10 @@ def _wrap_all() -> None:
     }
     for name, call in calls.items():
         setattr(openmm.Context, name, _wrapped(getattr(openmm.Context, name), call))
+    for name in (*calls, "getStepCount", "getTime", "setStepCount", "setParameter", "computeVirtualSites"):
+        setattr(openmm.Context, name, _settled(getattr(openmm.Context, name)))
+    for name in ("step", "runForClockTime"):
+        setattr(app.Simulation, name, _wrapped(getattr(app.Simulation, name), _in_simulation))
     minimizer = openmm.LocalEnergyMinimizer
     minimizer.minimize = staticmethod(_wrapped(minimizer.minimize, _minimize))
     for kind in vars(openmm).values():
