@@ -1,4 +1,4 @@
-"""An integrator's view of the Context it belongs to: checks before and during a run, and the way back."""
+"""Checks of an integrator on its Context, before and during a run, and the return to the last good state."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Guard:
         self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
-        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
         self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
         #: Whether the set-up was checked.
         self.started = False
@@ -364,8 +364,8 @@ class Guard:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
         if miss is not None:
             raise CertificateError(
-                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
-                "step, or see what changed the state or the rows behind their back",
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers reported success; take a smaller time "
+                "step, or find what else changed the state or the constraints",
                 row=miss.row,
                 residual=abs(miss.off),
                 atoms=miss.atoms,
