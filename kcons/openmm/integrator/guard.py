@@ -24,6 +24,7 @@ from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
     forces_of,
+    parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
@@ -83,10 +84,10 @@ class Guard:
     """
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context = weakref.ref(context)
-        self._integrator = weakref.ref(integrator)
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
-        check_system(self.system, leapfrog=integrator.scheme is None)
+        check_system(self.system)
+        self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.precision = Precision.of(context)
         integrator.take_precision(self.precision)
@@ -333,8 +334,8 @@ class Guard:
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
         """
-        context, integrator = self.context, self.integrator
-        step, begun = context.getStepCount(), perf_counter()
+        context, integrator, begun = self.context, self.integrator, perf_counter()
+        step = context.getStepCount()
         try:
             integrator.ensemble.verify(integrator)
             now = context.getState(positions=True, velocities=True)
