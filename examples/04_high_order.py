@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kcons import ConstraintSet
-from kcons.comparison import METHODS, CoreStepper, json_files, measure, scenes
+from kcons.comparison import METHODS, CoreStepper, json_files, measure, test_systems
 from kcons.constraints import Sphere
 from kcons.errors import KconsError
 from kcons.motion import Motion
@@ -43,11 +43,13 @@ ENERGY_STEPS, ENERGY_TIME = {True: (0.1, 0.01), False: (0.1,)}, {True: 1000.0, F
 # -- work and precision ---------------------------------------------------------------------------
 
 
-def curve(scene: scenes.Scene, reference: scenes.Reference, name: str, full: bool) -> list[dict[str, float]]:
+def curve(
+    test_system: test_systems.TestSystem, reference: test_systems.Reference, name: str, full: bool
+) -> list[dict[str, float]]:
     """Step, force evaluations and error, from coarse to fine."""
     method = METHODS[name]
     assert isinstance(method, CoreStepper)
-    system = System(scene.motion, scene.potential.forces)
+    system = System(test_system.motion, test_system.potential.forces)
     cost = method.stepper.force_evaluations
     found: list[dict[str, float]] = []
     # From point to point, evaluations grow by this factor.
@@ -59,14 +61,14 @@ def curve(scene: scenes.Scene, reference: scenes.Reference, name: str, full: boo
         if steps == tried:
             continue
         tried = steps
-        dt = scene.horizon / steps
-        scene.potential.forget()
+        dt = test_system.horizon / steps
+        test_system.potential.forget()
         try:
-            end = run(system, State(scene.positions, scene.velocities), dt, steps, stepper=method.make(dt))
+            end = run(system, State(test_system.positions, test_system.velocities), dt, steps, stepper=method.make(dt))
         except KconsError:  # the step is too large
             continue
-        error = scene.deviation(end.positions, reference.positions)
-        found.append({"dt": dt, "evaluations": scene.potential.evaluations, "error": error})
+        error = test_system.deviation(end.positions, reference.positions)
+        found.append({"dt": dt, "evaluations": test_system.potential.evaluations, "error": error})
         if error < BEST[full]:
             break
     return found
@@ -82,19 +84,25 @@ def at_goal(points: list[dict[str, float]], item: str, goal: float = GOAL) -> fl
     return float(np.exp(y0 + (np.log(goal) - e0) / (e1 - e0) * (y1 - y0)))
 
 
-def cpu_seconds(scene: scenes.Scene, name: str, points: list[dict[str, float]]) -> float | None:
+def cpu_seconds(test_system: test_systems.TestSystem, name: str, points: list[dict[str, float]]) -> float | None:
     """Processor time to the horizon with the step that reaches the goal; the better of two runs."""
     dt = at_goal(points, "dt")
     if dt is None:
         return None
-    steps = round(scene.horizon / dt)
+    steps = round(test_system.horizon / dt)
     stepper = METHODS[name].make(dt)
-    system = System(scene.motion, scene.potential.forces)
+    system = System(test_system.motion, test_system.potential.forces)
     times = []
     for _ in range(2):
-        scene.potential.forget()
+        test_system.potential.forget()
         start = process_time()
-        run(system, State(scene.positions, scene.velocities), scene.horizon / steps, steps, stepper=stepper)
+        run(
+            system,
+            State(test_system.positions, test_system.velocities),
+            test_system.horizon / steps,
+            steps,
+            stepper=stepper,
+        )
         times.append(process_time() - start)
     return min(times)
 
@@ -104,17 +112,17 @@ def work_precision(full: bool, console: Console) -> dict[str, Any]:
     names = [n for n, m in METHODS.items() if isinstance(m, CoreStepper) and (full or m.usual)]
     systems: dict[str, Any] = {}
     for name in SYSTEMS:
-        scene = scenes.build(name)
-        reference = scene.reference()
+        test_system = test_systems.build(name)
+        reference = test_system.reference()
         curves, seconds = {}, {}
         for stepper in names:
-            curves[stepper] = curve(scene, reference, stepper, full)
-            seconds[stepper] = cpu_seconds(scene, stepper, curves[stepper]) if full else None
+            curves[stepper] = curve(test_system, reference, stepper, full)
+            seconds[stepper] = cpu_seconds(test_system, stepper, curves[stepper]) if full else None
             needed = at_goal(curves[stepper], "evaluations")
             console.print(f"{name}, {stepper}: {'-' if needed is None else f'{needed:,.0f}'} evaluations for {GOAL:g}")
         systems[name] = {
-            "title": scene.title,
-            "horizon": scene.horizon,
+            "title": test_system.title,
+            "horizon": test_system.horizon,
             "reference_error": reference.error,
             "curves": curves,
             "cpu_seconds": seconds,
@@ -260,7 +268,7 @@ def main() -> None:
         result = json_files.read(options.show)
     else:
         environment = measure.environment()
-        measure.warm_up(scenes.build("butane"))
+        measure.warm_up(test_systems.build("butane"))
         result = {
             "environment": environment,
             "goal": GOAL,

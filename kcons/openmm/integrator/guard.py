@@ -23,6 +23,7 @@ from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
     forces_of,
+    parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
@@ -81,10 +82,10 @@ class Guard:
     """
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context = weakref.ref(context)
-        self._integrator = weakref.ref(integrator)
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
-        check_system(self.system, leapfrog=integrator.scheme is None)
+        check_system(self.system)
+        self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.precision = Precision.of(context)
         integrator.take_precision(self.precision)
@@ -331,8 +332,8 @@ class Guard:
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
         """
-        context, integrator = self.context, self.integrator
-        step, begun = context.getStepCount(), perf_counter()
+        context, integrator, begun = self.context, self.integrator, perf_counter()
+        step = context.getStepCount()
         try:
             integrator.ensemble.verify(integrator)
             now = context.getState(positions=True, velocities=True)
@@ -373,7 +374,7 @@ class Guard:
     def _remember(self, now: openmm.State) -> None:
         self.since_check = self._put_off = 0
         self._checked = perf_counter()
-        self._good = now
+        self._good, self._memory = now, self.integrator.program.remembered()
 
     def put_back(self) -> None:
         """The state that was checked last."""
@@ -384,8 +385,8 @@ class Guard:
             context.setVelocities(good.getVelocities(asNumpy=True))
             context.setTime(good.getTime())
             context.setStepCount(good.getStepCount())
-            self.since_check = 0
-            self.disturbed = False
+            self.integrator.program.recall(self._memory)
+            self.since_check, self.disturbed = 0, False
             self.integrator.refresh()
 
     def explosion(self, words: str, step: int) -> NonFiniteError:

@@ -49,7 +49,7 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
         'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator, for Systems with virtual sites.
+        openmm.VerletIntegrator.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional

@@ -252,13 +252,11 @@ def test_steps_without_python():
 
 
 def test_what_cannot_be_propagated_is_refused():
-    system = openmm.System()
-    for m in (16.0, 1.0, 1.0, 0.0):
-        system.addParticle(m)
-    system.setVirtualSite(3, openmm.ThreeParticleAverageSite(0, 1, 2, 0.8, 0.1, 0.1))
+    system, x, v = dumbbell()
+    system.addForce(openmm.DrudeForce())
     integrator = RattleIntegrator(1e-3)
-    context = started(system, integrator, np.eye(4, 3))
-    with pytest.raises(UnsupportedError, match="virtual"):
+    context = started(system, integrator, x, v)
+    with pytest.raises(UnsupportedError, match="Drude"):
         integrator.step(5)
     assert context.getStepCount() == 0
 

@@ -311,8 +311,10 @@ def cell_matrix(dimensions: Any) -> FloatArray | None:
     # Exactly 90 degrees has no rounding.
     cosines = [0.0 if angle == 90.0 else float(np.cos(np.radians(angle))) for angle in (alpha, beta, gamma)]
     sine = 1.0 if gamma == 90.0 else float(np.sin(np.radians(gamma)))
+    if not sine > 0:
+        return None
     x, y = c * cosines[1], c * (cosines[0] - cosines[1] * cosines[2]) / sine
     rest = c * c - x * x - y * y
-    if not (rest > 0 and sine > 0):
+    if not rest > 0:
         return None
     return np.array([[a, 0.0, 0.0], [b * cosines[2], b * sine, 0.0], [x, y, np.sqrt(rest)]])

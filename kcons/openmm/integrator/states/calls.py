@@ -110,7 +110,7 @@ class Calls(Integrator):
 
     def _run_block(self, guard: Guard, steps: int, to_the_end: bool) -> int:
         """Where the program can do less in steps whose end nobody looks at, let it; how many steps were made."""
-        unseen = steps - self._plan.observed if self._plan.lazy else 0
+        unseen = steps - self._plan.observed if self._plan.lazy and not guard.in_parts else 0
         if self._plan.lean:
             self.program.write("lean", guard.undisturbed)
             self.program.write("moving", guard.moving)
@@ -134,7 +134,7 @@ class Calls(Integrator):
         for part in self.parts:
             part.begin_run()
         try:
-            openmm.CustomIntegrator.step(self, steps)
+            self.program.run(context, steps, self._plan.phases if guard.in_parts else 1)
         except openmm.OpenMMException as error:
             guard.put_back()
             if "NaN" not in str(error):
