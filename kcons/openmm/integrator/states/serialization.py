@@ -1,9 +1,9 @@
 """Integrators in XML, and in CompoundIntegrators: they stay what they are.
 
 On import, methods of OpenMM's `XmlSerializer` and `CompoundIntegrator` are wrapped. OpenMM writes the program of an
-integrator of kcons as that of a CustomIntegrator, and knows no class. An attribute that OpenMM passes over says the rest:
-so what reads the file with kcons imported gets the integrator back, and what reads it without, the bare program. In a
-CompoundIntegrator, members that are written in Python are kept alive, and make their steps with all their checks.
+integrator of kcons as that of a CustomIntegrator, and knows no class. An attribute that OpenMM passes over says the
+rest: so what reads the file with kcons imported gets the integrator back, and what reads it without, the bare program.
+In a CompoundIntegrator, members that are written in Python are kept alive, and make their steps with all their checks.
 """
 
 from __future__ import annotations
