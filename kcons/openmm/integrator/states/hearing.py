@@ -46,6 +46,11 @@ def listen(integrator: Integrator) -> None:
     _LIVE[int(integrator.this)] = integrator
 
 
+def live(integrator: openmm.Integrator) -> Integrator | None:
+    """The integrator of kcons that OpenMM hands out as a plain one; None for others."""
+    return _LIVE.get(int(integrator.this))
+
+
 def listeners(context: openmm.Context) -> list[Integrator]:
     """The integrators of kcons that a Context has."""
     integrator = getattr(context, "_integrator", None)
@@ -54,8 +59,7 @@ def listeners(context: openmm.Context) -> list[Integrator]:
     heard = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
         heard = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
-    found = (_LIVE.get(int(one.this)) for one in heard)
-    return [one for one in found if one is not None]
+    return [found for one in heard if (found := live(one)) is not None]
 
 
 # -- states and checkpoints -------------------------------------------------------------------------
@@ -230,7 +234,9 @@ def _in_simulation(original: Callable[..., None], simulation: app.Simulation, *a
 # -- wrapping ---------------------------------------------------------------------------------------
 
 
-def _wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+def wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+    """What calls `call` with the original method and its arguments."""
+
     @functools.wraps(original)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         return call(original, *args, **kwargs)
@@ -271,17 +277,17 @@ def _wrap_all() -> None:
         **dict.fromkeys(_MOVING, _moving),
     }
     for name, call in calls.items():
-        setattr(openmm.Context, name, _wrapped(getattr(openmm.Context, name), call))
+        setattr(openmm.Context, name, wrapped(getattr(openmm.Context, name), call))
     for name in (*calls, "getStepCount", "getTime", "setStepCount", "setParameter", "computeVirtualSites"):
         setattr(openmm.Context, name, _settled(getattr(openmm.Context, name)))
     for name in ("step", "runForClockTime"):
-        setattr(app.Simulation, name, _wrapped(getattr(app.Simulation, name), _in_simulation))
+        setattr(app.Simulation, name, wrapped(getattr(app.Simulation, name), _in_simulation))
     minimizer = openmm.LocalEnergyMinimizer
-    minimizer.minimize = staticmethod(_wrapped(minimizer.minimize, _minimize))
+    minimizer.minimize = staticmethod(wrapped(minimizer.minimize, _minimize))
     for kind in vars(openmm).values():
         if isinstance(kind, type) and issubclass(kind, openmm.Force) and "updateParametersInContext" in vars(kind):
             name = "updateParametersInContext"
-            setattr(kind, name, _wrapped(getattr(kind, name), _update_parameters))
+            setattr(kind, name, wrapped(getattr(kind, name), _update_parameters))
 
 
 _wrap_all()
