@@ -228,7 +228,7 @@ class Isokinetic(Value):
         moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
-                f"the isokinetic thermostat in OpenMM needs targets that rest, and those of {moving[0]!r} move; use "
+                f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
         masses, v = self._masses(integrator, context), velocities_of(context)
@@ -272,7 +272,8 @@ class Isokinetic(Value):
         inside[atom_numbers(np.asarray(self.atoms), n)] = True
         if integrator.parts:
             raise UnsupportedError(
-                "a part of the particles can be thermostatted beside constraints of the System, not beside parts="
+                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
+                "thermostat all particles"
             )
         for k in range(system.getNumConstraints()):
             i, j, _ = system.getConstraintParameters(k)

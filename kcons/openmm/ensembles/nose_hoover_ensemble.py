@@ -115,7 +115,7 @@ class NoseHoover(ConstantEnergy):
         if scheme is None:
             raise UnsupportedError(
                 "NoseHoover needs velocities at the time of the positions, and those of the leapfrog are half a step "
-                "behind; for virtual sites use openmm.NoseHooverIntegrator"
+                "behind; use scheme='rattle'"
             )
         if scheme.order != 2:
             raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")

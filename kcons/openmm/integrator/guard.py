@@ -1,10 +1,11 @@
-"""An integrator's view of the Context it belongs to: checks before and during a run, and the way back."""
+"""Checks of an integrator on its Context, before and during a run, and the return to the last good state."""
 
 from __future__ import annotations
 
 import gc
 import logging
 import weakref
+from itertools import chain
 from time import perf_counter
 from typing import Any
 
@@ -23,6 +24,7 @@ from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
     forces_of,
+    parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
@@ -39,7 +41,8 @@ _REMEDY = "let kcons hold these constraints: take them out of the System and han
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     """The Context that was made with this integrator, alone or within a CompoundIntegrator."""
     address = int(integrator.this)
-    for thing in gc.get_objects():
+    # Young objects first: it was made just now in most cases, and a process has millions of old ones.
+    for thing in chain.from_iterable(gc.get_objects(generation) for generation in range(3)):
         if issubclass(type(thing), openmm.Context):
             owner = getattr(thing, "_integrator", None)
             if owner is integrator:
@@ -81,17 +84,17 @@ class Guard:
     """
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context = weakref.ref(context)
-        self._integrator = weakref.ref(integrator)
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
-        check_system(self.system, leapfrog=integrator.scheme is None)
+        check_system(self.system)
+        self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.precision = Precision.of(context)
         integrator.take_precision(self.precision)
         self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
-        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
         self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
         #: Whether the set-up was checked.
         self.started = False
@@ -331,8 +334,8 @@ class Guard:
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
         """
-        context, integrator = self.context, self.integrator
-        step, begun = context.getStepCount(), perf_counter()
+        context, integrator, begun = self.context, self.integrator, perf_counter()
+        step = context.getStepCount()
         try:
             integrator.ensemble.verify(integrator)
             now = context.getState(positions=True, velocities=True)
@@ -363,8 +366,8 @@ class Guard:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
         if miss is not None:
             raise CertificateError(
-                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
-                "step, or see what changed the state or the rows behind their back",
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers reported success; take a smaller time "
+                "step, or find what else changed the state or the constraints",
                 row=miss.row,
                 residual=abs(miss.off),
                 atoms=miss.atoms,

@@ -218,6 +218,28 @@ class Program:
         self.operations.append((kind, variable, expression))
         self._lines.append((self._depth, code, words))
 
+    # -- running --------------------------------------------------------------------------------
+
+    def run(self, context: openmm.Context, steps: int, parts: int = 1) -> None:
+        """Make steps, each of them in so many executions of the program, of which the global `phase` is the number.
+
+        OpenMM takes each execution for a step; clock and step count are put right.
+        """
+        integrator = self.integrator
+        if parts == 1:
+            openmm.CustomIntegrator.step(integrator, steps)
+            return
+        dt = integrator.getStepSize()._value
+        for _ in range(steps):
+            time, count = context.getTime()._value, context.getStepCount()
+            self.write("phase", 1.0)
+            try:
+                openmm.CustomIntegrator.step(integrator, parts)
+            finally:
+                self.write("phase", 0.0)
+            context.setTime(time + dt)
+            context.setStepCount(count + 1)
+
     # -- listing --------------------------------------------------------------------------------
 
     def listing(self) -> str:

@@ -12,8 +12,8 @@ from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.neighborlist import natural_cutoffs, neighbor_list
 
-from kcons.comparison.scenes.potential import Potential, of_calculator
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -23,7 +23,7 @@ from kcons.motion.motion import Motion
 TEMPERATURE = 300.0
 
 
-def build(size: int = 1, seed: int = 1, *, forces: str = "") -> Scene:
+def build(size: int = 1, seed: int = 1, *, forces: str = "") -> TestSystem:
     """Ethanol.
 
     Parameters
@@ -51,7 +51,7 @@ def build(size: int = 1, seed: int = 1, *, forces: str = "") -> Scene:
     potential = _potential(forces or ("xtb" if find_spec("tblite") else "emt"), atoms)
     # The ends of an angle whose arms are held are at a fixed distance: the same set by distances alone.
     pairs = np.concatenate([bonds, np.sort(angles[:, [0, 2]], axis=1)])
-    return Scene(
+    return TestSystem(
         name="ethanol",
         title=f"ethanol, all {len(bonds)} bonds and {len(angles)} angles, 300 K; {potential.name}",
         constraint_set=held,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from openmm import app, unit
 
-from kcons.comparison import scenes
-from kcons.comparison.scenes import structure
+from kcons.comparison import test_systems
+from kcons.comparison.test_systems import structure
 from kcons.comparison.work_precision import measure
 from kcons.errors import InputError, UnsupportedError
 
@@ -18,7 +18,7 @@ ALANINE = Path(__file__).parents[2] / "data" / "alanine-dipeptide-implicit.pdb"
 
 @pytest.fixture(scope="module")
 def alanine():
-    return scenes.build("alanine")
+    return test_systems.build("alanine")
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_alanine_dipeptide(alanine):
 
 @pytest.mark.parametrize(("constrain", "rows"), [("hbonds", 12), ("hangles", 30)])
 def test_what_is_held_can_be_chosen(constrain, rows):
-    scene = scenes.build("alanine", constrain=constrain)
+    scene = test_systems.build("alanine", constrain=constrain)
     assert scene.constraint_set.n_rows == rows
     assert scene.openmm.system.getNumConstraints() == rows
 
@@ -90,7 +90,7 @@ def test_protein_of_2489_atoms():
 @pytest.mark.validation
 @pytest.mark.parametrize(("name", "atoms", "rows"), [("villin", 8867, 8576), ("dhfr-water", 23558, 22290)])
 def test_proteins_in_water(name, atoms, rows):
-    scene = scenes.build(name)
+    scene = test_systems.build(name)
     assert (scene.n_atoms, scene.constraint_set.n_rows) == (atoms, rows)
     assert "PME" in scene.title
     assert scene.residuals(scene.positions, scene.velocities)[0] < 1e-12
@@ -99,24 +99,24 @@ def test_proteins_in_water(name, atoms, rows):
 
 
 def test_file_is_the_same_molecule(alanine):
-    scene = scenes.from_file(ALANINE, constrain="allbonds")
+    scene = test_systems.from_file(ALANINE, constrain="allbonds")
     np.testing.assert_array_equal(scene.positions, alanine.positions)
     np.testing.assert_array_equal(scene.velocities, alanine.velocities)
     assert scene.name == ALANINE.stem
-    assert scenes.from_file(ALANINE, quick=True).horizon == pytest.approx(alanine.horizon / 2)
+    assert test_systems.from_file(ALANINE, quick=True).horizon == pytest.approx(alanine.horizon / 2)
 
 
 def test_bonds_with_hydrogen_are_held_by_default():
-    assert scenes.from_file(ALANINE).constraint_set.n_rows == 12
+    assert test_systems.from_file(ALANINE).constraint_set.n_rows == 12
 
 
 def test_start_is_relaxed():
-    energies = [s.potential.energy(s.positions) for s in (scenes.from_file(ALANINE, relax=k) for k in (0, 100))]
+    energies = [s.potential.energy(s.positions) for s in (test_systems.from_file(ALANINE, relax=k) for k in (0, 100))]
     assert energies[1] < energies[0]
 
 
 def test_hydrogens_are_added(bare):
-    scene = scenes.from_file(bare, add_hydrogens=True)
+    scene = test_systems.from_file(bare, add_hydrogens=True)
     assert scene.n_atoms == 22
     assert scene.constraint_set.n_rows == 12
 
@@ -131,12 +131,12 @@ def test_hydrogens_do_not_depend_on_the_platforms_of_the_machine(bare, monkeypat
         return add(self, *args, platform=platform, **options)
 
     monkeypatch.setattr(app.Modeller, "addHydrogens", recorded)
-    scenes.from_file(bare, add_hydrogens=True)
+    test_systems.from_file(bare, add_hydrogens=True)
     assert seen == ["CPU"]
 
 
 def test_box_decides_about_the_forces(tmp_path, alanine):
-    scene = scenes.from_file(water(tmp_path / "water.pdb"))
+    scene = test_systems.from_file(water(tmp_path / "water.pdb"))
     assert "PME" in scene.title
     assert scene.constraint_set.n_rows == 3
     np.testing.assert_allclose(scene.cell, 20 * np.eye(3), atol=1e-9)
@@ -144,7 +144,7 @@ def test_box_decides_about_the_forces(tmp_path, alanine):
     found = measure.compare(scene.with_time_steps([1.0]), methods=["openmm-verlet", "openmm-kcons-rattle"])
     assert all(m.status == "ok" and m.constraint_residual < 1e-12 for m in found.measurements)
     placeholder = "CRYST1    1.000    1.000    1.000  90.00  90.00  90.00 P 1           1\n"
-    scene = scenes.from_file(changed(tmp_path / "nmr.pdb", head=placeholder))
+    scene = test_systems.from_file(changed(tmp_path / "nmr.pdb", head=placeholder))
     assert scene.cell is None
     assert "PME" not in scene.title
     assert alanine.cell is None
@@ -155,7 +155,7 @@ def test_box_decides_about_the_forces(tmp_path, alanine):
 
 def test_missing_hydrogens(bare):
     with pytest.raises(InputError, match=r"residue ACE 1 of chain .*missing 3 H atoms.*--add-hydrogens"):
-        scenes.from_file(bare)
+        test_systems.from_file(bare)
 
 
 def test_unknown_residue(tmp_path):
@@ -166,7 +166,7 @@ def test_unknown_residue(tmp_path):
     )
     for options in ({}, {"add_hydrogens": True}):
         with pytest.raises(InputError, match=r"residue XYZ 7 of chain B: .*--forcefield"):
-            scenes.from_file(path, **options)
+            test_systems.from_file(path, **options)
 
 
 @pytest.mark.parametrize(
@@ -179,17 +179,17 @@ def test_unknown_residue(tmp_path):
 )
 def test_bad_choices(options, text):
     with pytest.raises(InputError, match=text):
-        scenes.from_file(ALANINE, **options)
+        test_systems.from_file(ALANINE, **options)
 
 
 def test_bad_files(tmp_path):
     with pytest.raises(InputError, match="no file"):
-        scenes.from_file(tmp_path / "none.pdb")
+        test_systems.from_file(tmp_path / "none.pdb")
     for text, message in (("nonsense\n", "cannot be read|no atoms"), ("END\n", "cannot be read|no atoms")):
         path = tmp_path / "bad.pdb"
         path.write_text(text)
         with pytest.raises(InputError, match=message):
-            scenes.from_file(path)
+            test_systems.from_file(path)
 
 
 def test_molecule_that_is_cut(tmp_path):
@@ -201,44 +201,44 @@ def test_molecule_that_is_cut(tmp_path):
     with path.open("w") as file:
         app.PDBFile.writeFile(pdb.topology, x * unit.nanometer, file)
     with pytest.raises(InputError, match=r"CH3 of ACE 1 and H1 of ACE 1 are 2\.5 nm apart") as caught:
-        scenes.from_file(path)
+        test_systems.from_file(path)
     assert "make molecules whole" in str(caught.value)
     assert sorted(caught.value.atoms) == [0, 1]
 
 
 def test_narrow_box(tmp_path):
     with pytest.raises(InputError, match=r"the box is 0\.8 nm wide, too narrow"):
-        scenes.from_file(water(tmp_path / "water.pdb", edge=0.8))
+        test_systems.from_file(water(tmp_path / "water.pdb", edge=0.8))
 
 
 def test_virtual_sites(tmp_path):
     with pytest.raises(UnsupportedError, match="virtual sites into residue HOH"):
-        scenes.from_file(water(tmp_path / "water.pdb", model="tip4pew"), force_field=["amber14/tip4pew.xml"])
+        test_systems.from_file(water(tmp_path / "water.pdb", model="tip4pew"), force_field=["amber14/tip4pew.xml"])
 
 
 def test_nothing_to_hold(bare, tmp_path):
     path = tmp_path / "ion.pdb"
     path.write_text("HETATM    1 NA    NA A   1       0.000   0.000   0.000  1.00  0.00          NA  \nEND\n")
     with pytest.raises(InputError, match="nothing is held"):
-        scenes.from_file(path)
+        test_systems.from_file(path)
 
 
 def test_options_of_molecules_are_refused_elsewhere():
     with pytest.raises(InputError, match="for alanine, dhfr, dhfr-water, villin and PDB files, not for 'chain'"):
-        scenes.build("chain", constrain="hbonds")
+        test_systems.build("chain", constrain="hbonds")
     with pytest.raises(InputError, match="cannot be built at size 2"):
-        scenes.build("alanine", 2)
+        test_systems.build("alanine", 2)
 
 
 def test_openmm_is_needed(monkeypatch):
     monkeypatch.setattr(structure, "find_spec", lambda name: None)
-    for build in (lambda: scenes.build("alanine"), lambda: scenes.from_file(ALANINE)):
+    for build in (lambda: test_systems.build("alanine"), lambda: test_systems.from_file(ALANINE)):
         with pytest.raises(UnsupportedError, match="pip install openmm"):
             build()
 
 
 def test_names_of_files():
-    assert scenes.is_file("my.pdb")
-    assert scenes.is_file("a/b.CIF")
-    assert not scenes.is_file("alanine")
-    assert not scenes.is_file("chain-175")
+    assert test_systems.is_file("my.pdb")
+    assert test_systems.is_file("a/b.CIF")
+    assert not test_systems.is_file("alanine")
+    assert not test_systems.is_file("chain-175")

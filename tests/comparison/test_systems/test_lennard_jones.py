@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kcons.comparison.scenes.lennard_jones import LennardJones
+from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.errors import InputError
 
 

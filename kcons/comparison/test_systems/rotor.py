@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.scenes.minimal import integrated, single, spin, turned
-from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
-from kcons.comparison.scenes.potential import Potential
-from kcons.comparison.scenes.scene import BARE, Reference, Scene
+from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -46,7 +46,7 @@ VELOCITIES = {
 PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
-def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> Scene:
+def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> TestSystem:
     """The body, with one of two starts.
 
     Parameters
@@ -68,7 +68,7 @@ def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> Scene:
     # Half of the tennis racket's horizon lies before its first flip.
     horizon = 10.0 if start == "rotor" else 20.0
     what = "turning about its middle axis (tennis racket)" if start == "tennis-racket" else "in free flight"
-    return Scene(
+    return TestSystem(
         name=start,
         title=f"asymmetric top, 4 atoms and 6 distances, {what}",
         constraint_set=ConstraintSet(Distance(PAIRS), POSITIONS, MASSES),

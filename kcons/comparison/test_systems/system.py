@@ -1,4 +1,4 @@
-"""The contract of a scene: a system to run, small or at size N, that knows its own solution."""
+"""The contract of a test system: a system to run, small or at size N, that knows its own solution."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from ase import Atoms, units
 
-from kcons.comparison.scenes.openmm_host import OpenMMHost
-from kcons.comparison.scenes.potential import Potential, PotentialCalculator
+from kcons.comparison.test_systems.openmm_host import OpenMMHost
+from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -64,7 +64,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Scene:
+class TestSystem:
     """One system with its start, its forces and its reference solution.
 
     Attributes
@@ -107,6 +107,9 @@ class Scene:
     shortfall : callable, optional
         Where the goal is known and not the way: what is taken for the error, as a function of the positions.
     """
+
+    #: For pytest, which collects classes of such names.
+    __test__ = False
 
     name: str
     title: str
@@ -154,7 +157,7 @@ class Scene:
         atoms.set_velocities(self.velocities)
         return atoms
 
-    def with_time_steps(self, shown: Sequence[float]) -> Scene:
+    def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
         """The same test system with other steps, in the unit of time it shows.
 
         Raises
@@ -182,7 +185,7 @@ class Scene:
             steps.append(internal)
         return replace(self, time_steps=tuple(sorted(set(steps), reverse=True)))
 
-    def shortened(self, factor: int) -> Scene:
+    def shortened(self, factor: int) -> TestSystem:
         """The same test system with its horizon divided by `factor` and only the steps that still divide it."""
         horizon = self.horizon / factor
         steps = tuple(dt for dt in self.time_steps if abs(horizon / dt - round(horizon / dt)) < 1e-6 and dt < horizon)
@@ -213,7 +216,7 @@ REFERENCE_WORK = 8
 REFERENCE_CHECK = 1.5
 
 
-def converged(scene: Scene, dt: float, *, progress: Progress | None = None) -> Reference:
+def converged(test_system: TestSystem, dt: float, *, progress: Progress | None = None) -> Reference:
     """Order 6 at `REFERENCE_WORK` times the force evaluations of RATTLE at `dt`.
 
     The error estimate is the difference from a second run with longer steps. The error of the first is
@@ -221,22 +224,22 @@ def converged(scene: Scene, dt: float, *, progress: Progress | None = None) -> R
     with a self-consistent field, both runs are equally far off.
     """
     stepper = BlanesMoan6()
-    fine = max(3, round(REFERENCE_WORK * scene.horizon / dt / stepper.force_evaluations))
+    fine = max(3, round(REFERENCE_WORK * test_system.horizon / dt / stepper.force_evaluations))
     coarse = max(2, round(fine / REFERENCE_CHECK))
-    system = System(scene.motion, scene.potential.forces)
+    system = System(test_system.motion, test_system.potential.forces)
     done = 0
     ends: list[FloatArray] = []
     for count in (coarse, fine):
-        state = State(scene.positions, scene.velocities)
+        state = State(test_system.positions, test_system.velocities)
         for _ in range(count):
-            state = stepper.step(system, state, scene.horizon / count)
+            state = stepper.step(system, state, test_system.horizon / count)
             done += 1
             if progress is not None:
                 progress(done, coarse + fine)
         ends.append(state.positions)
-    shown = scene.horizon / fine / scene.units.time_unit
-    how = f"{type(stepper).__name__} at {shown:.3g} {scene.units.time}"
-    return Reference(ends[1], scene.deviation(*ends), how)
+    shown = test_system.horizon / fine / test_system.units.time_unit
+    how = f"{type(stepper).__name__} at {shown:.3g} {test_system.units.time}"
+    return Reference(ends[1], test_system.deviation(*ends), how)
 
 
 def thermal_velocities(

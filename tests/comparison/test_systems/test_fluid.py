@@ -9,9 +9,9 @@ import pytest
 from ase import Atoms, units
 from ase.calculators.tip3p import angleHOH, rOH
 
-from kcons.comparison import scenes
-from kcons.comparison.scenes import fluid
-from kcons.comparison.scenes.lennard_jones import LennardJones
+from kcons.comparison import test_systems
+from kcons.comparison.test_systems import fluid
+from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.errors import InputError
 from kcons.steppers import State, run
 from kcons.thermostats import thermal_velocities
@@ -88,16 +88,16 @@ def test_time_steps_of_ones_own():
 
 
 def test_fluids_by_name():
-    for name, entry in scenes.FLUIDS.items():
-        made = scenes.build_fluid(name, quick=True)
+    for name, entry in test_systems.FLUIDS.items():
+        made = test_systems.build_fluid(name, quick=True)
         assert made.name == name and made.n_molecules == entry.quick_size
-        assert not np.array_equal(made.positions, scenes.build_fluid(name, seed=2, quick=True).positions) or (
+        assert not np.array_equal(made.positions, test_systems.build_fluid(name, seed=2, quick=True).positions) or (
             name == "thermostat"
         )
-    assert scenes.build_fluid("thermostat").n_molecules == 32
+    assert test_systems.build_fluid("thermostat").n_molecules == 32
     with pytest.raises(InputError, match="there is no fluid 'mud'"):
-        scenes.build_fluid("mud")
+        test_systems.build_fluid("mud")
     with pytest.raises(InputError, match="7 are too few for a periodic fluid; use 8 or more"):
-        scenes.build_fluid("thermostat-dumbbells", 7)
+        test_systems.build_fluid("thermostat-dumbbells", 7)
     with pytest.raises(InputError, match="use 27 or more"):
-        scenes.build_fluid("thermostat-water", 26)
+        test_systems.build_fluid("thermostat-water", 26)

@@ -11,9 +11,9 @@ import numpy as np
 from ase import Atoms, units
 from ase.calculators.tip3p import TIP3P
 
-from kcons.comparison.scenes.openmm_host import ASE_LENGTH, OpenMMHost
-from kcons.comparison.scenes.potential import Potential, of_calculator
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost
+from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -34,7 +34,7 @@ SMALLEST = 8
 MANY = 2000
 
 
-def build(size: int = 64, seed: int = 1, *, forces: str = "") -> Scene:
+def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
     """`size` molecules.
 
     Parameters
@@ -69,7 +69,7 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> Scene:
         x = _relaxed(motion, potential, x, seed)
     v = thermal_velocities(motion, x, TEMPERATURE, seed)
     potential.forget()
-    return Scene(
+    return TestSystem(
         name="water",
         title=f"{size} rigid TIP3P waters, box {box:.2f} Å, 300 K; {potential.name}",
         constraint_set=held,
@@ -103,7 +103,7 @@ def _molecules(size: int) -> tuple[FloatArray, float, bool]:
 
 def _equilibrated(size: int) -> tuple[FloatArray, float]:
     """A box that ran 100 ps at 300 K: positions, shape (size, 3, 3), and its length."""
-    with resources.files("kcons.comparison.scenes").joinpath(f"data/water{size}.npz").open("rb") as file:
+    with resources.files("kcons.comparison.test_systems").joinpath(f"data/water{size}.npz").open("rb") as file:
         data = np.load(file)
         return data["positions"].astype(float).reshape(size, 3, 3), float(data["box"])
 
@@ -135,7 +135,7 @@ def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Po
 
 
 def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Potential:
-    from kcons.comparison.scenes import openmm_potential
+    from kcons.comparison.test_systems import openmm_potential
 
     potential = openmm_potential.of_system(_system(box, cutoff, masses))
     potential.name = f"PME, {potential.name}"

@@ -65,7 +65,7 @@ def butane(seed: int = 1) -> Problem:
     return _moving(Problem(x, [15.0, 14, 14, 15], pairs, springs=[(0, 3, 4.0, 0.9 * ends)]), 0.3, seed)
 
 
-SCENES: dict[str, Callable[[int], Problem]] = {
+SYSTEMS: dict[str, Callable[[int], Problem]] = {
     "water": water,
     "chain": chain,
     "dumbbells": dumbbells,

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from kcons.comparison.scenes.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
 from kcons.errors import InputError
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
-from kcons.comparison.scenes.fekete import OPTIMA
+from kcons.comparison.test_systems.fekete import OPTIMA
 from kcons.comparison.work_precision import measure
 from kcons.errors import InputError
 
@@ -22,7 +22,7 @@ def test_optima_are_the_published_ones():
 
 @pytest.mark.parametrize("size", OPTIMA)
 def test_every_size_finds_its_optimum(size):
-    scene = scenes.build("fekete", size)
+    scene = test_systems.build("fekete", size)
     found = measure.compare(scene.with_time_steps([0.16]), methods=["rattle"])
     (m,) = found.of("rattle")
     assert m.error < 1e-8
@@ -32,11 +32,11 @@ def test_every_size_finds_its_optimum(size):
 
 def test_sizes_without_a_known_optimum_are_refused():
     with pytest.raises(InputError, match="4, 6, 12, 20"):
-        scenes.build("fekete", 5)
+        test_systems.build("fekete", 5)
 
 
 def test_methods_without_friction_refuse():
-    scene = scenes.build("fekete")
+    scene = test_systems.build("fekete")
     for name in ("ase-kcons", "shake-1e-8", "openmm-verlet"):
         assert "friction" in methods.METHODS[name].refuses(scene)
     for name in ("rattle", "kahan-li6", "dop853"):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from kcons.comparison.scenes.scene import Reference
+from kcons.comparison.test_systems.system import Reference
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 

@@ -9,8 +9,8 @@ from ase import units
 from ase.build import fcc111
 from ase.calculators.emt import EMT
 
-from kcons.comparison.scenes.potential import of_calculator
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.potential import of_calculator
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
@@ -24,7 +24,7 @@ VACUUM = 6.0
 TEMPERATURE = 300.0
 
 
-def build(size: int = 1, seed: int = 1) -> Scene:
+def build(size: int = 1, seed: int = 1) -> TestSystem:
     """`size` molecules, one on each 2 x 2 patch; patches beyond their number are left bare.
 
     Parameters
@@ -59,7 +59,7 @@ def build(size: int = 1, seed: int = 1) -> Scene:
     pairs = metal + np.arange(2 * size, dtype=np.int64).reshape(-1, 2)
     held = ConstraintSet([Distance(pairs, BOND), FixedAtoms(fixed)], x, masses, cell=cell)
     molecules = f"{size} rigid CO molecules" if size > 1 else "a rigid CO molecule"
-    return Scene(
+    return TestSystem(
         name="slab",
         title=f"{molecules} on Cu(111), {metal} atoms in {LAYERS} layers of which {FIXED} are fixed, 300 K; ASE's EMT",
         constraint_set=held,

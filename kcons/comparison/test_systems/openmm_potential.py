@@ -7,7 +7,7 @@ import openmm
 from ase import units
 from openmm import unit
 
-from kcons.comparison.scenes.potential import Potential
+from kcons.comparison.test_systems.potential import Potential
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 

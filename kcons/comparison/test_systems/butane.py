@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.scenes.minimal import integrated, single, spin, turned
-from kcons.comparison.scenes.potential import Potential
-from kcons.comparison.scenes.scene import BARE, Reference, Scene
+from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Angle, Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -38,7 +38,7 @@ BONDS = np.array([[0, 1], [1, 2], [2, 3]])
 TRIPLES = np.array([[0, 1, 2], [1, 2, 3]])
 
 
-def build(size: int = 1, seed: int = 1) -> Scene:
+def build(size: int = 1, seed: int = 1) -> TestSystem:
     """One molecule.
 
     Parameters
@@ -54,7 +54,7 @@ def build(size: int = 1, seed: int = 1) -> Scene:
         Another size.
     """
     single(size, "butane is one molecule")
-    return Scene(
+    return TestSystem(
         name="butane",
         title=f"four-atom chain, 3 bonds and 2 angles held, torsion {BARRIER:g} (1 + cos 3φ)",
         constraint_set=ConstraintSet([Distance(BONDS, LENGTHS), Angle(TRIPLES, ANGLES)], POSITIONS, MASSES),

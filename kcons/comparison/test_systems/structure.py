@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.scenes.minimal import single
-from kcons.comparison.scenes.openmm_host import ASE_LENGTH, OpenMMHost, place, properties
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.minimal import single
+from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost, place, properties
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -62,7 +62,7 @@ def build(
     constrain: str = "",
     force_field: Sequence[str] = FORCE_FIELD,
     platform: str = "",
-) -> Scene:
+) -> TestSystem:
     """One of the structures that come with the package, or with OpenMM.
 
     Parameters
@@ -87,12 +87,12 @@ def build(
 
     known = STRUCTURES[structure]
     if known.file:
-        with resources.files("kcons.comparison.scenes").joinpath(f"data/{known.file}").open("rb") as file:
+        with resources.files("kcons.comparison.test_systems").joinpath(f"data/{known.file}").open("rb") as file:
             text = lzma.decompress(file.read()).decode()
     else:
         text = (Path(app.__file__).parent / "data" / "test.pdb").read_text()
     molecule = app.PDBFile(StringIO(text))
-    return _scene(
+    return _test_system(
         structure,
         known.text,
         molecule.topology,
@@ -114,7 +114,7 @@ def from_file(
     add_hydrogens: bool = False,
     platform: str = "",
     relax: int = 100,
-) -> Scene:
+) -> TestSystem:
     """The molecules of a PDB or mmCIF file at 300 K, relaxed a little.
 
     Parameters
@@ -157,7 +157,7 @@ def from_file(
     field = force_field_of(force_field)
     if add_hydrogens:
         topology, x = _with_hydrogens(topology, molecule.positions, field)
-    return _scene(
+    return _test_system(
         path.stem,
         path.name,
         topology,
@@ -266,7 +266,7 @@ def _box(topology: Any) -> FloatArray | None:
 # -- the test system --------------------------------------------------------------------------------------
 
 
-def _scene(
+def _test_system(
     name: str,
     text: str,
     topology: Any,
@@ -277,7 +277,7 @@ def _scene(
     field: Any,
     platform: str,
     relax: int,
-) -> Scene:
+) -> TestSystem:
     from openmm import app
 
     from kcons.openmm.integrator.system_checks import SystemRows
@@ -307,7 +307,7 @@ def _scene(
     many = len(x) > MANY_ATOMS
     steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
     what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances, {TEMPERATURE:g} K"
-    return Scene(
+    return TestSystem(
         name=name,
         title=f"{what}; {'PME, ' if box is not None else ''}{potential.name}",
         constraint_set=held,

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ellipj
 
-from kcons.comparison.scenes.minimal import integrated, single
-from kcons.comparison.scenes.potential import Potential, uniform_field
-from kcons.comparison.scenes.scene import BARE, Reference, Scene
+from kcons.comparison.test_systems.minimal import integrated, single
+from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance, Sphere
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
@@ -55,7 +55,7 @@ PENDULUMS = {
 }
 
 
-def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> Scene:
+def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> TestSystem:
     """One of `PENDULUMS`.
 
     Parameters
@@ -85,7 +85,7 @@ def build(size: int = 1, seed: int = 1, *, kind: str = "pendulum") -> Scene:
             return _swing(chosen.angles[0], time)
         return _angles(chosen, time)
 
-    return Scene(
+    return TestSystem(
         name=kind,
         title=f"{chosen.title}; m = l = g = 1" if links == 1 else f"{chosen.title}, g = 1",
         constraint_set=ConstraintSet(held, x, masses),

@@ -1,6 +1,6 @@
 """Built-in test systems with known solutions, small or at size N.
 
-- `scene`, `potential`, `minimal`: the contract, forces, solutions in minimal coordinates
+- `system`, `potential`, `minimal`: the contract, forces, solutions in minimal coordinates
 - `sphere`, `fekete`, `bead`, `pendulums`, `rotor`: particles, beads, pendulums and tops
 - `chain`, `butane`, `molecule`, `slab`: chains and molecules
 - `lennard_jones`, `dumbbells`, `water`, `fluid`: fluids
@@ -15,18 +15,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcons.comparison.scenes.scene import Reference, Scene, Units
+from kcons.comparison.test_systems.system import Reference, TestSystem, Units
 from kcons.errors import InputError
 
 if TYPE_CHECKING:
-    from kcons.comparison.scenes.fluid import Fluid
+    from kcons.comparison.test_systems.fluid import Fluid
 
 __all__ = [
     "FLUIDS",
-    "SCENES",
+    "SYSTEMS",
     "Entry",
     "Reference",
-    "Scene",
+    "TestSystem",
     "Units",
     "build",
     "build_fluid",
@@ -55,7 +55,7 @@ class Entry:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-SCENES: Mapping[str, Entry] = {
+SYSTEMS: Mapping[str, Entry] = {
     "water": Entry("water", "box of rigid TIP3P water, PME forces", 64, 8, "molecules"),
     "chain": Entry("chain", "zigzag chain, all bonds held", 100, 20, "bonds"),
     "chain-straight": Entry("chain", "straight chain", 100, 20, "bonds", {"shape": "straight"}),
@@ -123,17 +123,17 @@ def build_fluid(name: str, size: int | None = None, seed: int = 1, *, quick: boo
     entry = FLUIDS[name]
     if size is None:
         size = entry.quick_size if quick else entry.size
-    fluid: Fluid = import_module(f"kcons.comparison.scenes.{entry.module}").build(size, seed, **entry.options)
+    fluid: Fluid = import_module(f"kcons.comparison.test_systems.{entry.module}").build(size, seed, **entry.options)
     return fluid
 
 
-def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:
+def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = False, **options: Any) -> TestSystem:
     """The test system called `name`.
 
     Parameters
     ----------
     name : str
-        A key of `SCENES`.
+        A key of `SYSTEMS`.
     size : int, optional
         Number of molecules, bonds or particles.
     seed : int
@@ -148,23 +148,23 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
         Unknown name; a size the test system cannot be built at.
     """
     try:
-        entry = SCENES[name]
+        entry = SYSTEMS[name]
     except KeyError:
-        raise InputError(f"there is no test system {name!r}; there are {', '.join(SCENES)}", item="scene") from None
+        raise InputError(f"there is no test system {name!r}; there are {', '.join(SYSTEMS)}", item="scene") from None
     if size is None:
         size = entry.quick_size if quick else entry.size
     if entry.module != "structure" and set(options) & STRUCTURE_OPTIONS:
-        names = ", ".join(key for key, other in SCENES.items() if other.module == "structure")
+        names = ", ".join(key for key, other in SYSTEMS.items() if other.module == "structure")
         raise InputError(
             f"what to hold, the force field and the platform can be chosen for {names} and PDB files, not for {name!r}",
             item=sorted(set(options) & STRUCTURE_OPTIONS)[0],
         )
-    module = import_module(f"kcons.comparison.scenes.{entry.module}")
-    scene: Scene = module.build(size, seed, **{**entry.options, **options})
-    return scene.shortened(2) if quick else scene
+    module = import_module(f"kcons.comparison.test_systems.{entry.module}")
+    test_system: TestSystem = module.build(size, seed, **{**entry.options, **options})
+    return test_system.shortened(2) if quick else test_system
 
 
-def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options: Any) -> Scene:
+def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options: Any) -> TestSystem:
     """The molecules of a PDB or mmCIF file with forces of OpenMM, or of any file that MDAnalysis reads.
 
     Parameters
@@ -176,7 +176,7 @@ def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options
     **options
         What `structure.from_file` takes: constrain, force_field, add_hydrogens, platform, relax; or, for
         other files and where one of coordinates, forces, select, rigid_residues is given, what
-        `kcons.comparison.scenes.any_file.from_file` takes.
+        `kcons.comparison.test_systems.any_file.from_file` takes.
 
     Raises
     ------
@@ -184,14 +184,14 @@ def from_file(path: Path | str, seed: int = 1, *, quick: bool = False, **options
         The file cannot be read, or does not fit the force field.
     """
     if by_mdanalysis(str(path), options):
-        from kcons.comparison.scenes import any_file
+        from kcons.comparison.test_systems import any_file
 
-        scene = any_file.from_file(path, seed, **options)
+        test_system = any_file.from_file(path, seed, **options)
     else:
-        from kcons.comparison.scenes import structure
+        from kcons.comparison.test_systems import structure
 
-        scene = structure.from_file(path, seed, **options)
-    return scene.shortened(2) if quick else scene
+        test_system = structure.from_file(path, seed, **options)
+    return test_system.shortened(2) if quick else test_system
 
 
 def by_mdanalysis(name: str, options: Mapping[str, Any]) -> bool:
@@ -201,9 +201,9 @@ def by_mdanalysis(name: str, options: Mapping[str, Any]) -> bool:
 
 def is_file(name: str) -> bool:
     """Whether a name is that of a structure file and not of a test system."""
-    return name not in SCENES and Path(name).suffix.lower() in SUFFIXES
+    return name not in SYSTEMS and Path(name).suffix.lower() in SUFFIXES
 
 
 def is_other_file(name: str) -> bool:
     """Whether a name is that of a file that MDAnalysis may read: it exists, or has a suffix and is no test system."""
-    return name not in SCENES and name not in FLUIDS and (Path(name).is_file() or Path(name).suffix != "")
+    return name not in SYSTEMS and name not in FLUIDS and (Path(name).is_file() or Path(name).suffix != "")

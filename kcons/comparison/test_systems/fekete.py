@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcons.comparison.scenes.potential import Potential
-from kcons.comparison.scenes.scene import REDUCED, Reference, Scene
-from kcons.comparison.scenes.sphere import NO_SPHERE
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.sphere import NO_SPHERE
+from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -27,7 +27,7 @@ ROUNDING = 1e-14
 APART = 0.6
 
 
-def build(size: int = 20, seed: int = 1) -> Scene:
+def build(size: int = 20, seed: int = 1) -> TestSystem:
     """`size` particles at rest at random places of the unit sphere.
 
     Parameters
@@ -54,7 +54,7 @@ def build(size: int = 20, seed: int = 1) -> Scene:
     def optimum(time: float) -> Reference:
         return Reference(x, ROUNDING * OPTIMA[size], f"the least energy known, {OPTIMA[size]:.13g}")
 
-    return Scene(
+    return TestSystem(
         name="fekete",
         title=f"{size} particles repel each other on a sphere, friction {FRICTION:g}; error: energy above the optimum",
         constraint_set=ConstraintSet(Sphere(np.arange(size), np.zeros(3), 1.0), x, np.ones(size)),

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from kcons.comparison.scenes.minimal import integrated, single
-from kcons.comparison.scenes.potential import Potential, uniform_field
-from kcons.comparison.scenes.scene import BARE, Reference, Scene
+from kcons.comparison.test_systems.minimal import integrated, single
+from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Ellipsoid, ImplicitSurface, Plane, Torus
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
@@ -30,7 +30,7 @@ NO_SURFACE = "ASE has no constraint that holds an atom on {}"
 NO_TIME = "ASE tells constraints no time: they cannot move"
 
 
-def build(size: int = 1, seed: int = 1, *, on: str = "ellipse") -> Scene:
+def build(size: int = 1, seed: int = 1, *, on: str = "ellipse") -> TestSystem:
     """One bead.
 
     Parameters
@@ -54,7 +54,7 @@ def build(size: int = 1, seed: int = 1, *, on: str = "ellipse") -> Scene:
     return _on_ellipse(OMEGA if on == "rotating-ellipse" else 0.0)
 
 
-def _on_ellipse(omega: float) -> Scene:
+def _on_ellipse(omega: float) -> TestSystem:
     mass, angle, rate = (1.0, 0.4, 0.2) if omega else (1.5, 1.0, 0.7)
     x = ellipse_place(angle, 0.0)
     v = np.array([[ACROSS * np.cos(angle) * rate, omega * x[0, 0], UP * np.sin(angle) * rate]])
@@ -68,7 +68,7 @@ def _on_ellipse(omega: float) -> Scene:
         held = [Plane(0, [0.0, 1.0, 0.0], 0.0), Ellipsoid(0, np.zeros(3), [ACROSS, np.inf, UP])]
         title = f"bead on a vertical ellipse, a = {ACROSS:g}, b = {UP:g}, g = 1"
         refusals = dict.fromkeys(("ase-bonds", "ase-internals"), NO_SURFACE.format("an ellipse"))
-    return Scene(
+    return TestSystem(
         name="bead-rotating" if omega else "bead-ellipse",
         title=title,
         constraint_set=ConstraintSet(held, x, [mass]),
@@ -123,11 +123,11 @@ def _turning_plane(omega: float) -> ImplicitSurface:
     )
 
 
-def _on_torus() -> Scene:
+def _on_torus() -> TestSystem:
     turn, angle = 0.6, 0.5
     x = torus_place(0.0, angle)
     v = np.array([[-MINOR * np.sin(angle), x[0, 0] * turn, MINOR * np.cos(angle)]])
-    return Scene(
+    return TestSystem(
         name="bead-torus",
         title=f"free bead on a torus, R = {MAJOR:g}, r = {MINOR:g}",
         constraint_set=ConstraintSet(Torus(0, np.zeros(3), [0.0, 0.0, 1.0], MAJOR, MINOR), x, [1.0]),

@@ -13,12 +13,12 @@ from ase import units
 from scipy.integrate import solve_ivp
 
 from kcons import projection
-from kcons.comparison import scenes
-from kcons.comparison.scenes import chain, dumbbells, molecule, water
-from kcons.comparison.scenes.minimal import COARSER, FINEST
-from kcons.comparison.scenes.potential import Potential
-from kcons.comparison.scenes.scene import converged, thermal_velocities
-from kcons.comparison.scenes.sphere import swing
+from kcons.comparison import test_systems
+from kcons.comparison.test_systems import chain, dumbbells, molecule, water
+from kcons.comparison.test_systems.minimal import COARSER, FINEST
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.sphere import swing
+from kcons.comparison.test_systems.system import converged, thermal_velocities
 from kcons.errors import InputError
 from kcons.motion import Motion
 from kcons.steppers import State, System, run
@@ -52,7 +52,7 @@ def small(name, **options):
     if name in ("water", "ethanol"):
         # Forces that come with ASE: these tests do not need the extras.
         options = {"forces": {"water": "ase", "ethanol": "emt"}[name], **options}
-    return scenes.build(name, SMALL[name], **options)
+    return test_systems.build(name, SMALL[name], **options)
 
 
 def end(scene, dt):
@@ -61,7 +61,7 @@ def end(scene, dt):
 
 
 def test_every_scene_is_covered_here():
-    assert set(SMALL) | MOLECULES == set(scenes.SCENES)
+    assert set(SMALL) | MOLECULES == set(test_systems.SYSTEMS)
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -108,7 +108,7 @@ def test_rattle_reaches_the_reference_with_order_two(name):
 )
 def test_converged_reference_against_an_independent_integrator(name, size):
     # Eq. (105) with the dense oracle in DOP853: other equations, other code, other integrator.
-    scene = scenes.build(name, size, **({"forces": "emt"} if name == "ethanol" else {}))
+    scene = test_systems.build(name, size, **({"forces": "emt"} if name == "ethanol" else {}))
     if name == "dumbbells":
         scene = scene.shortened(4)
     held, masses, shape = scene.constraint_set, scene.masses, scene.positions.shape
@@ -175,7 +175,7 @@ def test_moving_constraint_is_followed_in_time():
 
 @pytest.mark.parametrize("size", [8, 20])
 def test_box_of_dumbbells(size):
-    scene = scenes.build("dumbbells", size, seed=3)
+    scene = test_systems.build("dumbbells", size, seed=3)
     assert scene.n_atoms == 2 * size
     assert scene.motion.rank == size
     sigma, tangency = scene.residuals(scene.positions, scene.velocities)
@@ -214,7 +214,7 @@ def test_forces_of_dumbbells_vanish_smoothly_at_the_cutoff():
 
 @pytest.mark.parametrize("size", [1, 3])
 def test_slab_is_periodic_and_its_lower_layers_are_fixed(size):
-    scene = scenes.build("slab", size)
+    scene = test_systems.build("slab", size)
     symbols = np.array(scene.symbols)
     assert list(symbols[-2 * size :]) == ["C", "O"] * size
     metal = np.flatnonzero(symbols == "Cu")
@@ -270,7 +270,7 @@ def test_swing_meets_the_reference_pendulum():
 
 
 def test_free_particles_stay_on_their_great_circles():
-    scene = scenes.build("sphere", 3, seed=5)
+    scene = test_systems.build("sphere", 3, seed=5)
     center = np.array([0.0, 0.0, 0.0])
     reference = scene.reference().positions[0] - center
     normal = np.cross(scene.positions[0], scene.velocities[0])
@@ -310,7 +310,7 @@ def test_equilibrated_water_needs_no_relaxation(size):
 
 
 def test_cut_water_has_no_overlaps():
-    scene = scenes.build("water", 20, forces="ase")
+    scene = test_systems.build("water", 20, forces="ase")
     d = scene.positions[::3][:, None] - scene.positions[::3]
     d -= scene.cell * np.round(d / scene.cell)
     assert np.linalg.norm(d, axis=2)[np.triu_indices(20, 1)].min() > 2.2
@@ -319,9 +319,9 @@ def test_cut_water_has_no_overlaps():
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="openmm is an extra")
 def test_openmm_forces_of_water_agree_with_ewald_in_double_precision():
-    from kcons.comparison.scenes import openmm_potential
+    from kcons.comparison.test_systems import openmm_potential
 
-    scene = scenes.build("water", 27, forces="openmm")
+    scene = test_systems.build("water", 27, forces="openmm")
     import openmm
 
     # Two molecules far apart in a large box without periodicity: Coulomb's law and Lennard-Jones by hand.
@@ -433,7 +433,7 @@ def test_atoms_carry_the_scene(name):
 )
 def test_bad_scene(name, size, options, text):
     with pytest.raises(InputError, match=text):
-        scenes.build(name, size, **options)
+        test_systems.build(name, size, **options)
 
 
 def test_unknown_chain_shape():

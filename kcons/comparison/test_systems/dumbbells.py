@@ -12,10 +12,10 @@ import numpy as np
 from ase import units
 from scipy.spatial import cKDTree
 
-from kcons.comparison.scenes.minimal import integrated
-from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
-from kcons.comparison.scenes.potential import Evaluate, Potential
-from kcons.comparison.scenes.scene import Reference, Scene, Units, thermal_velocities
+from kcons.comparison.test_systems.minimal import integrated
+from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.potential import Evaluate, Potential
+from kcons.comparison.test_systems.system import Reference, TestSystem, Units, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -55,7 +55,7 @@ SMALLEST = 8
 CUTOFF, SWITCH = 2.5, 0.7
 
 
-def build(size: int = 2, seed: int = 1) -> Scene:
+def build(size: int = 2, seed: int = 1) -> TestSystem:
     """Two dumbbells that collide, or a box of `size` of them.
 
     Parameters
@@ -74,7 +74,8 @@ def build(size: int = 2, seed: int = 1) -> Scene:
         return _collision()
     if size < SMALLEST:
         raise InputError(
-            f"{size} dumbbells are neither a collision nor a box; use 2, or at least {SMALLEST}", item="size"
+            f"there is no test system of {size} dumbbells; use 2 (a collision), or at least {SMALLEST} (a box)",
+            item="size",
         )
     return _box(size, seed)
 
@@ -86,8 +87,8 @@ def _pairs(size: int) -> IntArray:
 # -- two --------------------------------------------------------------------------------------------
 
 
-def _collision() -> Scene:
-    return Scene(
+def _collision() -> TestSystem:
+    return TestSystem(
         name="dumbbells",
         title="collision of two rigid Lennard-Jones dumbbells, no cutoff",
         constraint_set=ConstraintSet(Distance(_pairs(2), LENGTHS), POSITIONS, MASSES),
@@ -163,7 +164,7 @@ def encounter(time: float) -> Reference:
 # -- a box ------------------------------------------------------------------------------------------
 
 
-def _box(size: int, seed: int) -> Scene:
+def _box(size: int, seed: int) -> TestSystem:
     rng = np.random.default_rng(seed)
     cells = math.ceil(size ** (1 / 3) - 1e-9)
     side = cells * SPACING
@@ -176,7 +177,7 @@ def _box(size: int, seed: int) -> Scene:
     cutoff = min(CUTOFF, 0.499 * side)
     held = ConstraintSet(Distance(_pairs(size), BOND), x, masses, cell=np.full(3, side))
     motion = Motion(held, x)
-    return Scene(
+    return TestSystem(
         name="dumbbells",
         title=f"{size} rigid Lennard-Jones dumbbells, box {side:.4g} σ, T = {TEMPERATURE:g} ε, cutoff {cutoff:.3g} σ",
         constraint_set=held,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
-from kcons.comparison.scenes.potential import Potential, uniform_field
-from kcons.comparison.scenes.scene import REDUCED, Reference, Scene
+from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.potential import Potential, uniform_field
+from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -27,7 +27,7 @@ NO_SPHERE = "ASE has no constraint that holds an atom on a sphere"
 TILT, SLOW = 0.02, 0.01
 
 
-def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool = False) -> Scene:
+def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool = False) -> TestSystem:
     """`size` independent particles, each on its own sphere of radius 1.
 
     Parameters
@@ -77,7 +77,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool
     what = f"spherical pendulums, g = {gravity:g}" if gravity else "free particles on spheres"
     if near_top:
         what += f", {TILT:g} rad from upright"
-    return Scene(
+    return TestSystem(
         name="sphere-pendulum-top" if near_top else "sphere-pendulum" if gravity else "sphere",
         title=f"{size} {what}; units R, τ = R/v0, ε = m v0²",
         constraint_set=ConstraintSet(spheres, x, masses),

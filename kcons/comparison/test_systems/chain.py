@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.scenes.openmm_host import ASE_LENGTH, ASE_TIME, OpenMMHost, system_of
-from kcons.comparison.scenes.potential import Evaluate, Potential
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, ASE_TIME, OpenMMHost, system_of
+from kcons.comparison.test_systems.potential import Evaluate, Potential
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -33,7 +33,7 @@ SHAPES = {
 }
 
 
-def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> Scene:
+def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> TestSystem:
     """A chain of `size` bonds; every atom is tied to its initial place by a soft anisotropic spring.
 
     Parameters
@@ -63,7 +63,7 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> Scene:
     if size >= VERY_LONG:
         horizon, steps = 20.0, steps[:3]
     v = thermal_velocities(Motion(held, x), x, TEMPERATURE, seed, at_rest=False)
-    return Scene(
+    return TestSystem(
         name="chain" if shape == "zigzag" else f"chain-{shape}",
         title=f"chain of {size} rigid bonds, {SHAPES[shape]}, 300 K; springs to the initial sites",
         constraint_set=held,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.scenes.potential import Potential
+from kcons.comparison.test_systems.potential import Potential
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.scenes.openmm_host import ASE_LENGTH, OpenMMHost, place
-from kcons.comparison.scenes.potential import Potential, of_calculator
-from kcons.comparison.scenes.scene import Scene, thermal_velocities
+from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost, place
+from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -146,7 +146,7 @@ def from_file(
     forces: str = "openmm",
     force_field: Sequence[str] | None = None,
     platform: str = "",
-) -> Scene:
+) -> TestSystem:
     """The molecules of a file at 300 K.
 
     Angles are held as distances of their ends, which all MD engines can do.
@@ -206,7 +206,7 @@ def from_file(
     x = motion.restore_positions(x)
     many, few = len(x) > MANY_ATOMS, len(x) <= FEW_ATOMS
     steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
-    return Scene(
+    return TestSystem(
         name=Path(path).stem,
         title=f"{found.title}, {TEMPERATURE:g} K; {potential.name}",
         constraint_set=held,
@@ -252,7 +252,7 @@ def _has_force_field(file: str) -> bool:
 def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMHost:
     if find_spec("openmm") is None:
         raise UnsupportedError("these forces need OpenMM; python -m pip install openmm, or --forces emt, gfn2, ...")
-    from kcons.comparison.scenes.structure import force_field_of, system_of
+    from kcons.comparison.test_systems.structure import force_field_of, system_of
     from kcons.openmm.topology import openmm_topology
 
     if not all(isinstance(item, Distance) for item in rows):
