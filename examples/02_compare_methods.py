@@ -8,10 +8,10 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from kcons.comparison import measure, report, scenes
+from kcons.comparison import measure, report, test_systems
 
-scene = scenes.build("chain", size=10)
-result = measure.compare(scene, methods=["rattle", "ase-kcons", "ase-bonds"], budget=10)
+test_system = test_systems.build("chain", size=10)
+result = measure.compare(test_system, methods=["rattle", "ase-kcons", "ase-bonds"], budget=10)
 
 Console(width=report.WIDTH).print(report.table(result))
 print(report.explanation(result))

@@ -25,7 +25,7 @@ import openmm
 from rich.console import Console
 
 from kcons.cli.progress import Bars
-from kcons.comparison import Comparison, Measurement, Scene, json_files, measure, report, scenes, scripts
+from kcons.comparison import Comparison, Measurement, TestSystem, json_files, measure, report, scripts, test_systems
 from kcons.openmm import ProjectedIntegrator, hold
 
 #: Test systems, the errors in Å that they are asked for, and steps a turn.
@@ -35,12 +35,12 @@ QUICK_METHODS = ("openmm-verlet", "openmm-middle-bath", "openmm-kcons-rattle", "
 TIME_STEP = 1e-3  # ps
 
 
-def steps_in_turn(scene: Scene, steps: int, turns: int) -> dict[str, dict[str, float]]:
+def steps_in_turn(test_system: TestSystem, steps: int, turns: int) -> dict[str, dict[str, float]]:
     """Milliseconds of processor time a step, and steps a second relative to VerletIntegrator at its own tolerance."""
-    host = scene.openmm
+    host = test_system.openmm
     assert host is not None
     held = host.copy()
-    part = hold(held, [], scene.positions * host.length, take="all")
+    part = hold(held, [], test_system.positions * host.length, take="all")
     tight = openmm.VerletIntegrator(TIME_STEP)
     tight.setConstraintTolerance(1e-12)
     racers = {
@@ -54,8 +54,8 @@ def steps_in_turn(scene: Scene, steps: int, turns: int) -> dict[str, dict[str, f
     contexts = {}
     for name, (system, integrator) in racers.items():
         contexts[name] = host.context(system, integrator)
-        contexts[name].setPositions(scene.positions * host.length)
-        contexts[name].setVelocities(scene.velocities * host.speed)
+        contexts[name].setPositions(test_system.positions * host.length)
+        contexts[name].setVelocities(test_system.velocities * host.speed)
         integrator.step(2)
     calls = {name: partial(integrator.step, steps) for name, (_, integrator) in racers.items()}
     return scripts.speeds(scripts.in_turn(calls, turns), steps)
@@ -93,13 +93,13 @@ def run(full: bool) -> dict[str, Any]:
         for name, targets in FULL.items():
             if not full and name != "alanine":
                 continue
-            scene = scenes.build(name, quick=not full)
+            test_system = test_systems.build(name, quick=not full)
             methods = None if full else QUICK_METHODS
-            result = measure.compare(scene, methods=methods, budget=60 if full else 5, watcher=watcher)
+            result = measure.compare(test_system, methods=methods, budget=60 if full else 5, watcher=watcher)
             found[name] = result.to_dict()
             if full:
                 found[name]["targets"] = [cheapest(result, target) for target in targets]
-            found[name]["steps in turn"] = steps_in_turn(scene, TURN[name], 25 if full else 3)
+            found[name]["steps in turn"] = steps_in_turn(test_system, TURN[name], 25 if full else 3)
     return found
 
 

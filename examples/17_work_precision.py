@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from kcons import State, System, run, steppers
-from kcons.comparison import json_files, scenes
+from kcons.comparison import json_files, test_systems
 from kcons.errors import ConvergenceError
 
 STEPPERS = [steppers.Rattle(), steppers.Suzuki4(), steppers.BlanesMoan4(), steppers.BlanesMoan6()]
@@ -23,30 +23,35 @@ RESULT = Path("work_precision.json")
 
 
 def measure(name: str) -> dict:
-    scene = scenes.build(name, quick=True)
-    system = System(scene.motion, scene.potential.forces)
-    start = State(scene.positions, scene.velocities)
-    reference = scene.reference()
+    test_system = test_systems.build(name, quick=True)
+    system = System(test_system.motion, test_system.potential.forces)
+    start = State(test_system.positions, test_system.velocities)
+    reference = test_system.reference()
     curves = {}
     for stepper in STEPPERS:
-        stepper.step(system, start, scene.horizon / 1000)  # compiles what has to be compiled
+        stepper.step(system, start, test_system.horizon / 1000)  # compiles what has to be compiled
         points = []
         for force_evaluations in (60, 120, 240, 480, 960):
             steps = max(1, force_evaluations // stepper.force_evaluations)  # the same work for all
-            scene.potential.forget()
+            test_system.potential.forget()
             times = []
             try:
                 for _ in range(3):
                     begun = perf_counter()
-                    end = run(system, start, scene.horizon / steps, steps, stepper=stepper)
+                    end = run(system, start, test_system.horizon / steps, steps, stepper=stepper)
                     times.append(perf_counter() - begun)
             except ConvergenceError as failure:  # a step too long for the constraints: no point
                 print(f"{type(stepper).__name__}, {steps} steps: {str(failure).split('.')[0]}")
                 continue
             error = np.sqrt(np.mean(np.sum((end.positions - reference.positions) ** 2, axis=1)))
-            points.append([scene.potential.evaluations / 3, float(np.median(times)), float(error)])
+            points.append([test_system.potential.evaluations / 3, float(np.median(times)), float(error)])
         curves[type(stepper).__name__] = points
-    return {"scene": scene.title, "length": scene.units.length, "reference": reference.error, "curves": curves}
+    return {
+        "scene": test_system.title,
+        "length": test_system.units.length,
+        "reference": reference.error,
+        "curves": curves,
+    }
 
 
 def draw(result: dict, path: Path) -> None:

@@ -18,7 +18,7 @@ from ase import Atoms
 from ase.calculators.calculator import Calculator
 
 from kcons.ase import ConstrainedDynamics, IsokineticDynamics, constrain
-from kcons.comparison import Fluid, environment, scenes, scripts
+from kcons.comparison import Fluid, environment, scripts, test_systems
 from kcons.thermostats import thermal_velocities
 
 #: Fluid, molecules, steps of a block: 10 to 20 ms.
@@ -63,7 +63,7 @@ def timed(dynamics: ConstrainedDynamics, steps: int) -> float:
 
 def cost(title: str, name: str, molecules: int, steps: int, repeats: int) -> dict[str, Any]:
     """Both dynamics of one fluid, block after block, each of them first every other time."""
-    fluid = scenes.build_fluid(name, molecules)
+    fluid = test_systems.build_fluid(name, molecules)
     runs = [made(fluid, ConstrainedDynamics), made(fluid, IsokineticDynamics)]
     found = np.empty((repeats, 2))
     for dynamics in runs:

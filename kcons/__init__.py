@@ -37,7 +37,7 @@ MOVED = {
     "recommendation": "comparison.work_precision.recommendation",
     "report": "comparison.work_precision.report",
     "sampling": "comparison.averages.sampling",
-    "scenes": "comparison.scenes",
+    "scenes": "comparison.test_systems",
     "stability": "comparison.stability",
 }
 

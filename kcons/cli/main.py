@@ -18,8 +18,8 @@ from kcons.errors import InputError, KconsError
 
 if TYPE_CHECKING:
     from kcons.comparison.methods.method import Method
-    from kcons.comparison.scenes import Scene
-    from kcons.comparison.scenes.fluid import Fluid
+    from kcons.comparison.test_systems import TestSystem
+    from kcons.comparison.test_systems.fluid import Fluid
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,9 +60,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
-    scene_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
+    names_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("scene", nargs="?", help=scene_help)
+    common.add_argument("scene", nargs="?", help=names_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
     molecules = common.add_argument_group("molecules in OpenMM: alanine, dhfr, dhfr-water, villin, and files")
@@ -149,7 +149,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         return _compare_all(chosen)
     if chosen.list:
         return _list()
-    from kcons.comparison import scenes
+    from kcons.comparison import test_systems
 
     budget = chosen.budget if chosen.budget is not None else (5.0 if chosen.quick else 20.0)
     folder: Path = chosen.out or Path(f"compare-{Path(chosen.scene or '').stem}")
@@ -159,7 +159,7 @@ def _compare(chosen: argparse.Namespace) -> int:
     target: float | None = chosen.target_error
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
-    if chosen.scene in scenes.FLUIDS:
+    if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
         return _compare_averages(chosen, budget, folder, asked)
@@ -169,18 +169,18 @@ def _compare(chosen: argparse.Namespace) -> int:
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
-    _check_scene(chosen)
+    _check_name(chosen)
     with Bars() as watcher:
         compiling = "" if measure.kernels_cached() else "; compiling kernels (once)"
         with watcher.piece(f"building the test system{compiling}", 1):
-            scene = _scene(chosen, quick=chosen.quick)
+            test_system = _test_system(chosen, quick=chosen.quick)
         if chosen.dt is not None:
-            scene = scene.with_time_steps(chosen.dt)
+            test_system = test_system.with_time_steps(chosen.dt)
         folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
-        reference = None if target is None else measure.reference_of(scene, watcher)
+        reference = None if target is None else measure.reference_of(test_system, watcher)
         rounds = QUICK_ROUNDS if chosen.quick else ROUNDS
         result = measure.compare(
-            scene,
+            test_system,
             methods=chosen.methods,
             budget=budget,
             watcher=watcher,
@@ -190,7 +190,7 @@ def _compare(chosen: argparse.Namespace) -> int:
         )
         if target is not None and reference is not None:
             result = recommendation.recommend(
-                scene,
+                test_system,
                 result,
                 target,
                 reference=reference,
@@ -209,17 +209,17 @@ def _compare(chosen: argparse.Namespace) -> int:
 
 
 def _expression(chosen: argparse.Namespace) -> str:
-    """Python that makes the test system, after `from kcons.comparison import scenes`."""
-    from kcons.comparison import scenes
+    """Python that makes the test system, after `from kcons.comparison import test_systems`."""
+    from kcons.comparison import test_systems
 
     said: dict[str, Any] = {"seed": chosen.seed} if chosen.seed != 1 else {}
     said |= {"quick": True} if chosen.quick else {}
     said |= _molecules(chosen)
     words = [f"{name}={_literal(value)}" for name, value in said.items()]
-    if scenes.is_file(chosen.scene):
-        return f"scenes.from_file({', '.join([_literal(chosen.scene), *words])})"
+    if test_systems.is_file(chosen.scene):
+        return f"test_systems.from_file({', '.join([_literal(chosen.scene), *words])})"
     size = [] if chosen.size is None else [str(chosen.size)]
-    return f"scenes.build({', '.join([_literal(chosen.scene), *size, *words])})"
+    return f"test_systems.build({', '.join([_literal(chosen.scene), *size, *words])})"
 
 
 def _literal(value: Any) -> str:
@@ -258,7 +258,7 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     from kcons.comparison.averages import sampling
 
     sampling.chosen(chosen.methods)  # complain before any work
-    _check_scene(chosen)
+    _check_name(chosen)
     if _molecules(chosen):
         raise InputError(
             f"--{next(iter(_molecules(chosen))).replace('_', '-')} is for molecules in OpenMM, not for fluids",
@@ -278,18 +278,18 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     return 0
 
 
-def _check_scene(chosen: argparse.Namespace) -> None:
-    from kcons.comparison import scenes
+def _check_name(chosen: argparse.Namespace) -> None:
+    from kcons.comparison import test_systems
 
-    known = ", ".join((*scenes.SCENES, *scenes.FLUIDS))
+    known = ", ".join((*test_systems.SYSTEMS, *test_systems.FLUIDS))
     if chosen.scene is None:
         raise InputError(f"name a test system: {known}; or a PDB file", item="scene")
-    if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
+    if test_systems.is_file(chosen.scene) or test_systems.is_other_file(chosen.scene):
         if not Path(chosen.scene).is_file():
             raise InputError(f"there is no file {chosen.scene}", item="scene")
         if chosen.size is not None:
             raise InputError("a file has the size it has; leave --size out", item="size")
-    elif chosen.scene not in scenes.SCENES and chosen.scene not in scenes.FLUIDS:
+    elif chosen.scene not in test_systems.SYSTEMS and chosen.scene not in test_systems.FLUIDS:
         raise InputError(
             f"there is no test system {chosen.scene!r}; there are {known}; or give a PDB file", item="scene"
         )
@@ -312,29 +312,29 @@ def _molecules(chosen: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in said.items() if value is not None}
 
 
-def _scene(chosen: argparse.Namespace, *, quick: bool = False) -> Scene:
-    from kcons.comparison import scenes
+def _test_system(chosen: argparse.Namespace, *, quick: bool = False) -> TestSystem:
+    from kcons.comparison import test_systems
 
-    if scenes.is_file(chosen.scene) or scenes.is_other_file(chosen.scene):
-        if chosen.add_hydrogens and scenes.by_mdanalysis(chosen.scene, _molecules(chosen)):
+    if test_systems.is_file(chosen.scene) or test_systems.is_other_file(chosen.scene):
+        if chosen.add_hydrogens and test_systems.by_mdanalysis(chosen.scene, _molecules(chosen)):
             raise InputError("--add-hydrogens is for PDB and mmCIF files with OpenMM", item="add_hydrogens")
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", UserWarning)
-            scene = scenes.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
+            test_system = test_systems.from_file(chosen.scene, chosen.seed, quick=quick, **_molecules(chosen))
         for text in dict.fromkeys(str(w.message) for w in said if w.category is UserWarning):
             print(f"kcons: {text}", file=sys.stderr)
-        return scene
+        return test_system
     if chosen.add_hydrogens:
         raise InputError("--add-hydrogens is for files; the built-in molecules have theirs", item="add_hydrogens")
-    for name in sorted(scenes.FILE_OPTIONS & set(_molecules(chosen))):
+    for name in sorted(test_systems.FILE_OPTIONS & set(_molecules(chosen))):
         raise InputError(f"--{name.replace('_', '-')} is for files, not for built-in test systems", item=name)
-    return scenes.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
+    return test_systems.build(chosen.scene, chosen.size, chosen.seed, quick=quick, **_molecules(chosen))
 
 
 def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
-    from kcons.comparison import scenes
+    from kcons.comparison import test_systems
 
-    return scenes.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
+    return test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=quick)
 
 
 # -- plan and list ----------------------------------------------------------------------------------
@@ -343,26 +343,26 @@ def _fluid(chosen: argparse.Namespace, *, quick: bool = False) -> Fluid:
 def _plan(chosen: argparse.Namespace) -> int:
     if chosen.list:
         return _list()
-    from kcons.comparison import scenes
+    from kcons.comparison import test_systems
 
-    _check_scene(chosen)
+    _check_name(chosen)
     given = _molecules(chosen)
-    if scenes.is_other_file(chosen.scene) and scenes.by_mdanalysis(chosen.scene, given):
+    if test_systems.is_other_file(chosen.scene) and test_systems.by_mdanalysis(chosen.scene, given):
         return _plan_file(chosen, given)
-    if chosen.scene in scenes.FLUIDS:
+    if chosen.scene in test_systems.FLUIDS:
         fluid = _fluid(chosen)
         print(fluid.title)
         print(fluid.motion.report(fluid.positions))
         return 0
-    scene = _scene(chosen)
-    print(scene.title)
-    print(scene.motion.report(scene.positions, scene.velocities))
+    test_system = _test_system(chosen)
+    print(test_system.title)
+    print(test_system.motion.report(test_system.positions, test_system.velocities))
     return 0
 
 
 def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
     """Nothing but the rows: no forces are needed."""
-    from kcons.comparison.scenes import any_file
+    from kcons.comparison.test_systems import any_file
 
     for name in ("forces", "force_field", "platform", "add_hydrogens"):
         if name in given:
@@ -380,12 +380,12 @@ def _plan_file(chosen: argparse.Namespace, given: dict[str, Any]) -> int:
 
 
 def _list() -> int:
-    from kcons.comparison import scenes
+    from kcons.comparison import test_systems
     from kcons.comparison.averages import sampling
     from kcons.comparison.methods import methods
 
     print("test systems")
-    for name, entry in scenes.SCENES.items():
+    for name, entry in test_systems.SYSTEMS.items():
         print(f"  {name:<16} {entry.text} (default {entry.size} {entry.unit})")
     print(f"  {'FILE.pdb, .cif':<16} your own molecules; OpenMM, --forcefield, --constrain")
     print(f"  {'FILE':<16} any topology that MDAnalysis reads; --coordinates, --constrain, --select, --forces")
@@ -393,7 +393,7 @@ def _list() -> int:
     for name, method in methods.METHODS.items():
         print(f"  {name:<27} {method.title}{_when(method)}")
     print("test systems at a temperature, whose averages are compared")
-    for name, entry in scenes.FLUIDS.items():
+    for name, entry in test_systems.FLUIDS.items():
         print(f"  {name:<21} {entry.text} (default {entry.size} {entry.unit})")
     print("thermostats for these")
     for name, thermostat in sampling.METHODS.items():

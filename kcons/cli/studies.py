@@ -64,7 +64,9 @@ def _stability(chosen: argparse.Namespace) -> int:
     chosen.out.mkdir(parents=True, exist_ok=True)
     kept = chosen.out / "stability.json"
     with Bars() as watcher:
-        found = stability.run(only=chosen.only, scenes=chosen.scenes, quick=chosen.quick, kept=kept, watcher=watcher)
+        found = stability.run(
+            only=chosen.only, test_systems=chosen.scenes, quick=chosen.quick, kept=kept, watcher=watcher
+        )
     result = stability.digest(found)
     if chosen.into:
         before, result = stability.put_into(result, chosen.into[0])

@@ -1,7 +1,7 @@
 """Which method, and which step? Measured on test systems and on the user's own.
 
 - `study`: pages, machines and progress of all studies
-- `scenes`: the test systems
+- `test_systems`: the test systems
 - `methods`: everything that runs them
 - `work_precision`: cost against error, and what follows from it
 - `averages`: thermostats and the averages they give
@@ -15,7 +15,7 @@ from typing import Any
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
     "averages": ("sampling",),
-    "scenes": ("fluid",),
+    "test_systems": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),
     "work_precision": ("fronts", "measure", "recommendation", "report"),
@@ -23,12 +23,12 @@ _MODULES = {
 _NAMES = {
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
-    "scenes": ("Reference", "Scene"),
-    "scenes.any_file": ("read",),
-    "scenes.fluid": ("Fluid",),
-    "scenes.lennard_jones": ("LennardJones",),
-    "scenes.openmm_host": ("system_of",),
-    "scenes.potential": ("Potential", "PotentialCalculator"),
+    "test_systems": ("Reference", "TestSystem"),
+    "test_systems.any_file": ("read",),
+    "test_systems.fluid": ("Fluid",),
+    "test_systems.lennard_jones": ("LennardJones",),
+    "test_systems.openmm_host": ("system_of",),
+    "test_systems.potential": ("Potential", "PotentialCalculator"),
     "study.machine": ("environment",),
     "work_precision.measurement": ("Comparison", "Measurement"),
 }

@@ -5,7 +5,7 @@ collective variables, surfaces and the constraint objects of kcons.
 
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
-- `ensembles`: Langevin and isokinetic
+- `ensembles`: Langevin, isokinetic, Nosé-Hoover
 - `carried`: constraint objects of kcons
 - `collective`: collective variables
 - `surfaces`: particles on surfaces
@@ -18,6 +18,7 @@ from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
+from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -34,6 +35,7 @@ __all__ = [
     "ExpressionSurface",
     "Isokinetic",
     "Langevin",
+    "NoseHoover",
     "Precision",
     "ProjectedIntegrator",
     "RattleIntegrator",

@@ -11,6 +11,7 @@ import numpy as np
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
+from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4
 from kcons.steppers.operations import Chain, Operation
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.stepper import Listed, stays
@@ -23,11 +24,44 @@ from kcons.thermostats.freedom import (
     warn_of_conserved_momenta,
 )
 
-#: Suzuki's fractions of order 4 for the motion of the chain.
-_SHARE = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
-FRACTIONS = (_SHARE, _SHARE, 1.0 - 4.0 * _SHARE, _SHARE, _SHARE)
+#: Fractions in which the chain moves, by order: a symmetric step, Suzuki's five, Kahan and Li's nine.
+FRACTIONS = {2: (1.0,), 4: SUZUKI_4, 6: KAHAN_LI_6}
 #: What comes before a step on the constraints, and after it.
 HALF = Chain(0.5)
+
+
+def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
+    """The fractions of its time in which a chain moves on.
+
+    Parameters
+    ----------
+    chain_order : {2, 4, 6}
+    repeats : int
+        How many times in succession, each over its part of the time.
+
+    Raises
+    ------
+    InputError
+        Another order; no repeat.
+    """
+    if chain_order not in FRACTIONS:
+        raise InputError(f"chain_order is {chain_order!r}; give 2, 4 or 6", item="chain_order")
+    if int(repeats) != repeats or repeats < 1:
+        raise InputError(f"repeats is {repeats}; give a whole number, 1 or more", item="repeats")
+    return tuple(share / int(repeats) for share in FRACTIONS[chain_order]) * int(repeats)
+
+
+def chain_length(length: int) -> int:
+    """The number of links.
+
+    Raises
+    ------
+    InputError
+        No whole number above zero.
+    """
+    if int(length) != length or length < 1:
+        raise InputError(f"length is {length}; give a whole number, 1 or more", item="length")
+    return int(length)
 
 
 class NoseHooverChain(Listed):
@@ -44,6 +78,10 @@ class NoseHooverChain(Listed):
         Time in which the temperature oscillates; a few times the slowest vibration, at least 20 time steps.
     length : int
         Links of the chain.
+    chain_order : {2, 4, 6}
+        Of the motion of the chain at fixed velocities.
+    repeats : int
+        In how many parts of the time it is made.
     stepper : Splitting, optional
         Of order 2; `Rattle` by default.
     momentum : {'auto', 'conserved', 'free'}
@@ -52,7 +90,7 @@ class NoseHooverChain(Listed):
     Raises
     ------
     InputError
-        Temperature or period not positive, no links.
+        Temperature or period not positive, no links, an unknown order.
 
     Warns
     -----
@@ -79,14 +117,15 @@ class NoseHooverChain(Listed):
         period: float,
         *,
         length: int = 3,
+        chain_order: int = 4,
+        repeats: int = 1,
         stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        if int(length) != length or length < 1:
-            raise InputError(f"length is {length}; give a whole number, 1 or more", item="length")
+        self.length = chain_length(length)
+        self.fractions = chain_fractions(chain_order, repeats)
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
         self.period = positive(period, "period")
-        self.length = int(length)
         self.stepper: Splitting = Rattle() if stepper is None else stepper
         if self.stepper.order != 2:
             raise UnsupportedError(f"{self.stepper!r} has order {self.stepper.order}, the chain 2; use Rattle")
@@ -159,7 +198,7 @@ class NoseHooverChain(Listed):
         chain = thermostat.copy()
         masses = self._masses(float(chain[-1]))
         scale = _advance(
-            chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, HALF.fraction * dt, FRACTIONS
+            chain, masses, 2 * system.kinetic_energy(v), self.thermal_energy, HALF.fraction * dt, self.fractions
         )
         if not math.isfinite(scale):
             raise OverflowError

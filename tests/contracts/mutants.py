@@ -194,6 +194,18 @@ MUTANTS = [
         "tests/openmm/integrator/test_lean_step_writer.py::test_failure_where_nobody_looked",
     ),
     (
+        "openmm/ensembles/nose_hoover_ensemble.py",
+        'program.let(name, _before(name), "the chain is back where the step began")',
+        'program.let(name, name, "the chain is back where the step began")',
+        "tests/openmm/ensembles/test_nose_hoover_ensemble.py::test_a_step_that_fails_leaves_the_chain_where_it_was",
+    ),
+    (
+        "openmm/integrator/guard.py",
+        "self.integrator.program.recall(self._memory)",
+        "self.integrator.program.recall({})",
+        "tests/openmm/ensembles/test_nose_hoover_ensemble.py::test_a_nan_leaves_the_chain_of_the_last_check",
+    ),
+    (
         "openmm/ensembles/langevin_ensemble.py",
         "sqrt(2*kT*kept_share*sinh(friction*dt))",
         "sqrt(kT*kept_share*sinh(friction*dt))",

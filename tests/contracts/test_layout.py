@@ -19,7 +19,7 @@ PACKAGE = ROOT / "kcons"
 FILES = sorted(PACKAGE.rglob("*.py"))
 FOLDERS = sorted({path.parent for path in FILES})
 #: Folders in which one file is one test system or one theme.
-CATALOGUES = {"comparison/scenes", "comparison/hard_cases"}
+CATALOGUES = {"comparison/test_systems", "comparison/hard_cases"}
 #: Names that several modules may have: each says what its folder's is.
 SHARED = {"topology", "report", "study"}
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from kcons.cli import main
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods, snippets
 from kcons.comparison.work_precision import measure, recommendation
 from kcons.comparison.work_precision.measurement import Measurement
 from kcons.comparison.work_precision.timing_rounds import Rounds
 from kcons.errors import InputError
 
-CHAIN = 'scenes.build("chain", 4)'
+CHAIN = 'test_systems.build("chain", 4)'
 
 
 def point(error, setting, **changes):
@@ -67,7 +67,7 @@ def test_nothing_is_predicted_from_a_plateau_one_point_or_too_far():
 
 @pytest.fixture(scope="module")
 def chain():
-    return scenes.build("chain", 4)
+    return test_systems.build("chain", 4)
 
 
 @pytest.fixture(scope="module")
@@ -200,16 +200,16 @@ def test_lines_of_code_run_to_the_end_of_the_trajectory(chain, reference, name):
 
 
 def test_lines_of_code_on_arrays():
-    scene = scenes.build("sphere", 2)
-    text = snippets.code(scene, "suzuki4", 0.2, 'scenes.build("sphere", 2)')
+    scene = test_systems.build("sphere", 2)
+    text = snippets.code(scene, "suzuki4", 0.2, 'test_systems.build("sphere", 2)')
     space = {}
     exec(compile(text, "suzuki4", "exec"), space)
     assert np.abs(space["end"].positions - scene.reference().positions).max() < 1e-4
 
 
 def test_lines_of_code_of_adaptive_steps():
-    scene = scenes.build("dumbbells")
-    text = snippets.code(scene, "extrapolation", 1e-8, 'scenes.build("dumbbells")')
+    scene = test_systems.build("dumbbells")
+    text = snippets.code(scene, "extrapolation", 1e-8, 'test_systems.build("dumbbells")')
     space = {}
     exec(compile(text, "extrapolation", "exec"), space)
     assert "Extrapolation(1e-08)" in text and space["end"].time == scene.horizon
@@ -253,7 +253,7 @@ def test_command(tmp_path, capsys):
     assert "For an error of at most 1e-05 R at 2 τ" in printed
     entry = json.loads((out / "compare.json").read_text(encoding="utf-8"))["recommendation"]
     assert entry["reached"] and entry["error"] <= 1e-5
-    assert 'scene = scenes.build("sphere-pendulum", quick=True)' in entry["code"]
+    assert 'test_system = test_systems.build("sphere-pendulum", quick=True)' in entry["code"]
     exec(compile(entry["code"], "recommended", "exec"), {})
 
 

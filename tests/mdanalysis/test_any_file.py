@@ -13,8 +13,8 @@ from ase.build import molecule
 from host_systems import ALANINE, quietly, read_universe
 
 from kcons.cli import main
-from kcons.comparison import scenes
-from kcons.comparison.scenes import any_file
+from kcons.comparison import test_systems
+from kcons.comparison.test_systems import any_file
 from kcons.constraints import LinearRelation
 from kcons.errors import InputError, UnsupportedError
 
@@ -97,7 +97,7 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
 
 
 def test_scene_with_a_calculator_of_ase(ethanol):
-    scene = quietly(scenes.from_file, ethanol, forces="emt", constrain="hangles")
+    scene = quietly(test_systems.from_file, ethanol, forces="emt", constrain="hangles")
     assert scene.constraint_set.n_rows == len(scene.bonds) == 13
     assert scene.openmm is None
     assert max(scene.residuals(scene.positions, scene.velocities)) < 1e-12
@@ -105,8 +105,8 @@ def test_scene_with_a_calculator_of_ase(ethanol):
 
 
 def test_scene_with_a_force_field_is_the_one_of_openmm(alanine):
-    by_openmm = scenes.build("alanine", constrain="hbonds")
-    scene = quietly(scenes.from_file, alanine)
+    by_openmm = test_systems.build("alanine", constrain="hbonds")
+    scene = quietly(test_systems.from_file, alanine)
     assert scene.openmm.home
     assert {tuple(sorted(p)) for p in scene.bonds.tolist()} == {tuple(sorted(p)) for p in by_openmm.bonds.tolist()}
     x = by_openmm.positions
@@ -115,7 +115,7 @@ def test_scene_with_a_force_field_is_the_one_of_openmm(alanine):
 
 
 def test_rigid_residues_in_openmm(alanine):
-    scene = quietly(scenes.from_file, alanine, rigid_residues=["ALA"])
+    scene = quietly(test_systems.from_file, alanine, rigid_residues=["ALA"])
     inside = [k for k, name in enumerate(scene.symbols) if name]
     assert scene.openmm.home and len(inside) == 22
     assert scene.openmm.system.getNumConstraints() == scene.motion.constraint_set.n_rows
@@ -124,9 +124,9 @@ def test_rigid_residues_in_openmm(alanine):
 
 def test_forces_that_do_not_fit(ethanol, alanine):
     with pytest.raises(InputError, match="no forces 'emtt'; there are openmm, emt"):
-        quietly(scenes.from_file, ethanol, forces="emtt")
+        quietly(test_systems.from_file, ethanol, forces="emtt")
     with pytest.raises(InputError, match="residue"):
-        quietly(scenes.from_file, ethanol)  # no template
+        quietly(test_systems.from_file, ethanol)  # no template
     with pytest.raises(UnsupportedError, match="holds distances only"):
         any_file._openmm_host(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
 
@@ -152,7 +152,7 @@ def test_virtual_sites_have_a_plan_and_no_scene(tmp_path):
     assert len(found.rows.virtual_sites) == 1
     assert found.motion.degrees_of_freedom == 6
     with pytest.raises(UnsupportedError, match="1 virtual sites"):
-        quietly(scenes.from_file, path)
+        quietly(test_systems.from_file, path)
 
 
 def test_pdb_files_go_the_new_way_when_asked(capsys):
@@ -169,7 +169,7 @@ def test_a_protein_in_water_with_force_fields_by_name(tmp_path, capsys, monkeypa
     from openmm import app, unit
 
     monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
-    scene = quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
+    scene = quietly(test_systems.from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
     pdb = app.PDBFile(str(VILLIN))
     system = app.ForceField("amber14-all.xml", "amber14/tip3p.xml").createSystem(
         pdb.topology, nonbondedMethod=app.PME, constraints=app.HBonds, rigidWater=True
@@ -204,10 +204,10 @@ def test_compare_runs_on_a_protein_in_water(tmp_path, capsys, monkeypatch):
 
 def test_force_fields_that_do_not_fit(ethanol):
     with pytest.raises(InputError, match="--forcefield out"):
-        quietly(scenes.from_file, VILLIN, forces="amber14-all", force_field=["tip3p.xml"])
+        quietly(test_systems.from_file, VILLIN, forces="amber14-all", force_field=["tip3p.xml"])
     with pytest.raises(InputError, match="residue Cl 36"):
-        quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all")
+        quietly(test_systems.from_file, VILLIN, select="all", forces="amber14-all")
     with pytest.raises(InputError, match=r"nosuch\.xml"):
-        quietly(scenes.from_file, VILLIN, select="all", forces="amber14-all,nosuch")
+        quietly(test_systems.from_file, VILLIN, select="all", forces="amber14-all,nosuch")
     with pytest.raises(InputError, match="residue"):
-        quietly(scenes.from_file, ethanol, forces="tip3p.xml")
+        quietly(test_systems.from_file, ethanol, forces="tip3p.xml")

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "error-budget.md").read_text(encoding="utf-8")
 RESULTS = json.loads((ROOT / "docs" / "results" / "error_budget.json").read_text(encoding="utf-8"))
-SCENES = ("water", "chain", "dumbbells")
+SYSTEMS = ("water", "chain", "dumbbells")
 
 
 def load_example():
@@ -40,7 +40,7 @@ def test_the_figure_can_be_drawn_from_them(tmp_path):
     assert (ROOT / "docs" / "figures" / "error_budget.png").exists()
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", SYSTEMS)
 def test_the_step_enters_with_the_order(scene):
     found = RESULTS["scenes"][scene]
     assert slope(found["steps"]["kcons RATTLE"]) == pytest.approx(2.0, abs=0.1)
@@ -57,7 +57,7 @@ def test_the_tolerance_enters_with_its_first_power():
         assert 0.05 * tolerance < distance < 20 * tolerance
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", SYSTEMS)
 def test_kcons_has_none(scene):
     ((_, distance, residual),) = RESULTS["scenes"][scene]["tolerances"]["solvers"]["kcons"]
     assert distance < 1e-10 and residual < 1e-13

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods.methods import METHODS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "compare.md").read_text(encoding="utf-8")
@@ -20,7 +20,7 @@ def listed(name):
 
 
 def test_every_scene_is_listed():
-    assert {name for name in scenes.SCENES if name not in CODE} == set()
+    assert {name for name in test_systems.SYSTEMS if name not in CODE} == set()
 
 
 def test_every_method_is_listed():

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from kcons import steppers
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.work_precision import measure
 
@@ -87,7 +87,7 @@ def test_readme_quotes_the_committed_ratios():
 @pytest.mark.parametrize("name", example.SYSTEMS)
 def test_ten_times_fewer_evaluations_here_and_now(name):
     # Where the best stepper is below the goal, RATTLE is still above it with ten times its force evaluations.
-    scene = scenes.build(name)
+    scene = test_systems.build(name)
     curve = example.curve(scene, scene.reference(), "blanes-moan6", full=False)
     best = next(p for p in curve if p["error"] < example.GOAL)
     steps = 10 * int(best["evaluations"])

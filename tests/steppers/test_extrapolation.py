@@ -13,7 +13,7 @@ from stepper_attempts import attempts, counted, end_of, scene_system
 from stepper_problems import FRICTION, HOLONOMIC, VELOCITY_ROWS, GlobalError, named, observed_order
 from stepper_systems import gravity, growing_rod, rotor, skate, spherical_pendulum, system_of
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.work_precision import measure
 from kcons.constraints import Distance, FixedAtoms
 from kcons.steppers import (
@@ -62,7 +62,7 @@ def test_eight_orders_and_another_base() -> None:
     ("name", "most"), [("dumbbells", 300.0), ("triple-pendulum", 60.0), ("sphere-pendulum-top", 30.0)]
 )
 def test_errors_are_proportional_to_the_tolerance(name, most) -> None:
-    scene = scenes.build(name)
+    scene = test_systems.build(name)
     exact = scene.reference().positions
     system, times = scene_system(scene)
     tolerances, errors, calls = np.array([1e-5, 1e-7, 1e-9, 1e-11]), [], []
@@ -111,7 +111,7 @@ def at_error(error: float, errors, evaluations) -> float:
 def test_fewer_evaluations_than_dop853(name) -> None:
     """As the page says."""
     tolerances = 10.0 ** -np.arange(6, 11)
-    scene = replace(scenes.build(name), tolerances=tuple(tolerances))
+    scene = replace(test_systems.build(name), tolerances=tuple(tolerances))
     theirs = measure.compare(scene, methods=["dop853"], budget=60.0).of("dop853")
     exact = scene.reference().positions
     system, times = scene_system(scene)
@@ -144,7 +144,7 @@ def test_what_is_held_holds_at_loose_tolerances(make) -> None:
 @pytest.mark.parametrize("tolerance", [1e-13, 1e-14])
 def test_rounding_is_no_reason_for_small_steps(tolerance) -> None:
     for name in ("triple-pendulum", "sphere-pendulum-top"):
-        scene = scenes.build(name)
+        scene = test_systems.build(name)
         system, times = scene_system(scene)
         states = list(Extrapolation(tolerance).states(system, State(scene.positions, scene.velocities), scene.horizon))
         assert len(states) < 60 and len(times) < 2000

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from thermostat_systems import METHANE, TEN, quartic, repelling, swirling, system, waves
 
-from kcons.comparison.scenes.lennard_jones import LennardJones
+from kcons.comparison.test_systems.lennard_jones import LennardJones
 from kcons.constraints import (
     CenterOfMass,
     Cylinder,

@@ -98,6 +98,8 @@ def test_another_stepper_of_order_two():
         ({"period": math.nan}, "period is nan"),
         ({"length": 0}, "length is 0"),
         ({"length": 1.5}, "length is 1.5"),
+        ({"chain_order": 3}, "chain_order is 3; give 2, 4 or 6"),
+        ({"repeats": 0}, "repeats is 0"),
     ],
 )
 def test_bad_parameters(options, words):
@@ -150,3 +152,16 @@ def test_temperature_oscillates_with_the_period_asked_for(n):
     before = np.flatnonzero(off[1:] * off[:-1] < 0)
     times = dt * (before + off[before] / (off[before] - off[before + 1]))
     assert 2 * np.diff(times).mean() == pytest.approx(period / math.sqrt(2), rel=2e-3)
+
+
+def test_finer_motion_of_the_chain_converges():
+    """The same step of the atoms, chains moved more and more finely: orders 2, 4 and 6 in the length of a part."""
+    held, state = started()
+    exact = NoseHooverChain(0.5, 0.3, chain_order=6, repeats=32)
+    end = run(held, state, 0.04, 10, stepper=exact)
+    for order, coarse in ((2, 4), (4, 4), (6, 2)):
+        errors = []
+        for repeats in (coarse, 2 * coarse):
+            thermostat = NoseHooverChain(0.5, 0.3, chain_order=order, repeats=repeats)
+            errors.append(np.abs(run(held, state, 0.04, 10, stepper=thermostat).thermostat - end.thermostat).max())
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.4)

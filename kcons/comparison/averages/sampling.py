@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kcons.comparison.scenes.fluid import Fluid
 from kcons.comparison.study.machine import environment
 from kcons.comparison.study.study import Watcher, picked
+from kcons.comparison.test_systems.fluid import Fluid
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, Stepper

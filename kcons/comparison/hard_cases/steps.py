@@ -113,7 +113,7 @@ def raised_step(program: Program, quick: bool) -> Outcome:
     told: list[str] = []
     found: list[tuple[str, float, float]] = []
     steppers = STEPPERS if isinstance(program, Core) and not quick else {"Rattle": Rattle}
-    for scene, (problem, omega) in (("water", water_in_field()), ("chain", chain_in_springs())):
+    for test_system, (problem, omega) in (("water", water_in_field()), ("chain", chain_in_springs())):
         for name, make in steppers.items():
             dt, largest, error = 0.05 / omega, 0.0, ""
             worst = 0.0
@@ -132,7 +132,7 @@ def raised_step(program: Program, quick: bool) -> Outcome:
                     break
                 largest = dt
                 dt *= 1.2
-            label = f"{scene}, {name}" if len(steppers) > 1 else scene
+            label = f"{test_system}, {name}" if len(steppers) > 1 else test_system
             found.append((f"{label}: residual without an error, at step {dt:.3g}", worst, SILENT))
             told.append(f"{label} {largest:.3g}" + (f" then {error}" if error else ""))
     return outcome(*found, remark=f"largest steps over {steps}: " + ", ".join(told))

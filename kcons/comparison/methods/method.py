@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.linalg import qr
 
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 
@@ -105,7 +105,7 @@ class Run(ABC):
         """One step, or as many as `steps` then says."""
 
     def march(self, steps: int) -> None:
-        """So many steps that nobody looks at: `advance` as often, without what it does for onlookers."""
+        """Make `steps` steps as `advance` does, without recording anything between them."""
         for _ in range(steps):
             self.advance()
 
@@ -114,10 +114,10 @@ class Run(ABC):
         raise NotImplementedError
 
     def settle(self) -> None:
-        """After `rewind`: whatever the first steps from there would set up lazily, at the price of being as many on."""
+        """After `rewind`: make the first steps, which set up what is set up lazily."""
 
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
-        """How many steps to time at a stretch, though the horizon may be nearer: a run is longer.
+        """How many steps to time in one call; they may lead beyond the horizon.
 
         Parameters
         ----------
@@ -200,7 +200,8 @@ class Method(ABC):
     host : str
         Whose it is: 'kcons', 'ase', 'scipy', 'openmm' or 'peer'.
     guest : bool
-        Whether it runs, unless methods are named, wherever it is able to, and is not mentioned elsewhere.
+        Whether it also runs, unless methods are named, with test systems of other MD engines. Where it cannot
+        run, tables leave it out.
     follows : bool
         Whether it is to follow the reference trajectory. A thermostat does not: no error can be stated.
     remark : str
@@ -208,7 +209,7 @@ class Method(ABC):
     damps : bool
         Whether it can run test systems with friction.
     marches : bool
-        Of the class: whether its runs can `march` and `rewind`, so that steps can be timed with nobody looking on.
+        Of the class: whether its runs can `march` and `rewind`, so that steps can be timed without observation.
         Otherwise whole runs are timed.
     """
 
@@ -225,46 +226,46 @@ class Method(ABC):
     remark: str = ""
     damps: bool = False
 
-    def refuses(self, scene: Scene) -> str | None:
+    def refuses(self, test_system: TestSystem) -> str | None:
         """Why this method cannot run the test system, or None."""
-        if scene.friction and self.holds and not self.damps:
-            return "it knows no friction"
-        return scene.refusals.get(self.name)
+        if test_system.friction and self.holds and not self.damps:
+            return "it has no friction"
+        return test_system.refusals.get(self.name)
 
-    def settings(self, scene: Scene) -> tuple[float, ...]:
+    def settings(self, test_system: TestSystem) -> tuple[float, ...]:
         """Time steps or tolerances to run, the cheapest first."""
-        return tuple(scene.tolerances if self.adaptive else scene.time_steps)
+        return tuple(test_system.tolerances if self.adaptive else test_system.time_steps)
 
-    def warm_up(self, scene: Scene) -> None:
+    def warm_up(self, test_system: TestSystem) -> None:
         """Compile or load what the first step would wait for."""
 
     @abstractmethod
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         """Everything up to the first step."""
 
 
-def matched_steps(scene: Scene, evaluations: int) -> tuple[float, ...]:
+def matched_steps(test_system: TestSystem, evaluations: int) -> tuple[float, ...]:
     """Time steps that cost as many force evaluations as the test system's steps cost RATTLE."""
-    steps = scene.time_steps
-    first = max(scene.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
+    steps = test_system.time_steps
+    first = max(test_system.horizon / steps[0] / evaluations, 1.0 if evaluations == 1 else 2.0)
     counts = dict.fromkeys(max(1, round(first * steps[0] / dt)) for dt in steps)
-    return tuple(scene.horizon / count for count in counts)
+    return tuple(test_system.horizon / count for count in counts)
 
 
-def independent_rows(scene: Scene, held: ConstraintSet | None = None) -> ConstraintSet:
+def independent_rows(test_system: TestSystem, held: ConstraintSet | None = None) -> ConstraintSet:
     """The constraint set, or an equivalent one, without rows that others imply at the start (last in a pivoted QR)."""
     if held is None:
-        held = scene.constraint_set
-    if scene.motion.rank == held.n_rows:
+        held = test_system.constraint_set
+    if test_system.motion.rank == held.n_rows:
         return held
-    weighted = held.jacobian(scene.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
-    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][: scene.motion.rank])
+    weighted = held.jacobian(test_system.positions).toarray() / np.sqrt(np.repeat(held.masses, 3))
+    kept = np.sort(qr(weighted.T, mode="r", pivoting=True)[1][: test_system.motion.rank])
     pieces = []
     for item, start in zip(held.constraints, held.starts, strict=False):
         mine = kept[(kept >= start) & (kept < start + item.n_rows)] - start
         if len(mine):
             pieces.append(item.select(mine))
-    return ConstraintSet(pieces, scene.positions, held.masses, cell=scene.cell)
+    return ConstraintSet(pieces, test_system.positions, held.masses, cell=test_system.cell)
 
 
 def exponent(tolerance: float) -> str:

@@ -19,7 +19,7 @@ from kcons.comparison.methods.engines import InAse, OfStates, OnArrays, ase_cons
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, independent_rows, matched_steps
 from kcons.comparison.methods.openmm import OPENMM_METHODS
 from kcons.comparison.methods.peers import PEERS
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -56,12 +56,12 @@ ASE_HOOKS = ("adjust_positions", "adjust_momenta", "adjust_forces", "redistribut
 
 
 class _CoreRun(OnArrays):
-    def __init__(self, scene: Scene, motion: Motion, stepper: Stepper, dt: float) -> None:
-        stepper.check(system := System(motion, scene.potential.forces, friction=scene.friction))
-        start = system.with_forces(State(scene.positions, scene.velocities))
-        super().__init__(system, start, stepper, dt, round(scene.horizon / dt))
+    def __init__(self, test_system: TestSystem, motion: Motion, stepper: Stepper, dt: float) -> None:
+        stepper.check(system := System(motion, test_system.potential.forces, friction=test_system.friction))
+        start = system.with_forces(State(test_system.positions, test_system.velocities))
+        super().__init__(system, start, stepper, dt, round(test_system.horizon / dt))
         self.constraints.watch(motion, ENGINE_CALLS)
-        self._potential = scene.potential
+        self._potential = test_system.potential
 
     def rewind(self) -> None:
         super().rewind()
@@ -91,22 +91,22 @@ class CoreStepper(Method):
         """The stepper for a step of 1: order, cost and name are the same for all."""
         return self.make(1.0)
 
-    def settings(self, scene: Scene) -> tuple[float, ...]:
-        return matched_steps(scene, self.stepper.force_evaluations)
+    def settings(self, test_system: TestSystem) -> tuple[float, ...]:
+        return matched_steps(test_system, self.stepper.force_evaluations)
 
-    def warm_up(self, scene: Scene) -> None:
-        dt = min(scene.time_steps)
-        system = System(scene.motion, scene.potential.forces, friction=scene.friction)
-        start = State(scene.positions, scene.velocities)
+    def warm_up(self, test_system: TestSystem) -> None:
+        dt = min(test_system.time_steps)
+        system = System(test_system.motion, test_system.potential.forces, friction=test_system.friction)
+        start = State(test_system.positions, test_system.velocities)
         stepper = self.make(dt)
         stepper.step(system, start, dt)
         steppers.run(system, start, dt, 2, stepper=stepper)
 
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         # What does not keep the positions on the surface cannot have rows that depend on each other there.
-        held = scene.constraint_set if self.stepper.symplectic else independent_rows(scene)
+        held = test_system.constraint_set if self.stepper.symplectic else independent_rows(test_system)
         stepper = self.make(setting)
-        return _CoreRun(scene, Motion(held, scene.positions), stepper, setting)
+        return _CoreRun(test_system, Motion(held, test_system.positions), stepper, setting)
 
 
 class CoreVerlet(Method):
@@ -114,14 +114,14 @@ class CoreVerlet(Method):
 
     marches = True
 
-    def warm_up(self, scene: Scene) -> None:
-        run = self.start(scene, min(scene.time_steps))
+    def warm_up(self, test_system: TestSystem) -> None:
+        run = self.start(test_system, min(test_system.time_steps))
         run.advance()
         run.march(2)
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        nothing = Motion(ConstraintSet([], scene.positions, scene.masses), scene.positions)
-        return _CoreRun(scene, nothing, Rattle(), setting)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        nothing = Motion(ConstraintSet([], test_system.positions, test_system.masses), test_system.positions)
+        return _CoreRun(test_system, nothing, Rattle(), setting)
 
 
 def of_steppers(found: Any) -> list[CoreStepper]:
@@ -152,14 +152,14 @@ def _maker(item: Any) -> Callable[[float], Stepper]:
 
 
 class _ExtrapolatedRun(OfStates):
-    def __init__(self, scene: Scene, tolerance: float) -> None:
+    def __init__(self, test_system: TestSystem, tolerance: float) -> None:
         super().__init__()
-        motion = Motion(scene.constraint_set, scene.positions)
+        motion = Motion(test_system.constraint_set, test_system.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
-        system = System(motion, scene.potential.forces, friction=scene.friction)
-        self._state = State(scene.positions, scene.velocities)
-        self._horizon = scene.horizon
-        self._states = steppers.Extrapolation(tolerance).states(system, self._state, scene.horizon)
+        system = System(motion, test_system.potential.forces, friction=test_system.friction)
+        self._state = State(test_system.positions, test_system.velocities)
+        self._horizon = test_system.horizon
+        self._states = steppers.Extrapolation(tolerance).states(system, self._state, test_system.horizon)
 
     def advance(self) -> None:
         self._state = next(self._states)
@@ -175,31 +175,31 @@ class _ExtrapolatedRun(OfStates):
 
 
 class Extrapolated(Method):
-    """`kcons.steppers.Extrapolation`, by itself of the size and order of its steps; its settings are tolerances."""
+    """`kcons.steppers.Extrapolation`, which chooses size and order of its steps; its settings are tolerances."""
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        return _ExtrapolatedRun(scene, setting)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        return _ExtrapolatedRun(test_system, setting)
 
 
 # -- ASE --------------------------------------------------------------------------------------------
 
 
 class _AseRun(InAse):
-    def __init__(self, scene: Scene, dt: float, *constraints: Any) -> None:
-        atoms = scene.atoms()
-        self._scene, self._momenta = scene, atoms.get_momenta()
+    def __init__(self, test_system: TestSystem, dt: float, *constraints: Any) -> None:
+        atoms = test_system.atoms()
+        self._test_system, self._momenta = test_system, atoms.get_momenta()
         atoms.set_constraint(constraints)
-        super().__init__(atoms, VelocityVerlet(atoms, timestep=dt), dt, round(scene.horizon / dt))
+        super().__init__(atoms, VelocityVerlet(atoms, timestep=dt), dt, round(test_system.horizon / dt))
         # set_constraint keeps the objects themselves, so that their hooks can be timed.
         for item in atoms.constraints:
             self.constraints.watch(item, ASE_HOOKS)
-        scene.potential.forces(atoms.positions)
+        test_system.potential.forces(atoms.positions)
 
     def rewind(self) -> None:
-        self._atoms.positions[:] = self._scene.positions
+        self._atoms.positions[:] = self._test_system.positions
         # Constraints would change them by what rounding leaves.
         self._atoms.set_momenta(self._momenta, apply_constraint=False)
-        self._scene.potential.forces(self._scene.positions)
+        self._test_system.potential.forces(self._test_system.positions)
 
 
 class AseMethod(Method):
@@ -211,44 +211,48 @@ class AseMethod(Method):
 class AseKcons(AseMethod):
     """ASE's VelocityVerlet with `kcons.ase.Constraints`."""
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        held = Constraints(scene.constraint_set.constraints)
-        return _AseRun(scene, setting, held)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        held = Constraints(test_system.constraint_set.constraints)
+        return _AseRun(test_system, setting, held)
 
 
 class AseVerlet(AseMethod):
     """ASE's VelocityVerlet with nothing held."""
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        return _AseRun(scene, setting)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        return _AseRun(test_system, setting)
 
 
 class AseBonds(AseMethod):
     """ASE's VelocityVerlet with FixBondLengths at its own tolerance, angles held by their end distances."""
 
-    def refuses(self, scene: Scene) -> str | None:
-        return super().refuses(scene) or (None if scene.bonds is not None else "it holds distances only")
+    def refuses(self, test_system: TestSystem) -> str | None:
+        return super().refuses(test_system) or (None if test_system.bonds is not None else "it holds distances only")
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        assert scene.bonds is not None
-        lengths = _distances(scene.atoms(), scene.bonds)
-        return _AseRun(scene, setting, *ase_constraints(scene.fixed, scene.bonds, lengths, internals=False))
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        assert test_system.bonds is not None
+        lengths = _distances(test_system.atoms(), test_system.bonds)
+        return _AseRun(
+            test_system, setting, *ase_constraints(test_system.fixed, test_system.bonds, lengths, internals=False)
+        )
 
 
 class AseInternals(AseMethod):
     """ASE's VelocityVerlet with FixInternals at its own tolerance."""
 
-    def refuses(self, scene: Scene) -> str | None:
-        return super().refuses(scene) or (None if scene.bonds is not None else "it holds internal coordinates only")
+    def refuses(self, test_system: TestSystem) -> str | None:
+        return super().refuses(test_system) or (
+            None if test_system.bonds is not None else "it holds internal coordinates only"
+        )
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        bonds = scene.bonds if scene.angle_bonds is None else scene.angle_bonds
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        bonds = test_system.bonds if test_system.angle_bonds is None else test_system.angle_bonds
         assert bonds is not None
-        atoms = scene.atoms()
+        atoms = test_system.atoms()
         lengths = _distances(atoms, bonds)
-        degrees = [atoms.get_angle(*triple) for triple in scene.angles]
-        held = ase_constraints(scene.fixed, bonds, lengths, scene.angles, degrees, internals=True)
-        return _AseRun(scene, setting, *held)
+        degrees = [atoms.get_angle(*triple) for triple in test_system.angles]
+        held = ase_constraints(test_system.fixed, bonds, lengths, test_system.angles, degrees, internals=True)
+        return _AseRun(test_system, setting, *held)
 
 
 def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
@@ -260,27 +264,27 @@ def _distances(atoms: Atoms, pairs: IntArray) -> FloatArray:
 
 
 class _OdeRun(Run):
-    def __init__(self, scene: Scene, rtol: float, *, project: bool) -> None:
+    def __init__(self, test_system: TestSystem, rtol: float, *, project: bool) -> None:
         super().__init__()
         # Off the surface, where this equation drifts, rows that depend on each other contradict each other.
-        motion = Motion(independent_rows(scene), scene.positions)
+        motion = Motion(independent_rows(test_system), test_system.positions)
         self.constraints.watch(motion, ENGINE_CALLS)
-        shape, half = scene.positions.shape, scene.positions.size
+        shape, half = test_system.positions.shape, test_system.positions.size
 
         def rate(t: float, y: FloatArray) -> FloatArray:
             x, v = y[:half].reshape(shape), y[half:].reshape(shape)
-            f = self._force = scene.potential.forces(x, t)
-            if scene.friction:
-                f = f - scene.friction * scene.masses[:, None] * v
+            f = self._force = test_system.potential.forces(x, t)
+            if test_system.friction:
+                f = f - test_system.friction * test_system.masses[:, None] * v
             return np.concatenate([y[half:], motion.acceleration(x, v, f, t).ravel()])
 
-        speed = float(np.sqrt(np.mean(scene.velocities**2)))
+        speed = float(np.sqrt(np.mean(test_system.velocities**2)))
         # Errors are measured against one unit of length and the thermal speed, not against each entry.
         scale = np.concatenate([np.ones(half), np.full(half, speed if speed > 0 else 1.0)])
-        start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])
+        start = np.concatenate([test_system.positions.ravel(), test_system.velocities.ravel()])
         self._shape, self._half = shape, half
-        self._motion, self._project, self._damping = motion, project, scene.friction * scene.masses[:, None]
-        self._solver = DOP853(rate, 0.0, start, scene.horizon, rtol=max(rtol, 1e-13), atol=rtol * scale)
+        self._motion, self._project, self._damping = motion, project, test_system.friction * test_system.masses[:, None]
+        self._solver = DOP853(rate, 0.0, start, test_system.horizon, rtol=max(rtol, 1e-13), atol=rtol * scale)
 
     def advance(self) -> None:
         message = self._solver.step()
@@ -328,8 +332,8 @@ class ProjectedOde(Method):
 
     project: bool = False
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        return _OdeRun(scene, setting, project=self.project)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        return _OdeRun(test_system, setting, project=self.project)
 
 
 METHODS: Mapping[str, Method] = {
@@ -350,7 +354,7 @@ METHODS: Mapping[str, Method] = {
 }
 
 
-def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> list[Method]:
+def chosen(names: Iterable[str] | None = None, test_system: TestSystem | None = None) -> list[Method]:
     """Methods by name, by default the usual ones for the test system.
 
     'all' alone stands for all, 'openmm' for the usual ones of OpenMM that can run the test system.
@@ -361,7 +365,7 @@ def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> li
         Unknown name.
     """
     if names is None:
-        return usual(scene)
+        return usual(test_system)
     wanted = list(names)
     if wanted == ["all"]:
         return list(METHODS.values())
@@ -369,7 +373,7 @@ def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> li
     for name in wanted:
         if name == "openmm":
             group = [m for m in METHODS.values() if m.usual and m.host == name]
-            able = [m for m in group if scene is None or m.refuses(scene) is None]
+            able = [m for m in group if test_system is None or m.refuses(test_system) is None]
             picked |= {m.name: m for m in able or group}
         elif name in METHODS:
             picked[name] = METHODS[name]
@@ -381,13 +385,13 @@ def chosen(names: Iterable[str] | None = None, scene: Scene | None = None) -> li
     return list(picked.values())
 
 
-def usual(scene: Scene | None = None) -> list[Method]:
-    """What runs where no method is named: the usual ones, of guests only those that can run the test system.
+def usual(test_system: TestSystem | None = None) -> list[Method]:
+    """Methods that run by default, of guests only those that can run the test system.
 
-    All of OpenMM's on test systems that are at home there, and nothing else.
+    For test systems whose forces are OpenMM's, all usual methods of OpenMM that can run them, and no others.
     """
     found = [method for method in METHODS.values() if method.usual]
-    if scene is not None and scene.openmm is not None and scene.openmm.home:
-        return [method for method in found if method.host == "openmm" and method.refuses(scene) is None]
+    if test_system is not None and test_system.openmm is not None and test_system.openmm.home:
+        return [method for method in found if method.host == "openmm" and method.refuses(test_system) is None]
     hosts = [m for m in found if m.host != "openmm" or m.guest]
-    return [m for m in hosts if not m.guest or (scene is not None and m.refuses(scene) is None)]
+    return [m for m in hosts if not m.guest or (test_system is not None and m.refuses(test_system) is None)]

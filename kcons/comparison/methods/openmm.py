@@ -16,8 +16,8 @@ import numpy as np
 
 from kcons.comparison.methods.engines import InOpenMM
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, exponent, matched_steps
-from kcons.comparison.scenes import Scene
-from kcons.comparison.scenes.openmm_host import OpenMMHost
+from kcons.comparison.test_systems import TestSystem
+from kcons.comparison.test_systems.openmm_host import OpenMMHost
 from kcons.constraints.target import FloatArray
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class _HostRun(InOpenMM):
 
     def __init__(
         self,
-        scene: Scene,
+        test_system: TestSystem,
         context: openmm.Context,
         integrator: openmm.Integrator,
         dt: float,
@@ -72,19 +72,19 @@ class _HostRun(InOpenMM):
         half_step: bool = False,
         records: int | None = RECORDS,
     ) -> None:
-        host = scene.openmm
+        host = test_system.openmm
         assert host is not None
-        super().__init__(context, integrator, dt, round(scene.horizon / dt), host.length, host.speed)
+        super().__init__(context, integrator, dt, round(test_system.horizon / dt), host.length, host.speed)
         self._evaluations, self._half_step = evaluations, half_step
         self._stride = 1 if records is None else max(1, self._planned // records)
         self._groups = integrator.getIntegrationForceGroups()
         self._end: tuple[FloatArray, FloatArray] | None = None
         self._spent = 0.0
-        self._x, self._v = scene.positions * host.length, scene.velocities * host.speed
+        self._x, self._v = test_system.positions * host.length, test_system.velocities * host.speed
         context.setPositions(self._x)
         if half_step:
             # Then the first position is the one that RATTLE reaches.
-            self._v = self._v - 0.5 * dt * host.time * self._forces() / scene.masses[:, None]
+            self._v = self._v - 0.5 * dt * host.time * self._forces() / test_system.masses[:, None]
         context.setVelocities(self._v)
 
     def advance(self) -> None:
@@ -168,31 +168,31 @@ class OpenMMMethod(Method):
 
     host: str = "openmm"
 
-    def refuses(self, scene: Scene) -> str | None:
-        reason = super().refuses(scene)
+    def refuses(self, test_system: TestSystem) -> str | None:
+        reason = super().refuses(test_system)
         if reason is not None:
             return reason
         if find_spec("openmm") is None:
             return "OpenMM is not installed; python -m pip install openmm"
-        if scene.openmm is None:
+        if test_system.openmm is None:
             return "the test system has no OpenMM System"
-        return self._lacks(scene)
+        return self._lacks(test_system)
 
-    def _lacks(self, scene: Scene) -> str | None:
+    def _lacks(self, test_system: TestSystem) -> str | None:
         """What of the test system the method cannot hold."""
-        return None if scene.bonds is not None else "a System holds distances only"
+        return None if test_system.bonds is not None else "a System holds distances only"
 
 
-def _host(scene: Scene) -> OpenMMHost:
-    assert scene.openmm is not None
-    return scene.openmm
+def _host(test_system: TestSystem) -> OpenMMHost:
+    assert test_system.openmm is not None
+    return test_system.openmm
 
 
-def only_water(scene: Scene) -> bool:
+def only_water(test_system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
     from kcons.openmm.carried.hold import take_constraints
 
-    host = _host(scene)
+    host = _host(test_system)
     return not host.surfaces and not take_constraints(host.copy())
 
 
@@ -246,18 +246,18 @@ class BuiltIn(OpenMMMethod):
     make: Own = VERLET
     tolerance: float = DEFAULT
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        host, integrator = _host(scene), self.make()
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        host, integrator = _host(test_system), self.make()
         integrator.setStepSize(setting * host.time)
         integrator.setConstraintTolerance(self.tolerance)
         context = host.context(host.system if self.holds else host.copy(constraints=False), integrator)
         records = RECORDS if self.holds else None
-        return _HostRun(scene, context, integrator, setting, half_step=True, records=records)
+        return _HostRun(test_system, context, integrator, setting, half_step=True, records=records)
 
-    def _lacks(self, scene: Scene) -> str | None:
-        if not self.follows and scene.units.energy != "eV":
+    def _lacks(self, test_system: TestSystem) -> str | None:
+        if not self.follows and test_system.units.energy != "eV":
             return "the units of the test system know no kelvin"
-        return super()._lacks(scene) if self.holds else None
+        return super()._lacks(test_system) if self.holds else None
 
 
 # -- kcons in OpenMM --------------------------------------------------------------------------------
@@ -274,8 +274,8 @@ class Projected(OpenMMMethod):
 
     scheme: str = "rattle"
 
-    def settings(self, scene: Scene) -> tuple[float, ...]:
-        return matched_steps(scene, self._evaluations)
+    def settings(self, test_system: TestSystem) -> tuple[float, ...]:
+        return matched_steps(test_system, self._evaluations)
 
     @property
     def _evaluations(self) -> int:
@@ -284,16 +284,20 @@ class Projected(OpenMMMethod):
         scheme = to_scheme(self.scheme)
         return 1 if scheme is None else scheme.force_evaluations
 
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator
 
-        host = _host(scene)
+        host = _host(test_system)
         integrator = ProjectedIntegrator(setting * host.time, self.scheme, tolerance=TIGHT)
         context = host.context(host.system, integrator)
-        return self._run(_HostRun, scene, context, integrator, setting)
+        return self._run(_HostRun, test_system, context, integrator, setting)
 
-    def _run(self, kind: type[_HostRun], scene: Scene, context: openmm.Context, integrator: Any, dt: float) -> _HostRun:
-        return kind(scene, context, integrator, dt, evaluations=self._evaluations, half_step=integrator.scheme is None)
+    def _run(
+        self, kind: type[_HostRun], test_system: TestSystem, context: openmm.Context, integrator: Any, dt: float
+    ) -> _HostRun:
+        return kind(
+            test_system, context, integrator, dt, evaluations=self._evaluations, half_step=integrator.scheme is None
+        )
 
 
 @dataclass(frozen=True)
@@ -307,14 +311,14 @@ class Compiled(OpenMMMethod):
 
     tolerance: float = TIGHT
 
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import RattleIntegrator
 
-        host = _host(scene)
+        host = _host(test_system)
         integrator = RattleIntegrator(setting * host.time, tolerance=self.tolerance)
         context = host.context(host.system, integrator)
         # Each time somebody looks costs a force evaluation: only the end is looked at.
-        return _HostRun(scene, context, integrator, setting, records=1)
+        return _HostRun(test_system, context, integrator, setting, records=1)
 
 
 @dataclass(frozen=True)
@@ -324,21 +328,23 @@ class Held(Projected):
     Rigid water stays with OpenMM, unless there is nothing else.
     """
 
-    def _lacks(self, scene: Scene) -> str | None:
-        return None if _host(scene).surfaces else super()._lacks(scene)
+    def _lacks(self, test_system: TestSystem) -> str | None:
+        return None if _host(test_system).surfaces else super()._lacks(test_system)
 
-    def warm_up(self, scene: Scene) -> None:
-        self.start(scene, min(scene.time_steps)).advance()
+    def warm_up(self, test_system: TestSystem) -> None:
+        self.start(test_system, min(test_system.time_steps)).advance()
 
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator, hold
 
-        host, system = _host(scene), _host(scene).copy()
+        host, system = _host(test_system), _host(test_system).copy()
         rows: Sequence[Any] = host.surfaces
-        part = hold(system, rows, scene.positions * host.length, take="all", keep_water=not only_water(scene))
+        part = hold(
+            system, rows, test_system.positions * host.length, take="all", keep_water=not only_water(test_system)
+        )
         integrator = ProjectedIntegrator(setting * host.time, self.scheme, parts=[part], tolerance=TIGHT)
         context = host.context(system, integrator)
-        run = self._run(_CarriedRun, scene, context, integrator, setting)
+        run = self._run(_CarriedRun, test_system, context, integrator, setting)
         run.constraints.watch(part.motion, ENGINE_CALLS)
         return run
 
@@ -347,17 +353,17 @@ class Held(Projected):
 class OnSurfaces(Projected):
     """`SurfaceIntegrator`: surfaces computed by OpenMM itself."""
 
-    def _lacks(self, scene: Scene) -> str | None:
-        return None if _host(scene).surfaces else "no particle is held on a surface"
+    def _lacks(self, test_system: TestSystem) -> str | None:
+        return None if _host(test_system).surfaces else "no particle is held on a surface"
 
-    def start(self, scene: Scene, setting: float) -> Run:
+    def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import SurfaceIntegrator
 
-        host, system = _host(scene), _host(scene).copy()
+        host, system = _host(test_system), _host(test_system).copy()
         integrator = SurfaceIntegrator(
             setting * host.time, self.scheme, surfaces=host.surfaces, system=system, tolerance=TIGHT
         )
-        return self._run(_HostRun, scene, host.context(system, integrator), integrator, setting)
+        return self._run(_HostRun, test_system, host.context(system, integrator), integrator, setting)
 
 
 # -- by name ----------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
-"""The lines of code that run a method on a scene, to be pasted and changed.
+"""The lines of code that run a method on a test system, to be pasted and changed.
 
-Each snippet runs as it stands, from the start of the scene to its horizon. What is to be replaced for a system of
+Each snippet runs as it stands, from the start of the test system to its horizon. What is to be replaced for a system of
 one's own is named in comments.
 """
 
@@ -11,30 +11,30 @@ import inspect
 from kcons.comparison.methods.method import Method
 from kcons.comparison.methods.methods import METHODS, AseBonds, AseKcons, CoreStepper, Extrapolated, ProjectedOde
 from kcons.comparison.methods.openmm import TIGHT, BuiltIn, Compiled, Held, OnSurfaces, Projected, only_water
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.errors import InputError
 
 _ON_ARRAYS = (
-    "scene = SCENE",
-    "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet and positions",
-    "system = System(motion, scene.potential.forces)  # a function of positions and time",
-    "start = State(scene.positions, scene.velocities)",
+    "test_system = MADE_BY",
+    "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet and positions",
+    "system = System(motion, test_system.potential.forces)  # a function of positions and time",
+    "start = State(test_system.positions, test_system.velocities)",
 )
 
 
-def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
+def code(test_system: TestSystem, method: str, setting: float, made_by: str) -> str:
     """Python for one method.
 
     Parameters
     ----------
-    scene : Scene
+    test_system : TestSystem
     method : str
         A key of `kcons.comparison.methods.methods.METHODS`.
     setting : float
-        Time step in the unit the scene shows, or tolerance.
+        Time step in the unit that tables show, or tolerance.
     made_by : str
-        The expression that makes the scene after ``from kcons.comparison import scenes``, as in
-        ``scenes.build("chain", 10)``.
+        The expression that makes the test system after ``from kcons.comparison import test_systems``, as in
+        ``test_systems.build("chain", 10)``.
 
     Raises
     ------
@@ -44,12 +44,12 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
     if method not in METHODS:
         raise InputError(f"there is no method {method!r}", item="method")
     found = METHODS[method]
-    steps = 0 if found.adaptive else round(scene.horizon / (setting * scene.units.time_unit))
-    molecular = scene.units.energy == "eV"
+    steps = 0 if found.adaptive else round(test_system.horizon / (setting * test_system.units.time_unit))
+    molecular = test_system.units.energy == "eV"
     # All digits: steps divide the horizon.
     dt = repr(float(f"{setting:.15g}"))
-    if getattr(scene, "friction", 0.0):
-        lines = _any(method, setting if found.adaptive else setting * scene.units.time_unit)
+    if getattr(test_system, "friction", 0.0):
+        lines = _any(method, setting if found.adaptive else setting * test_system.units.time_unit)
     elif isinstance(found, CoreStepper) and _plain(found):
         stepper = type(found.make(1.0)).__name__
         lines = _ase_stepper(dt, steps, stepper) if molecular else _arrays(dt, steps, stepper)
@@ -62,12 +62,12 @@ def code(scene: Scene, method: str, setting: float, made_by: str) -> str:
     elif isinstance(found, ProjectedOde) and not found.project:
         lines = _scipy(setting)
     elif isinstance(found, BuiltIn | Compiled | Projected) and not isinstance(found, OnSurfaces):
-        assert scene.openmm is not None
-        step = repr(float(f"{setting * scene.units.time_unit * scene.openmm.time:.15g}"))
-        lines = _openmm(found, step, steps, keep_water=not only_water(scene))
+        assert test_system.openmm is not None
+        step = repr(float(f"{setting * test_system.units.time_unit * test_system.openmm.time:.15g}"))
+        lines = _openmm(found, step, steps, keep_water=not only_water(test_system))
     else:
-        lines = _any(method, setting if found.adaptive else setting * scene.units.time_unit)
-    return "\n".join(lines).replace("SCENE", made_by) + "\n"
+        lines = _any(method, setting if found.adaptive else setting * test_system.units.time_unit)
+    return "\n".join(lines).replace("MADE_BY", made_by) + "\n"
 
 
 def _plain(method: CoreStepper) -> bool:
@@ -81,13 +81,13 @@ def _ase_stepper(dt: str, steps: int, stepper: str) -> list[str]:
     return [
         "from ase import units",
         "",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "from kcons.ase import ConstrainedDynamics",
         f"from kcons.steppers import {stepper}",
         "",
-        "scene = SCENE",
-        "atoms = scene.atoms()  # yours, with a calculator and velocities",
-        "held = scene.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]",
+        "test_system = MADE_BY",
+        "atoms = test_system.atoms()  # yours, with a calculator and velocities",
+        "held = test_system.constraint_set.constraints  # yours, such as [Distance([[0, 1], [1, 2]])]",
         f"dynamics = ConstrainedDynamics(atoms, {dt} * units.fs, {stepper}(), constraints=held)",
         f"dynamics.run({steps})",
     ]
@@ -96,7 +96,7 @@ def _ase_stepper(dt: str, steps: int, stepper: str) -> list[str]:
 def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
     return [
         "from kcons import Motion, State, System, run",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         f"from kcons.steppers import {stepper}",
         "",
         *_ON_ARRAYS,
@@ -107,11 +107,11 @@ def _arrays(dt: str, steps: int, stepper: str) -> list[str]:
 def _extrapolated(tolerance: float) -> list[str]:
     return [
         "from kcons import Motion, State, System",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "from kcons.steppers import Extrapolation",
         "",
         *_ON_ARRAYS,
-        f"for end in Extrapolation({tolerance!r}).states(system, start, until=scene.horizon):",
+        f"for end in Extrapolation({tolerance!r}).states(system, start, until=test_system.horizon):",
         "    pass  # each state is the end of a step",
     ]
 
@@ -121,13 +121,13 @@ def _ase_kcons(dt: str, steps: int) -> list[str]:
         "from ase import units",
         "from ase.md.verlet import VelocityVerlet",
         "",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "from kcons.ase import Constraints",
         "",
-        "scene = SCENE",
-        "atoms = scene.atoms()  # yours, with a calculator and velocities",
-        "atoms.set_constraint(Constraints(scene.constraint_set.constraints))",
-        f"VelocityVerlet(atoms, {dt} * scene.units.time_unit).run({steps})",
+        "test_system = MADE_BY",
+        "atoms = test_system.atoms()  # yours, with a calculator and velocities",
+        "atoms.set_constraint(Constraints(test_system.constraint_set.constraints))",
+        f"VelocityVerlet(atoms, {dt} * test_system.units.time_unit).run({steps})",
     ]
 
 
@@ -136,12 +136,12 @@ def _ase_bonds(dt: str, steps: int) -> list[str]:
         "from ase.constraints import FixAtoms, FixBondLengths",
         "from ase.md.verlet import VelocityVerlet",
         "",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "",
-        "scene = SCENE",
-        "atoms = scene.atoms()  # yours, with a calculator and velocities",
-        "atoms.set_constraint([FixAtoms(scene.fixed), FixBondLengths(scene.bonds)])",
-        f"VelocityVerlet(atoms, {dt} * scene.units.time_unit).run({steps})",
+        "test_system = MADE_BY",
+        "atoms = test_system.atoms()  # yours, with a calculator and velocities",
+        "atoms.set_constraint([FixAtoms(test_system.fixed), FixBondLengths(test_system.bonds)])",
+        f"VelocityVerlet(atoms, {dt} * test_system.units.time_unit).run({steps})",
     ]
 
 
@@ -151,28 +151,28 @@ def _scipy(rtol: float) -> list[str]:
         "from scipy.integrate import solve_ivp",
         "",
         "from kcons import Motion",
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "",
-        "scene = SCENE",
-        "motion = Motion(scene.constraint_set, scene.positions)  # your ConstraintSet, rows independent",
+        "test_system = MADE_BY",
+        "motion = Motion(test_system.constraint_set, test_system.positions)  # your ConstraintSet, rows independent",
         "",
         "",
         "def rate(t, y):",
         "    x, v = y.reshape(2, -1, 3)",
-        "    return np.concatenate([v, motion.acceleration(x, v, scene.potential.forces(x, t), t)]).ravel()",
+        "    return np.concatenate([v, motion.acceleration(x, v, test_system.potential.forces(x, t), t)]).ravel()",
         "",
         "",
-        "start = np.concatenate([scene.positions, scene.velocities]).ravel()",
-        "scale = np.repeat([1.0, np.sqrt(np.mean(scene.velocities**2)) or 1.0], start.size // 2)",
+        "start = np.concatenate([test_system.positions, test_system.velocities]).ravel()",
+        "scale = np.repeat([1.0, np.sqrt(np.mean(test_system.velocities**2)) or 1.0], start.size // 2)",
         f"options = dict(method='DOP853', rtol={max(rtol, 1e-13):g}, atol={rtol:g} * scale)",
-        "end = solve_ivp(rate, (0, scene.horizon), start, **options)",
+        "end = solve_ivp(rate, (0, test_system.horizon), start, **options)",
         "assert end.success",
     ]
 
 
 def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str]:
-    lines = ["from kcons.comparison import scenes"]
-    made = ["scene = SCENE", "host = scene.openmm", "system = host.system  # yours, with its constraints"]
+    lines = ["from kcons.comparison import test_systems"]
+    made = ["test_system = MADE_BY", "host = test_system.openmm", "system = host.system  # yours, with its constraints"]
     if isinstance(found, BuiltIn):
         lines = ["import openmm", "", *lines]
         made += [
@@ -183,7 +183,8 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
         lines += ["from kcons.openmm import ProjectedIntegrator, hold"]
         made[-1] = "system = host.copy()  # yours; its constraints move to kcons"
         made += [
-            f'part = hold(system, host.surfaces, scene.positions * host.length, take="all", keep_water={keep_water})',
+            "x = test_system.positions * host.length",
+            f'part = hold(system, host.surfaces, x, take="all", keep_water={keep_water})',
             f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", parts=[part], tolerance={TIGHT:g})',
         ]
     elif isinstance(found, Compiled):
@@ -197,19 +198,19 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
         "",
         *made,
         "context = host.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
-        "context.setPositions(scene.positions * host.length)",
-        "context.setVelocities(scene.velocities * host.speed)",
+        "context.setPositions(test_system.positions * host.length)",
+        "context.setVelocities(test_system.velocities * host.speed)",
         f"integrator.step({steps})",
     ]
 
 
 def _any(method: str, setting: float) -> list[str]:
     return [
-        "from kcons.comparison import scenes",
+        "from kcons.comparison import test_systems",
         "from kcons.comparison import METHODS",
         "",
-        "scene = SCENE",
-        f'run = METHODS["{method}"].start(scene, {setting!r})',
+        "test_system = MADE_BY",
+        f'run = METHODS["{method}"].start(test_system, {setting!r})',
         "while not run.finished:",
         "    run.advance()",
         "print(run.positions)",

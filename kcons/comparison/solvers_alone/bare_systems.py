@@ -112,7 +112,7 @@ def methyl(count: int) -> BareSystem:
 
 def chain(bonds: int) -> BareSystem:
     """A zigzag chain of CH2."""
-    from kcons.comparison.scenes.chain import MASS, positions
+    from kcons.comparison.test_systems.chain import MASS, positions
 
     x = positions(bonds, "zigzag")
     x -= x.mean(axis=0)
@@ -124,19 +124,19 @@ def chain(bonds: int) -> BareSystem:
 
 def protein(constrain: str) -> BareSystem:
     """Dihydrofolate reductase, 2489 atoms, with createSystem's `constrain`."""
-    from kcons.comparison import scenes
-    from kcons.comparison.scenes.structure import CONSTRAIN
+    from kcons.comparison import test_systems
+    from kcons.comparison.test_systems.structure import CONSTRAIN
 
-    scene = scenes.build("dhfr", constrain=constrain)
-    (item,) = scene.constraint_set.constraints
-    host = scene.openmm
-    assert host is not None and scene.bonds is not None
+    test_system = test_systems.build("dhfr", constrain=constrain)
+    (item,) = test_system.constraint_set.constraints
+    host = test_system.openmm
+    assert host is not None and test_system.bonds is not None
     name = f"DHFR, {CONSTRAIN[constrain]}"
     return BareSystem(
         name,
-        scene.positions,
-        scene.masses,
-        scene.bonds,
+        test_system.positions,
+        test_system.masses,
+        test_system.bonds,
         np.asarray(item.target_at(0.0)),
         system=lambda: host.system,
     )

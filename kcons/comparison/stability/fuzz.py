@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kcons.comparison.hard_cases.problem import Array
-from kcons.comparison.stability.scenes import every_pair, separated
+from kcons.comparison.stability.small_systems import every_pair, separated
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms, Plane, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import KconsError

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.stability.fuzz import FAULTS
 from kcons.comparison.stability.runs import METHODS
-from kcons.comparison.stability.scenes import SCENES
+from kcons.comparison.stability.small_systems import SYSTEMS
 from kcons.comparison.study import html_page, tables
 from kcons.comparison.study.html_page import Section
 from kcons.comparison.study.report_files import made_by
@@ -32,8 +32,10 @@ def steps_table(result: Mapping[str, Any]) -> Table:
 
 def _by_method(result: Mapping[str, Any], part: str, told: Callable[[Mapping[str, Any] | None], str]) -> Table:
     """A row a method, a column a test system; methods without any piece are left out."""
-    rows = [[method, *(told(_piece(result, part, scene, method)) for scene in SCENES)] for method in METHODS]
-    return Table(["method", *SCENES], [row for row in rows if any(row[1:])])
+    rows = [
+        [method, *(told(_piece(result, part, test_system, method)) for test_system in SYSTEMS)] for method in METHODS
+    ]
+    return Table(["method", *SYSTEMS], [row for row in rows if any(row[1:])])
 
 
 def _largest(piece: Mapping[str, Any] | None) -> str:
@@ -59,13 +61,13 @@ _END = {
 def drift_table(result: Mapping[str, Any]) -> Table:
     """Slope of the energy per unit time, with its standard error over the seeds."""
     rows = []
-    for scene in SCENES:
-        piece = _piece(result, "drift", scene)
+    for test_system in SYSTEMS:
+        piece = _piece(result, "drift", test_system)
         if piece:
             error = piece["standard_error"] or math.nan
             rows.append(
                 [
-                    scene,
+                    test_system,
                     f"{piece['dt']:g}",
                     f"{piece['steps']:,}",
                     str(piece["seeds"]),
@@ -118,8 +120,10 @@ def markdown(result: Mapping[str, Any]) -> dict[str, str]:
 
 def _lengths(result: Mapping[str, Any], part: str, words: str) -> str:
     """How long the runs of each test system were, with Rattle."""
-    found = {scene: _piece(result, part, scene, "Rattle") for scene in SCENES}
-    told = ", ".join(f"{scene} {piece['steps']}" for scene, piece in found.items() if piece and "steps" in piece)
+    found = {test_system: _piece(result, part, test_system, "Rattle") for test_system in SYSTEMS}
+    told = ", ".join(
+        f"{test_system} {piece['steps']}" for test_system, piece in found.items() if piece and "steps" in piece
+    )
     return f"\n\n{words}: {told}." if told else ""
 
 
@@ -159,17 +163,17 @@ def picture(result: Mapping[str, Any]) -> Figure:
 
     figure = Figure(figsize=(11.0, 4.8), layout="constrained")
     axes = figure.subplots()
-    scenes = [s for s in SCENES if any(_piece(result, "steps", s, m) for m in METHODS)]
+    test_systems = [s for s in SYSTEMS if any(_piece(result, "steps", s, m) for m in METHODS)]
     width = 0.8 / len(METHODS)
     for k, method in enumerate(METHODS):
         at, height = [], []
-        for j, scene in enumerate(scenes):
-            piece = _piece(result, "steps", scene, method)
+        for j, test_system in enumerate(test_systems):
+            piece = _piece(result, "steps", test_system, method)
             if piece and piece.get("largest_step"):
                 at.append(j - 0.4 + (k + 0.5) * width)
                 height.append(piece["largest_step"] / piece.get("evaluations", 1))
         axes.bar(at, height, width, label=method, hatch="//" if method in ("ASE", "OpenMM") else None)
-    axes.set_xticks(range(len(scenes)), scenes)
+    axes.set_xticks(range(len(test_systems)), test_systems)
     axes.set_yscale("log")
     axes.set_ylabel("largest stable step / force evaluations")
     axes.legend(fontsize=8, ncols=2)

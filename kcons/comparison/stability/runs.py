@@ -14,7 +14,7 @@ from kcons.comparison.hard_cases.contract import CannotExpressError, Frame, NotI
 from kcons.comparison.hard_cases.long_runs import secular_drift
 from kcons.comparison.hard_cases.problem import Array, Problem
 from kcons.comparison.hard_cases.programs import Core, PlainAse, PlainOpenMM
-from kcons.comparison.stability.scenes import SCENES
+from kcons.comparison.stability.small_systems import SYSTEMS
 from kcons.constraints import Constraint, Distance, FixedAtoms
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion.motion import Motion
@@ -48,13 +48,13 @@ class _Exploded(Exception):
     """The energy has left all bounds; there is no need to go on."""
 
 
-def attempt(method: str, scene: str, dt: float, steps: int) -> tuple[str, float]:
+def attempt(method: str, test_system: str, dt: float, steps: int) -> tuple[str, float]:
     """How a run ends, and its largest residual.
 
     'stable'; 'silent' where it ended without an error but off its rows; 'explosion' of the energy; the type of an
     error.
     """
-    problem = SCENES[scene](1)
+    problem = SYSTEMS[test_system](1)
     residual = 0.0
     first: list[float] = []
     largest = problem.kinetic(problem.v)
@@ -69,7 +69,7 @@ def attempt(method: str, scene: str, dt: float, steps: int) -> tuple[str, float]
         if not math.isfinite(residual):
             raise _Exploded
         # Energies that are exchanged: kinetic plus what the potential may give.
-        scale = max(largest, abs(first[-1] - _lowest(scene)))
+        scale = max(largest, abs(first[-1] - _lowest(test_system)))
         if not abs(frame.energy - first[-1]) <= EXPLOSION * scale:
             raise _Exploded
 
@@ -87,17 +87,17 @@ def attempt(method: str, scene: str, dt: float, steps: int) -> tuple[str, float]
 _LOWEST: dict[str, float] = {}
 
 
-def _lowest(scene: str) -> float:
+def _lowest(test_system: str) -> float:
     """About the lowest potential energy that the test system passes through."""
-    if scene not in _LOWEST:
-        problem = SCENES[scene](1)
+    if test_system not in _LOWEST:
+        problem = SYSTEMS[test_system](1)
         seen: list[float] = []
         Core().run(problem, 0.02, 1000, lambda frame: seen.append(frame.potential), every=5)
-        _LOWEST[scene] = min(seen)
-    return _LOWEST[scene]
+        _LOWEST[test_system] = min(seen)
+    return _LOWEST[test_system]
 
 
-def largest_step(method: str, scene: str, quick: bool) -> dict[str, Any]:
+def largest_step(method: str, test_system: str, quick: bool) -> dict[str, Any]:
     """Double the step until it fails, then halve the bracket.
 
     A failure must be an error or an energy that explodes while all rows hold; the state before it must be intact
@@ -108,7 +108,7 @@ def largest_step(method: str, scene: str, quick: bool) -> dict[str, Any]:
 
     def holds(dt: float) -> bool:
         nonlocal stable, failing, end, silent
-        found, residual = attempt(method, scene, dt, steps)
+        found, residual = attempt(method, test_system, dt, steps)
         silent = _silent(silent, found, residual)
         if found == "stable":
             stable = dt
@@ -153,14 +153,14 @@ def _silent(before: float, end: str, residual: float) -> float:
 TIME_STEPS = {"water": 0.02, "chain": 0.02, "dumbbells": 0.02, "rotor": 0.05, "pendulum": 0.02, "butane": 0.02}
 
 
-def drift(scene: str, seeds: int, steps: int, every: int = 20) -> dict[str, Any]:
+def drift(test_system: str, seeds: int, steps: int, every: int = 20) -> dict[str, Any]:
     """Slope of the energy over a long run with Rattle, mean and standard error over seeds, relative to kinetic energy.
 
     The slope is the difference of the windowed means of both halves over the time between them. All seeds run side by
     side, as molecules of one system that do not know of each other: a step costs little more than that of one.
     """
-    dt = TIME_STEPS[scene]
-    copies = Copies([SCENES[scene](seed) for seed in range(1, seeds + 1)])
+    dt = TIME_STEPS[test_system]
+    copies = Copies([SYSTEMS[test_system](seed) for seed in range(1, seeds + 1)])
     system = copies.system()
     state = system.initial_state(copies.x, copies.v)
     kinetic = copies.energies(copies.x, copies.v)[1]
@@ -242,10 +242,10 @@ class Copies:
         return float(np.max(np.abs(np.linalg.norm(x[i] - x[j], axis=1) / self.lengths - 1)))
 
 
-def reversal(method: str, scene: str, steps: int) -> dict[str, Any]:
+def reversal(method: str, test_system: str, steps: int) -> dict[str, Any]:
     """n steps, velocities turned round, n steps: by how much the start is missed."""
-    problem = SCENES[scene](1)
-    dt = TIME_STEPS[scene]
+    problem = SYSTEMS[test_system](1)
+    dt = TIME_STEPS[test_system]
     try:
         if method == "OpenMM":
             raise CannotExpressError("velocities of the leapfrog belong to half steps")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kcons.comparison.stability import fuzz, runs
-from kcons.comparison.stability.scenes import SCENES
+from kcons.comparison.stability.small_systems import SYSTEMS
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import stamp
 from kcons.comparison.study.study import Kept, Watcher, picked, work_off
@@ -24,7 +24,7 @@ BATCH = 500
 def run(
     *,
     only: Iterable[str] | None = None,
-    scenes: Iterable[str] | None = None,
+    test_systems: Iterable[str] | None = None,
     quick: bool = False,
     kept: Path | None = None,
     watcher: Watcher | None = None,
@@ -35,8 +35,8 @@ def run(
     ----------
     only : iterable of str, optional
         Of 'steps' (largest stable step), 'drift', 'reversal', 'fuzz'.
-    scenes : iterable of str, optional
-        Of `SCENES`, for all parts but 'fuzz'.
+    test_systems : iterable of str, optional
+        Of `SYSTEMS`, for all parts but 'fuzz'.
     quick : bool
         1e4 steps instead of 1e6, 300 trials instead of 10,000.
     kept : Path, optional
@@ -50,7 +50,7 @@ def run(
         An unknown part or test system.
     """
     parts = picked(only, PARTS, "part", "only")
-    chosen = picked(scenes, SCENES, "test system", "scenes")
+    chosen = picked(test_systems, SYSTEMS, "test system", "scenes")
     file = Kept(kept, stamp(quick=quick), form=FORMAT)
     result: dict[str, Any] = {**file.head, "pieces": file.earlier().get("pieces", {})}
 
@@ -63,12 +63,12 @@ def run(
     return result
 
 
-def _pieces(part: str, quick: bool, scenes: Sequence[str]) -> dict[str, Callable[[], Any]]:
-    both = [(method, scene) for scene in scenes for method in runs.METHODS]
+def _pieces(part: str, quick: bool, test_systems: Sequence[str]) -> dict[str, Callable[[], Any]]:
+    both = [(method, test_system) for test_system in test_systems for method in runs.METHODS]
     if part == "steps":
         return {f"steps/{s}/{m}": partial(runs.largest_step, m, s, quick) for m, s in both}
     if part == "drift":
-        return {f"drift/{s}": partial(runs.drift, s, 8, 10_000 if quick else 1_000_000) for s in scenes}
+        return {f"drift/{s}": partial(runs.drift, s, 8, 10_000 if quick else 1_000_000) for s in test_systems}
     if part == "reversal":
         steps = 200 if quick else 2000
         return {f"reversal/{s}/{m}": partial(runs.reversal, m, s, steps // (10 if m == "ASE" else 1)) for m, s in both}
@@ -91,7 +91,7 @@ def digest(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add pieces to results that are there already, without those made quickly.
+    """Add pieces to existing results; pieces of quick runs are left out.
 
     Returns
     -------

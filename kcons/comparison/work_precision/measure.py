@@ -2,7 +2,7 @@
 
 Every method starts from the same state with the same forces and is compared with the same reference
 solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded; with `rounds`,
-those of short runs are medians over rounds in which nobody looks on (`kcons.comparison.work_precision.timing_rounds`).
+those of short runs are medians over rounds without observation (`kcons.comparison.work_precision.timing_rounds`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 
 from kcons.comparison.methods.method import Method, OverBudgetError, Run, first_line, interrupted_after
 from kcons.comparison.methods.methods import METHODS, chosen
-from kcons.comparison.scenes import Reference, Scene
-from kcons.comparison.scenes.potential import Potential
 from kcons.comparison.study.machine import environment, kernels_cached
 from kcons.comparison.study.study import Watcher
 from kcons.comparison.study.tables import duration
+from kcons.comparison.test_systems import Reference, TestSystem
+from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.work_precision import timing_rounds
 from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status
 from kcons.comparison.work_precision.timing_rounds import Rounds
@@ -42,7 +42,7 @@ PATIENCE = 3
 
 
 def compare(
-    scene: Scene,
+    test_system: TestSystem,
     *,
     methods: Iterable[str] | None = None,
     budget: float = 30.0,
@@ -51,11 +51,11 @@ def compare(
     rounds: Rounds | None = None,
     reference: Reference | None = None,
 ) -> Comparison:
-    """Run `scene` through `methods`.
+    """Run `test_system` through `methods`.
 
     Parameters
     ----------
-    scene : Scene
+    test_system : TestSystem
     methods : iterable of str, optional
         Names out of `methods.METHODS`, 'openmm' for those of OpenMM, or 'all' alone; by default the usual
         ones for the test system.
@@ -79,36 +79,36 @@ def compare(
     """
     if not budget > 0:
         raise InputError(f"the budget is {budget} s; give a positive number of seconds", item="budget")
-    picked = chosen(methods, scene)
-    if scene.openmm is not None:
-        scene.openmm.patience = budget
+    picked = chosen(methods, test_system)
+    if test_system.openmm is not None:
+        test_system.openmm.patience = budget
     watching = watcher or Watcher()
     with watching.piece("loading kernels" if kernels_cached() else "compiling kernels (once)", 1):
-        warm_up(scene, picked)
+        warm_up(test_system, picked)
 
     if reference is None:
-        reference = reference_of(scene, watching)
+        reference = reference_of(test_system, watching)
 
-    bench = Bench(scene, reference, budget, watching, rounds)
+    bench = Bench(test_system, reference, budget, watching, rounds)
     measurements, margin = bench.timed_again([m for method in picked for m in bench.all_settings(method)])
-    unit = scene.units.time_unit
+    unit = test_system.units.time_unit
     return Comparison(
         scene={
-            "name": scene.name,
-            "title": scene.title,
-            "atoms": scene.n_atoms,
-            "rows": scene.motion.constraint_set.n_rows,
-            "rank": scene.motion.rank,
-            "degrees_of_freedom": scene.motion.degrees_of_freedom,
-            "horizon": scene.horizon / unit,
+            "name": test_system.name,
+            "title": test_system.title,
+            "atoms": test_system.n_atoms,
+            "rows": test_system.motion.constraint_set.n_rows,
+            "rank": test_system.motion.rank,
+            "degrees_of_freedom": test_system.motion.degrees_of_freedom,
+            "horizon": test_system.horizon / unit,
             "units": {
-                "length": scene.units.length,
-                "energy": scene.units.energy,
-                "time": scene.units.time,
-                "long_time": scene.units.long_time,
+                "length": test_system.units.length,
+                "energy": test_system.units.energy,
+                "time": test_system.units.time,
+                "long_time": test_system.units.long_time,
             },
-            "forces": scene.potential.name,
-            **({"error": "energy above the optimum"} if scene.shortfall is not None else {}),
+            "forces": test_system.potential.name,
+            **({"error": "energy above the optimum"} if test_system.shortfall is not None else {}),
         },
         reference={"how": reference.how, "error": reference.error},
         settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {})},
@@ -116,26 +116,26 @@ def compare(
         environment=environment(),
         measurements=measurements,
         timing={
-            "force_seconds": force_seconds(scene),
+            "force_seconds": force_seconds(test_system),
             "repeats": 0 if rounds is None else rounds.least,
             "margin": margin,
         },
     )
 
 
-def reference_of(scene: Scene, watcher: Watcher) -> Reference:
+def reference_of(test_system: TestSystem, watcher: Watcher) -> Reference:
     """The reference solution, with its progress shown."""
     with watcher.piece("reference solution", 1):
-        return scene.reference(lambda done, total: watcher.advance(done / total))
+        return test_system.reference(lambda done, total: watcher.advance(done / total))
 
 
-def force_seconds(scene: Scene) -> float:
+def force_seconds(test_system: TestSystem) -> float:
     """Median wall time of the forces beyond that of a spring on one atom, which is that of a call of NumPy.
 
     They take turns: a machine that slows down in between does it to both.
     """
     spring = Potential(lambda x: (0.5 * float(np.sum(x * x)), -x), "one spring")
-    both = ((scene.potential, scene.positions), (spring, np.ones((1, 3))))
+    both = ((test_system.potential, test_system.positions), (spring, np.ones((1, 3))))
     for potential, x in both:
         potential.watched_energy(x)
         potential.forget()
@@ -152,18 +152,18 @@ def force_seconds(scene: Scene) -> float:
     return max(0.0, float(np.median(found)))
 
 
-def warm_up(scene: Scene, methods: Iterable[Method] = ()) -> None:
+def warm_up(test_system: TestSystem, methods: Iterable[Method] = ()) -> None:
     """Compile or load every kernel that the test system and these methods need, outside of any timing."""
-    motion = scene.motion
-    x, v = scene.positions, scene.velocities
-    f = scene.potential.forces(x)
-    Rattle().step(System(motion, scene.potential.forces), State(x, v), min(scene.time_steps))
+    motion = test_system.motion
+    x, v = test_system.positions, test_system.velocities
+    f = test_system.potential.forces(x)
+    Rattle().step(System(motion, test_system.potential.forces), State(x, v), min(test_system.time_steps))
     motion.acceleration(x, v, f)
     motion.project_forces(x, f)
     for method in methods:
-        if method.refuses(scene) is None:
+        if method.refuses(test_system) is None:
             with suppress(Exception):  # what goes wrong is shown where it is measured
-                method.warm_up(scene)
+                method.warm_up(test_system)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class Bench:
 
     Attributes
     ----------
-    scene : Scene
+    test_system : TestSystem
     reference : Reference
     budget : float
         Seconds for each method.
@@ -181,7 +181,7 @@ class Bench:
         In which short runs are timed again; None: times stay as they were observed.
     """
 
-    scene: Scene
+    test_system: TestSystem
     reference: Reference
     budget: float
     watcher: Watcher = field(default_factory=Watcher)
@@ -189,14 +189,14 @@ class Bench:
 
     def all_settings(self, method: Method) -> list[Measurement]:
         """One method at all its settings, as far as the budget goes."""
-        reason = method.refuses(self.scene)
+        reason = method.refuses(self.test_system)
         if reason is not None:
             return [Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason)]
         found: list[Measurement] = []
         budget, begun = self.budget, perf_counter()
         given_up: Measurement | None = None
-        for setting in method.settings(self.scene):
-            common = _about(self.scene, method, setting)
+        for setting in method.settings(self.test_system):
+            common = _about(self.test_system, method, setting)
             if found and perf_counter() - begun > budget:
                 note = f"the budget of {budget:g} s is used up"
                 found.append(Measurement(status="not run", note=note, **common))
@@ -227,7 +227,7 @@ class Bench:
             return measurements, None
         with self.watcher.piece("times of short runs, in rounds", self.rounds.most):
             return timing_rounds.timed(
-                self.scene,
+                self.test_system,
                 measurements,
                 METHODS,
                 self.rounds,
@@ -252,9 +252,9 @@ class Bench:
         watched : bool
             Whether the constraints' part is timed, which costs a little.
         """
-        scene, budget = self.scene, self.budget
+        test_system, budget = self.test_system, self.budget
         log = _Log()
-        common = _about(scene, method, setting)
+        common = _about(test_system, method, setting)
         what = f"{method.title}, {'rtol' if method.adaptive else 'dt'} {common['setting']:g}"
         note = ""
         status: Status = "ok"
@@ -262,18 +262,18 @@ class Bench:
         now = perf_counter()
         deadline = (now if begun is None else begun) + budget
         setup = None
-        scene.potential.forget()
+        test_system.potential.forget()
         try:
             with (
-                self.watcher.piece(what, scene.horizon),
+                self.watcher.piece(what, test_system.horizon),
                 interrupted_after(PATIENCE * budget),
                 np.errstate(all="ignore"),
             ):
-                run = method.start(scene, setting)
+                run = method.start(test_system, setting)
                 setup = perf_counter() - now
                 if not watched:
                     run.constraints.release()
-                note = _run_to_horizon(scene, run, method.holds, log, budget, deadline, self.watcher)
+                note = _run_to_horizon(test_system, run, method.holds, log, budget, deadline, self.watcher)
                 status = "partial" if note else "ok"
         except OverBudgetError:
             status = "partial"
@@ -283,23 +283,23 @@ class Bench:
         except Exception as error:  # whatever a peer raises is a result, and is shown
             status = "failed"
             note = f"step {log.steps + 1}: {first_line(error)}"
-        common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(scene, method, run, log))
+        common = dict(common, steps=log.steps, setup_seconds=setup, **_costs(test_system, method, run, log))
         if run is None or not log.seconds:
             return Measurement(status=status, note=note, **common)
-        return _judged(scene, method, run, log, self.reference, status, note, common)
+        return _judged(test_system, method, run, log, self.reference, status, note, common)
 
 
 # -- one run ----------------------------------------------------------------------------------------
 
 
-def _about(scene: Scene, method: Method, setting: float) -> dict[str, Any]:
+def _about(test_system: TestSystem, method: Method, setting: float) -> dict[str, Any]:
     """What is known of a measurement before it."""
     return {
         "method": method.name,
         "title": method.title,
-        "setting": setting if method.adaptive else setting / scene.units.time_unit,
+        "setting": setting if method.adaptive else setting / test_system.units.time_unit,
         "adaptive": method.adaptive,
-        "steps_planned": None if method.adaptive else round(scene.horizon / setting),
+        "steps_planned": None if method.adaptive else round(test_system.horizon / setting),
     }
 
 
@@ -316,7 +316,7 @@ class _Log:
 
 
 def _judged(
-    scene: Scene,
+    test_system: TestSystem,
     method: Method,
     run: Run,
     log: _Log,
@@ -331,15 +331,15 @@ def _judged(
     x, v = run.positions, run.velocities
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(v))):
         return Measurement(status="failed", note="positions are not finite", **common)
-    sigma, tangency = scene.residuals(x, v, run.time)
+    sigma, tangency = test_system.residuals(x, v, run.time)
     if not method.follows:
         shown: Status = "thermostat" if status == "ok" else status
         return Measurement(status=shown, note=note, constraint_residual=sigma, velocity_residual=tangency, **common)
-    slope, slope_error = _energy_slope(scene, log)
+    slope, slope_error = _energy_slope(test_system, log)
     return Measurement(
         status=status,
         note=note,
-        error=scene.deviation(x, reference.positions) if status == "ok" else None,
+        error=test_system.deviation(x, reference.positions) if status == "ok" else None,
         constraint_residual=sigma,
         velocity_residual=tangency,
         energy_slope=slope,
@@ -349,10 +349,10 @@ def _judged(
 
 
 def _run_to_horizon(
-    scene: Scene, run: Run, holds: bool, log: _Log, budget: float, deadline: float, watcher: Watcher
+    test_system: TestSystem, run: Run, holds: bool, log: _Log, budget: float, deadline: float, watcher: Watcher
 ) -> str:
     """Advance to the horizon; the reason if it was given up for the budget."""
-    potential, masses = scene.potential, scene.masses[:, None]
+    potential, masses = test_system.potential, test_system.masses[:, None]
 
     def write_down() -> None:
         log.times.append(run.time)
@@ -383,7 +383,7 @@ def _run_to_horizon(
         if run.finished:
             break
         first = len(log.seconds) == 1
-        to_go = run.steps * (scene.horizon - run.time) / (run.time - log.times[-2])
+        to_go = run.steps * (test_system.horizon - run.time) / (run.time - log.times[-2])
         doubtful = first and log.seconds[0] < max(FIRST_STEP_DOUBT, FIRST_STEP_SHARE * budget)
         if now + log.seconds[-1] * to_go > deadline and not doubtful and (len(log.seconds) <= 2 or now > deadline):
             return _too_slow(log.seconds[-1], budget)
@@ -394,14 +394,14 @@ def _too_slow(step_seconds: float, budget: float) -> str:
     return f"at {duration(step_seconds)} a step, the steps to the horizon exceed the budget of {budget:.3g} s"
 
 
-def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str, float | None]:
+def _costs(test_system: TestSystem, method: Method, run: Run | None, log: _Log) -> dict[str, float | None]:
     if run is None or not log.seconds or run.time <= 0:
         return {}
     # The first step pays for what an MD engine sets up lazily.
     counted = slice(1, None) if len(log.seconds) > 1 else slice(None)
     run.constraints.release()
     step = run.own_step_seconds() or float(np.median(log.seconds[counted]))
-    elapsed = run.time / scene.units.long_time_unit
+    elapsed = run.time / test_system.units.long_time_unit
     return {
         "step_seconds": step,
         "constraint_seconds": float(np.median(log.constraints[counted])) if method.holds and run.divided else None,
@@ -410,14 +410,14 @@ def _costs(scene: Scene, method: Method, run: Run | None, log: _Log) -> dict[str
     }
 
 
-def _energy_slope(scene: Scene, log: _Log) -> tuple[float | None, float | None]:
+def _energy_slope(test_system: TestSystem, log: _Log) -> tuple[float | None, float | None]:
     """Least-squares slope of the energy and its standard error, a degree of freedom and `long_time`."""
     if len(log.times) < 4:
         return None, None
     if not np.all(np.isfinite(log.energies)):
         return None, None
-    t = np.array(log.times) / scene.units.long_time_unit
-    e = np.array(log.energies) / max(scene.motion.degrees_of_freedom, 1)
+    t = np.array(log.times) / test_system.units.long_time_unit
+    e = np.array(log.energies) / max(test_system.motion.degrees_of_freedom, 1)
     t, e = t - t.mean(), e - e.mean()
     slope = float(t @ e / (t @ t))
     left_over = float(np.sum((e - slope * t) ** 2))

@@ -19,7 +19,7 @@ class Item:
         Name of its files.
     heading : str
     scene : str
-        A key of `scenes.SCENES`; '' for a part with a module of its own.
+        A key of `test_systems.SYSTEMS`; '' for a part with a module of its own.
     size : int or None
     options : mapping
         For the test system.

@@ -15,9 +15,9 @@ from typing import Any
 from kcons.comparison.methods.method import Method
 from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.methods.snippets import code
-from kcons.comparison.scenes import Reference, Scene
 from kcons.comparison.study.study import Watcher
 from kcons.comparison.study.tables import duration
+from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.work_precision.fronts import (
     COSTS,
     EVERY_HOST,
@@ -114,7 +114,7 @@ def predicted(curve: Sequence[Measurement], error: float, resolution: float = 0.
 
 
 def recommend(
-    scene: Scene,
+    test_system: TestSystem,
     comparison: Comparison,
     target: float,
     *,
@@ -128,7 +128,7 @@ def recommend(
 
     Parameters
     ----------
-    scene : Scene
+    test_system : TestSystem
     comparison : Comparison
         Of this test system.
     target : float
@@ -155,13 +155,13 @@ def recommend(
     """
     if not (math.isfinite(target) and target > 0):
         raise InputError(f"the target error is {target}; give a positive number", item="target_error")
-    bench = Bench(scene, reference, budget, watcher or Watcher(), rounds)
+    bench = Bench(test_system, reference, budget, watcher or Watcher(), rounds)
     decides = verdict(comparison).decides
     resolution = resolution_of(comparison)
     curves = _curves(comparison)
     found: list[Measurement] = []
     if target >= resolution:
-        warm_up(scene, [METHODS[name] for name in curves])
+        warm_up(test_system, [METHODS[name] for name in curves])
         promising = sorted(
             (p for curve in curves.values() if (p := predicted(curve, SAFETY * target, resolution)) is not None),
             key=lambda p: p.cost(decides),
@@ -176,12 +176,12 @@ def recommend(
     entry: dict[str, Any] = {"target": target, "decides": COSTS[decides][1], "reached": bool(able)}
     if able:
         best = min(able, key=lambda m: (cost_of(m, decides), cost_of(m, "wall")))
-        entry |= {**_facts(best), "code": code(scene, best.method, best.setting, made_by)}
+        entry |= {**_facts(best), "code": code(test_system, best.method, best.setting, made_by)}
         default, more = _default(bench, comparison, best, target)
         entry["default"] = default
         found += more
     else:
-        entry["why"] = _why_not(scene, comparison, target, resolution, everything)
+        entry["why"] = _why_not(test_system, comparison, target, resolution, everything)
         usable = [m for m in everything if m.error]
         if usable:
             entry["best"] = _facts(min(usable, key=lambda m: max(float(m.error or 0.0), resolution)))
@@ -215,7 +215,7 @@ def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
             best = min(predictions, key=lambda p: p.cost(standing.cost), default=None)
             if best is not None and (best.method, target) not in tried:
                 tried.add((best.method, target))
-                warm_up(bench.scene, [METHODS[best.method]])
+                warm_up(bench.test_system, [METHODS[best.method]])
                 found += reach(bench, best, target)
     found, _ = bench.timed_again(found)
     return replace(comparison, measurements=_sorted([*comparison.measurements, *found]))
@@ -236,8 +236,8 @@ def reach(bench: Bench, prediction: Prediction, target: float) -> list[Measureme
     found : list of Measurement
         All runs that were made.
     """
-    scene, method = bench.scene, METHODS[prediction.method]
-    seconds = prediction.wall * scene.horizon / scene.units.long_time_unit
+    test_system, method = bench.test_system, METHODS[prediction.method]
+    seconds = prediction.wall * test_system.horizon / test_system.units.long_time_unit
     found: list[Measurement] = []
     if seconds > bench.budget:
         return found
@@ -245,10 +245,10 @@ def reach(bench: Bench, prediction: Prediction, target: float) -> list[Measureme
     good, bad = 0.0, math.inf  # the longest step that reaches the error, the shortest that does not
     least = math.inf
     for _ in range(TRIES):
-        setting = _divided(scene, method, setting, bad)
+        setting = _divided(test_system, method, setting, bad)
         if setting <= good or setting >= bad:
             break
-        internal = setting if method.adaptive else setting * scene.units.time_unit
+        internal = setting if method.adaptive else setting * test_system.units.time_unit
         m = bench.measure(method, internal)
         found.append(m)
         if m.status not in ("ok", "failed"):
@@ -267,11 +267,11 @@ def reach(bench: Bench, prediction: Prediction, target: float) -> list[Measureme
     return found
 
 
-def _divided(scene: Scene, method: Method, setting: float, bad: float) -> float:
+def _divided(test_system: TestSystem, method: Method, setting: float, bad: float) -> float:
     """The longest step that divides the horizon and is not longer than `setting`, shorter than one known to be bad."""
     if method.adaptive:
         return setting
-    horizon = scene.horizon / scene.units.time_unit
+    horizon = test_system.horizon / test_system.units.time_unit
     count = max(1, math.ceil(horizon / setting * (1 - 1e-9)))
     if horizon / count >= bad * (1 - 1e-9):
         count += 1
@@ -300,21 +300,21 @@ def _default(
     bench: Bench, comparison: Comparison, best: Measurement, target: float
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
     """What the MD engine of the best method does unless told otherwise: at its usual step, and at this error."""
-    scene = bench.scene
-    name = default_method(scene, METHODS[best.method].host)
+    test_system = bench.test_system
+    name = default_method(test_system, METHODS[best.method].host)
     if name is None:
         return None, []
     method = METHODS[name]
-    horizon = scene.horizon / scene.units.time_unit
-    molecular = scene.units.energy == "eV"
+    horizon = test_system.horizon / test_system.units.time_unit
+    molecular = test_system.units.energy == "eV"
     usual = DEFAULT_STEP if molecular else comparison.scene["horizon"] / 20
     setting = DEFAULT_RTOL if method.adaptive else horizon / max(1, round(horizon / usual))
     curve = _curves(comparison).get(name, [])
     found: list[Measurement] = []
     first = next((m for m in curve if abs(m.setting - setting) < 1e-9 * setting), None)
     if first is None:
-        warm_up(scene, [method])
-        internal = setting if method.adaptive else setting * scene.units.time_unit
+        warm_up(test_system, [method])
+        internal = setting if method.adaptive else setting * test_system.units.time_unit
         (first,), _ = bench.timed_again([bench.measure(method, internal)])
         found.append(first)
     entry: dict[str, Any] = {**_facts(first), "status": first.status, "note": first.note}
@@ -344,14 +344,14 @@ def _default(
     return entry, found
 
 
-def default_method(scene: Scene, host: str) -> str | None:
+def default_method(test_system: TestSystem, host: str) -> str | None:
     """What a user of this MD engine takes who has not thought about it; None if it cannot run the test system."""
     names = ("openmm-verlet",) if host == "openmm" else ("ase-bonds", "dop853")
-    return next((name for name in names if METHODS[name].refuses(scene) is None), None)
+    return next((name for name in names if METHODS[name].refuses(test_system) is None), None)
 
 
 def _why_not(
-    scene: Scene, comparison: Comparison, target: float, resolution: float, everything: Sequence[Measurement]
+    test_system: TestSystem, comparison: Comparison, target: float, resolution: float, everything: Sequence[Measurement]
 ) -> str:
     length = comparison.scene["units"]["length"]
     good = float(comparison.reference["error"])

@@ -1,4 +1,4 @@
-"""Times of steps that nobody looks at, in rounds: every method once, then all again.
+"""Times of steps without observation, in rounds: every method once, then all again.
 
 A run of few short steps that is observed after each tells the time of cold caches and of the observer. Here a method
 starts afresh in every round, warms up, and makes its planned steps again and again until enough of them are timed. The
@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 
 from kcons.comparison.methods.method import Method, OverBudgetError, Run, first_line, interrupted_after
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.comparison.work_precision.measurement import Measurement
 from kcons.errors import KconsError
 
@@ -78,7 +78,7 @@ class Times:
 
 
 def timed(
-    scene: Scene,
+    test_system: TestSystem,
     measurements: Sequence[Measurement],
     methods: Mapping[str, Method],
     rounds: Rounds,
@@ -92,7 +92,7 @@ def timed(
 
     Parameters
     ----------
-    scene : Scene
+    test_system : TestSystem
     measurements : sequence of Measurement
         Those that failed, or take longer than `limit`, stay as they are.
     methods : mapping of name to Method
@@ -116,12 +116,12 @@ def timed(
     chosen = [k for k, m in enumerate(measurements) if _short(m, limit)]
 
     def task(m: Measurement) -> Callable[[], float]:
-        method, setting = methods[m.method], m.setting if m.adaptive else m.setting * scene.units.time_unit
+        method, setting = methods[m.method], m.setting if m.adaptive else m.setting * test_system.units.time_unit
 
         def by_march() -> float:
-            scene.potential.forget()
+            test_system.potential.forget()
             with interrupted_after(patience), np.errstate(all="ignore"):
-                return marched(method.start(scene, setting), m, method.holds, rounds.pass_seconds)
+                return marched(method.start(test_system, setting), m, method.holds, rounds.pass_seconds)
 
         def by_run() -> float:
             again = whole(method, setting)

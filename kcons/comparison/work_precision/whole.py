@@ -15,12 +15,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods.methods import METHODS
-from kcons.comparison.scenes import Scene
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import stamp
 from kcons.comparison.study.study import Kept, Watcher
+from kcons.comparison.test_systems import TestSystem
 from kcons.comparison.work_precision import whole_page
 from kcons.comparison.work_precision.measure import Bench, compare, reference_of
 from kcons.comparison.work_precision.measurement import Comparison
@@ -144,7 +144,7 @@ def _excluded(item: Item, quick: bool) -> str:
         return "in the full run only"
     if item.module and find_spec(item.module) is None:
         return f"this version of kcons has no {item.module}"
-    if item.scene and item.scene not in scenes.SCENES:
+    if item.scene and item.scene not in test_systems.SYSTEMS:
         return f"this version of kcons has no test system {item.scene!r}"
     if item.needs and find_spec(item.needs) is None:
         return f"{item.needs} is not installed; python -m pip install {item.needs}"
@@ -153,13 +153,13 @@ def _excluded(item: Item, quick: bool) -> str:
 
 def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Comparison:
     with watcher.piece("building the test system", 1):
-        scene = scene_of(item, quick)
+        test_system = test_system_of(item, quick)
     budget = (item.quick_seconds / 12 if quick else item.budget) * share
-    names, left_out = methods_of(item, scene, quick)
-    reference = reference_of(scene, watcher)
+    names, left_out = methods_of(item, test_system, quick)
+    reference = reference_of(test_system, watcher)
     rounds = QUICK_ROUNDS if quick else FULL_ROUNDS
     found = compare(
-        scene,
+        test_system,
         methods=names,
         budget=budget,
         watcher=watcher,
@@ -170,19 +170,19 @@ def _compared(item: Item, quick: bool, share: float, watcher: Watcher) -> Compar
     reasons = dict.fromkeys(left_out.values())
     remarks = [f"not run: {', '.join(n for n in left_out if left_out[n] == why)} ({why})" for why in reasons]
     found = replace(found, remarks=[*found.remarks, *remarks])
-    return sharpen(Bench(scene, reference, budget, watcher, rounds), found)
+    return sharpen(Bench(test_system, reference, budget, watcher, rounds), found)
 
 
-def scene_of(item: Item, quick: bool) -> Scene:
+def test_system_of(item: Item, quick: bool) -> TestSystem:
     """The test system of a part."""
     size = item.quick_size if quick and item.quick_size is not None else item.size
-    scene = scenes.build(item.scene, size, quick=quick, **item.options)
+    test_system = test_systems.build(item.scene, size, quick=quick, **item.options)
     if item.steps is not None and not quick:
-        scene = scene.with_time_steps(item.steps)
-    return scene if item.pace is None else replace(scene, reference_pace=item.pace)
+        test_system = test_system.with_time_steps(item.steps)
+    return test_system if item.pace is None else replace(test_system, reference_pace=item.pace)
 
 
-def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[str, str]]:
+def methods_of(item: Item, test_system: TestSystem, quick: bool) -> tuple[list[str], dict[str, str]]:
     """Names of the methods that run, and of those that are left out though they could, with the reasons.
 
     All steppers of kcons on arrays, in a quick run the usual ones; of other MD engines the usual ones, those that
@@ -193,7 +193,7 @@ def methods_of(item: Item, scene: Scene, quick: bool) -> tuple[list[str], dict[s
     for method in METHODS.values():
         usual = method.usual or (not quick and method.host == "kcons")
         guest = method.guest or method.host == "openmm"
-        if not usual or not method.follows or (guest and method.refuses(scene) is not None):
+        if not usual or not method.follows or (guest and method.refuses(test_system) is not None):
             continue
         why = next((why for beginning, why in item.without.items() if method.name.startswith(beginning)), None)
         if why is None:

@@ -42,7 +42,7 @@ def masses_of(system: openmm.System) -> FloatArray:
 
 
 def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
-    """What OpenMM does not move is fixed."""
+    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
     if not all(isinstance(item, Constraint) for item in given):
         return given  # ConstraintSet says what is wrong
     used = [item.atoms.ravel() for item in given]
@@ -69,7 +69,7 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
 
 
 def refuse_single_precision(precision: Precision) -> None:
-    """GPUs hand positions to PythonForces as they keep them."""
+    """Refuse single precision: GPUs hand positions to PythonForces in the precision in which they store them."""
     if precision.name == "single":
         raise UnsupportedError(
             f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
@@ -78,7 +78,7 @@ def refuse_single_precision(precision: Precision) -> None:
 
 
 def refuse_some_particles(force: openmm.PythonForce, precision: Precision) -> None:
-    """Of some particles, mixed precision hands over single numbers."""
+    """Refuse forces on some particles in mixed precision: OpenMM hands over their positions in single precision."""
     if precision.name == "mixed" and force.getParticles():
         raise UnsupportedError(
             f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
@@ -98,7 +98,7 @@ def refuse_shared_atoms(system: openmm.System, touched: set[int]) -> None:
 
 
 def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
-    """Warn of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+    """Warn of coordinates so large that their rounding adds noise to the velocities."""
     if grain <= COARSE * scale:
         return False
     warnings.warn(
@@ -110,7 +110,7 @@ def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
 
 
 def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
-    """Barostats and others that move particles between steps must not move them off the rows."""
+    """Refuse barostats and other forces that move particles off the rows between steps."""
     bound = next((item for item in held.constraints if not item.translation_invariant), None)
     for force in system.getForces():
         name = type(force).__name__

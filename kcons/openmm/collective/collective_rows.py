@@ -250,8 +250,8 @@ class CollectiveRows(GroupRows):
             )
         if scheme is not None and not isinstance(scheme, Rattle | Composition):
             raise UnsupportedError(
-                f"{scheme!r} gives no multipliers at a point by the way; read mean_multipliers(integrator), the mean "
-                "over the last step, or multipliers_at(context), those at the state of a context"
+                f"{scheme!r} has no multipliers at a single point of the step; read mean_multipliers(integrator), the "
+                "mean over the last step, or multipliers_at(context), those at the state of a context"
             )
         return self._read(integrator, "lambda")
 

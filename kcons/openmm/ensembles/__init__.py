@@ -3,4 +3,5 @@
 - `conserved_momenta`: momenta that a thermostat leaves alone
 - `langevin_ensemble`: Langevin dynamics
 - `isokinetic_ensemble`: constant kinetic energy
+- `nose_hoover_ensemble`: Nosé-Hoover chains
 """

@@ -1,8 +1,9 @@
-"""Which momenta a System conserves, as far as its thermostats must know."""
+"""Momenta that a System conserves, and that its thermostat must not count."""
 
 from __future__ import annotations
 
 import copy
+import warnings
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,11 +12,11 @@ import openmm
 from openmm import unit
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import UnsupportedError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.system_checks import BAROSTATS, forces_of, removes_centre_of_mass_motion
-from kcons.thermostats.freedom import BALANCED, SHAKE, SHIFT, open_directions
+from kcons.thermostats.freedom import AT_REST, BALANCED, SHAKE, SHIFT, open_directions
 
 Momentum = Literal["auto", "conserved", "free"]
 
@@ -61,8 +62,42 @@ class Momenta:
 NONE = Momenta(np.zeros((0, 3)), False)
 
 
+def check_momentum(momentum: str) -> None:
+    """Raise `InputError` for a word that is none of `Momentum`."""
+    if momentum not in ("auto", "conserved", "free"):
+        raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
+
+
+def warn_of_conserved_momenta(momenta: Momenta, masses: FloatArray, v: FloatArray, turns: bool) -> None:
+    """Say so, at the first step, where conserved momenta keep a deterministic thermostat from sampling a temperature.
+
+    Parameters
+    ----------
+    momenta : Momenta
+    masses : ndarray, shape (n,)
+        Of the particles that are thermostatted; 0 for others.
+    v : ndarray, shape (n, 3)
+    turns : bool
+        Whether to speak of angular momentum.
+    """
+    p = momenta.directions @ (masses @ v)
+    twice = float(masses @ np.einsum("ij,ij->i", v, v))
+    if float(p @ p) > AT_REST * masses.sum() * twice:
+        warnings.warn(
+            "total momentum is not zero, and a thermostat that scales velocities scales it too instead of "
+            "forgetting it: no temperature is sampled. Take it out of the velocities first, or use Langevin",
+            stacklevel=6,
+        )
+    elif turns:
+        warnings.warn(
+            "the forces exert no torque (a free cluster), so that angular momentum is only scaled by the "
+            "thermostat and never forgotten: configurations are not canonical. Use Langevin",
+            stacklevel=6,
+        )
+
+
 def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
-    """Look at the forces and at what is held.
+    """Find conserved momenta from the forces and the constraints.
 
     Parameters
     ----------

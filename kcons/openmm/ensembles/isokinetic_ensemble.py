@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
@@ -14,7 +13,14 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.errors import ConvergenceError, InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm.ensembles.conserved_momenta import NONE, Momenta, Momentum, conserved_momenta
+from kcons.openmm.ensembles.conserved_momenta import (
+    NONE,
+    Momenta,
+    Momentum,
+    check_momentum,
+    conserved_momenta,
+    warn_of_conserved_momenta,
+)
 from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.interface import Integrator
@@ -25,7 +31,7 @@ from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
-from kcons.thermostats.freedom import AT_REST, atom_numbers, positive
+from kcons.thermostats.freedom import atom_numbers, positive
 
 #: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
 ROUNDING = 1e-12
@@ -97,8 +103,7 @@ class Isokinetic(Value):
     ) -> None:
         if convention not in ("exact", "notes"):
             raise InputError(f"convention is {convention!r}; choose 'exact' or 'notes'", item="convention")
-        if momentum not in ("auto", "conserved", "free"):
-            raise InputError(f"momentum is {momentum!r}; choose 'auto', 'conserved' or 'free'", item="momentum")
+        check_momentum(momentum)
         if temperature is not None and kinetic_energy is not None:
             raise InputError("give temperature or kinetic_energy, not both", item="temperature")
         self._keep(
@@ -142,7 +147,7 @@ class Isokinetic(Value):
     def declare(self, program: Program) -> None:
         p = program
         p.number("two_k", "2K, kept; 0 until the first step")
-        p.number("growth", "integral of alpha over time")
+        p.remember("growth", "integral of alpha over time")
         p.number("lost", "kicks that turned velocities round and lost digits")
         p.vector("w", "velocities before a kick")
         for name, words in (
@@ -222,7 +227,7 @@ class Isokinetic(Value):
         moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
-                f"the isokinetic thermostat in OpenMM needs targets that rest, and those of {moving[0]!r} move; use "
+                f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
         masses, v = self._masses(integrator, context), velocities_of(context)
@@ -237,18 +242,7 @@ class Isokinetic(Value):
             )
         momenta = self._momenta(integrator, context)
         twice = self._twice_kinetic(self._count(integrator, context, momenta), int(np.sum(masses > 0)), found)
-        if _momentum_share(masses, v, momenta.directions) > AT_REST:
-            warnings.warn(
-                "total momentum is not zero, and a thermostat that scales velocities scales it too instead of "
-                "forgetting it: no temperature is sampled. Take it out of the velocities first, or use Langevin",
-                stacklevel=5,
-            )
-        elif momenta.angular and self.temperature is not None:
-            warnings.warn(
-                "the forces exert no torque (a free cluster), so that angular momentum is only scaled by the "
-                "thermostat and never forgotten: configurations are not canonical. Use Langevin",
-                stacklevel=5,
-            )
+        warn_of_conserved_momenta(momenta, masses, v, turns=momenta.angular and self.temperature is not None)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
@@ -277,7 +271,8 @@ class Isokinetic(Value):
         inside[atom_numbers(np.asarray(self.atoms), n)] = True
         if integrator.parts:
             raise UnsupportedError(
-                "a part of the particles can be thermostatted beside constraints of the System, not beside parts="
+                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
+                "thermostat all particles"
             )
         for k in range(system.getNumConstraints()):
             i, j, _ = system.getConstraintParameters(k)
@@ -397,11 +392,3 @@ def _energy(energy: unit.Quantity | float) -> float:
     if unit.is_quantity(energy):
         energy = energy.value_in_unit(unit.kilojoule_per_mole)  # type: ignore[union-attr]
     return positive(energy, "kinetic_energy")  # type: ignore[arg-type]
-
-
-def _momentum_share(masses: np.ndarray, v: np.ndarray, directions: np.ndarray) -> float:
-    """|P|^2/(M 2K) along directions."""
-    if not len(directions):
-        return 0.0
-    p = directions @ (masses @ v)
-    return float(p @ p / (masses.sum() * (masses @ np.einsum("ij,ij->i", v, v))))

@@ -37,7 +37,7 @@ class Langevin(ConstantEnergy):
 
     Notes
     -----
-    Scheme: 'rattle'. For virtual sites use openmm.LangevinMiddleIntegrator.
+    Scheme: 'rattle'.
 
     References
     ----------
@@ -66,7 +66,7 @@ class Langevin(ConstantEnergy):
         if scheme is None:
             raise UnsupportedError(
                 "Langevin needs velocities at the time of the positions, and those of the leapfrog are half a step "
-                "behind; for virtual sites use openmm.LangevinMiddleIntegrator"
+                "behind; use scheme='rattle'"
             )
         if scheme.kicks != (0.5, 0.5) or scheme.drifts != (1.0,) or scheme.flight != (1.0,):
             raise UnsupportedError(f"Langevin splits the drift of scheme='rattle' in two; {scheme!r} has another form")

@@ -28,10 +28,13 @@ class Ensemble(Protocol):
     adds_up : bool
         Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
         divided into calls then changes the rounding of the motion.
+    owes : bool
+        Whether the end of a step may be left to the next step if the state is not read between; see `open`.
     """
 
     stays_tangent: bool
     adds_up: bool
+    owes: bool
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
@@ -43,6 +46,24 @@ class Ensemble(Protocol):
 
     def declare(self, program: Program) -> None:
         """Variables and tables."""
+        ...
+
+    def open(self, program: Program) -> None:
+        """What comes before the first kick of a step, v tangent to all constraints; also what the last step owes.
+
+        Where constraints are applied alone (`first_stage` is not 0) it must do nothing.
+        """
+        ...
+
+    def close(self, program: Program) -> None:
+        """What comes at the end of a step, v tangent to all constraints; `behind` says that the next step is to do it.
+
+        Only with `owes`, and where the program has `between`.
+        """
+        ...
+
+    def take_back(self, program: Program) -> None:
+        """A step failed: variables of the ensemble are again what they were before `open`."""
         ...
 
     def kick(
@@ -104,7 +125,18 @@ class Ensemble(Protocol):
 
 
 class Value:
-    """Attributes that are given once; equal if they are."""
+    """An object whose attributes never change; two are equal if their attributes are."""
+
+    owes = False
+
+    def open(self, program: Program) -> None:
+        pass
+
+    def close(self, program: Program) -> None:
+        pass
+
+    def take_back(self, program: Program) -> None:
+        pass
 
     def _keep(self, **attributes: Any) -> None:
         self.__dict__.update(attributes)

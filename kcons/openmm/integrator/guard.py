@@ -1,16 +1,19 @@
-"""An integrator's view of the Context it belongs to: checks before and during a run, and the way back."""
+"""Checks of an integrator on its Context, before and during a run, and the return to the last good state."""
 
 from __future__ import annotations
 
 import gc
 import logging
 import weakref
+from itertools import chain
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import openmm
+from numpy.typing import NDArray
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, ConvergenceError, InputError, NonFiniteError
 from kcons.motion.certificate import MOST, SHARE
@@ -21,6 +24,7 @@ from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
     forces_of,
+    parts_of_steps,
     refuse_forgotten_parts,
     removes_centre_of_mass_motion,
 )
@@ -37,7 +41,8 @@ _REMEDY = "let kcons hold these constraints: take them out of the System and han
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     """The Context that was made with this integrator, alone or within a CompoundIntegrator."""
     address = int(integrator.this)
-    for thing in gc.get_objects():
+    # Young objects first: it was made just now in most cases, and a process has millions of old ones.
+    for thing in chain.from_iterable(gc.get_objects(generation) for generation in range(3)):
         if issubclass(type(thing), openmm.Context):
             owner = getattr(thing, "_integrator", None)
             if owner is integrator:
@@ -79,17 +84,17 @@ class Guard:
     """
 
     def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
-        self._context = weakref.ref(context)
-        self._integrator = weakref.ref(integrator)
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
         self.system = context.getSystem()
-        check_system(self.system, leapfrog=integrator.scheme is None)
+        check_system(self.system)
+        self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.precision = Precision.of(context)
         integrator.take_precision(self.precision)
         self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
-        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
         self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
         #: Whether the set-up was checked.
         self.started = False
@@ -144,7 +149,7 @@ class Guard:
             return
         miss = np.abs(self.rows.stretches(x))
         limit = self.limit(x)
-        if np.median(miss / limit) <= 1:  # few molecules cross the faces of the box at a time
+        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
             limit = self.limit(x, wrapped=True)
         excess = miss / limit
         row = int(np.argmax(excess))
@@ -329,8 +334,8 @@ class Guard:
         What is held is asked itself: the constraints of the System and the rows of the parts at the positions and
         velocities of the Context, whatever the solvers have found.
         """
-        context, integrator = self.context, self.integrator
-        step, begun = context.getStepCount(), perf_counter()
+        context, integrator, begun = self.context, self.integrator, perf_counter()
+        step = context.getStepCount()
         try:
             integrator.ensemble.verify(integrator)
             now = context.getState(positions=True, velocities=True)
@@ -361,8 +366,8 @@ class Guard:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
         if miss is not None:
             raise CertificateError(
-                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
-                "step, or see what changed the state or the rows behind their back",
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers reported success; take a smaller time "
+                "step, or find what else changed the state or the constraints",
                 row=miss.row,
                 residual=abs(miss.off),
                 atoms=miss.atoms,
@@ -371,7 +376,7 @@ class Guard:
     def _remember(self, now: openmm.State) -> None:
         self.since_check = self._put_off = 0
         self._checked = perf_counter()
-        self._good = now
+        self._good, self._memory = now, self.integrator.program.remembered()
 
     def put_back(self) -> None:
         """The state that was checked last."""
@@ -382,8 +387,8 @@ class Guard:
             context.setVelocities(good.getVelocities(asNumpy=True))
             context.setTime(good.getTime())
             context.setStepCount(good.getStepCount())
-            self.since_check = 0
-            self.disturbed = False
+            self.integrator.program.recall(self._memory)
+            self.since_check, self.disturbed = 0, False
             self.integrator.refresh()
 
     def explosion(self, words: str, step: int) -> NonFiniteError:
@@ -410,6 +415,26 @@ class Guard:
     def degrees_of_freedom(self) -> int:
         """Also less three where a CMMotionRemover acts."""
         return self.independent_momenta() - (3 if removes_centre_of_mass_motion(self.system) else 0)
+
+
+def _may_have_crossed(context: openmm.Context, first: IntArray, off: NDArray[np.bool_]) -> bool:
+    """Whether what is off may be molecules that were just moved back into the box: few of them cross a face at a time.
+
+    Parameters
+    ----------
+    context : openmm.Context
+    first : ndarray of int, shape (n_rows,)
+        A particle of each row.
+    off : ndarray of bool, shape (n_rows,)
+        Rows that are off.
+    """
+    if not off.any():
+        return False
+    of_particle = np.zeros(context.getSystem().getNumParticles(), dtype=np.int64)
+    for number, molecule in enumerate(context.getMolecules()):
+        of_particle[list(molecule)] = number
+    molecules = of_particle[first]
+    return 2 * len(np.unique(molecules[off])) <= max(len(np.unique(molecules)), 2)
 
 
 def _check_finite(x: FloatArray, v: FloatArray, step: int, held: bool) -> None:

@@ -26,6 +26,8 @@ class Integrator(openmm.CustomIntegrator):
         Force groups that carry rows, not forces.
     spare : bool
         Whether checks come later where they would take more than a hundredth of the time.
+    unseen : bool
+        Whether a Simulation is making steps: the state at the end of a call is then read through the Context only.
     """
 
     scheme: Splitting | None
@@ -33,6 +35,7 @@ class Integrator(openmm.CustomIntegrator):
     program: Program
     row_groups: frozenset[int]
     spare: bool
+    unseen: bool
 
     def take_precision(self, precision: Precision) -> None:
         """The Context is known: tolerances that were left open become those of its platform."""

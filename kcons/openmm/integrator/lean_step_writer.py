@@ -1,6 +1,6 @@
-"""The program of a step with what nobody looks at left out.
+"""The program of a step without operations that only serve a state that is read.
 
-Between two steps of one call of `step` nobody sees the velocities. The second half kick of a step and the first of the
+Between two steps of one call of `step` velocities are not read. The second half kick of a step and the first of the
 next are then one, and the velocities are not made tangent: the next drift starts where they would be, pushes along
 the same gradients, and absorbs what they have across. The motion is the same; see notes on RATTLE and leapfrog.
 
@@ -23,7 +23,7 @@ SHORT_DRIFT = 1 / 30
 
 
 class LeanStepWriter(StepWriter):
-    """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, leave out what nobody looks at.
+    """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, omit what only readers of the state need.
 
     With an ensemble, velocity Verlet without parts does so, too: two kicks of half a step are made as one.
 
@@ -48,7 +48,8 @@ class LeanStepWriter(StepWriter):
         self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = self.ensemble.adds_up and not self.parts and isinstance(self.scheme, Rattle)
-        self.lazy = self.lean or self.joined or (self.scheme is None and not self.parts)
+        owing = self.ensemble.owes and not self.parts
+        self.lazy = self.lean or self.joined or owing or (self.scheme is None and not self.parts)
         self.observed = 2 if self.lean else 1
         self.filtered = not self.parts and bool(np.abs(self.drifts).min() < SHORT_DRIFT)
         if self.lazy:
@@ -65,6 +66,7 @@ class LeanStepWriter(StepWriter):
             super()._write_plain()
             return
         p = self.program
+        p.let_others_act()
         self._kick("dt")
         p.each("x", "x+dt*v", "move freely (drift)")
         p.each("xu", "x", "where that leads")
@@ -77,20 +79,23 @@ class LeanStepWriter(StepWriter):
 
     def _write_joined(self) -> None:
         p, ensemble = self.program, self.ensemble
-        use(p, "behind", "kick")
-        p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
-        self._kick("kick*dt", tangent=True)
-        h = "(0.5*dt)" if self.halves else "dt"
-        if self.halves:
-            ensemble.middle(p, self._drift(h), self._project)
-        p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
-        if ensemble.stays_tangent:
-            self._project()
-        with p.when("between = 0", "somebody looks at the velocities"):
+        use(p, "behind", "kick", "phase")
+        with p.when("phase != 2", "up to the new positions"):
+            p.let_others_act()
+            p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
+            self._kick("kick*dt", tangent=True)
+            h = "(0.5*dt)" if self.halves else "dt"
+            if self.halves:
+                ensemble.middle(p, self._drift(h), self._project)
+            p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
+            if ensemble.stays_tangent:
+                self._project()
+        with p.when("between+delta(phase-1) = 0", "somebody looks at the velocities"):
             self._kick("0.5*dt", tangent=True)
             if not ensemble.stays_tangent:  # otherwise the next drift absorbs what v has across
                 self._project()
         p.let("behind", "between", "the next step makes up for it")
+        p.let("phase", "select(phase, 3-phase, 0)", "what follows")
 
     # -- impulses without rounding --------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -29,6 +29,8 @@ class Program:
         Context are copies of them, which a State or a checkpoint may overwrite, and `push` puts right.
     idle : dict of float
         Global variables that control the program, as they are between two calls of `step`.
+    memory : set of str
+        Global variables that belong to a state as x and v do.
     """
 
     def __init__(self, integrator: openmm.CustomIntegrator) -> None:
@@ -46,6 +48,7 @@ class Program:
         self.numbers: dict[str, float] = {}
         self.settings: dict[str, float] = {}
         self.idle: dict[str, float] = {}
+        self.memory: set[str] = set()
         #: Variables with a value for each degree of freedom.
         self.vectors: set[str] = set()
         self._vectors: dict[str, FloatArray] = {}
@@ -78,6 +81,20 @@ class Program:
         if name not in self._known:
             self.idle[name] = float(value)
         return self.number(name, words, value)
+
+    def remember(self, name: str, words: str) -> str:
+        """Declare a global variable that belongs to a state as x and v do, 0 at first; returns its name."""
+        self.memory.add(name)
+        return self.number(name, words)
+
+    def remembered(self) -> dict[str, float]:
+        """What belongs to the present state besides x and v."""
+        return {name: self.integrator.getGlobalVariableByName(name) for name in sorted(self.memory)}
+
+    def recall(self, values: Mapping[str, float]) -> None:
+        """Write what `remembered` gave back into the Context."""
+        for name, value in values.items():
+            self.write(name, value)
 
     def vector_setting(self, name: str, words: str, values: FloatArray) -> str:
         """Declare a variable that the integrator was made with, values of shape (n_particles, 3); returns its name."""
@@ -203,6 +220,28 @@ class Program:
             self._depth += 1
         self.operations.append((kind, variable, expression))
         self._lines.append((self._depth, code, words))
+
+    # -- running --------------------------------------------------------------------------------
+
+    def run(self, context: openmm.Context, steps: int, parts: int = 1) -> None:
+        """Make steps, each of them in so many executions of the program, of which the global `phase` is the number.
+
+        OpenMM takes each execution for a step; clock and step count are put right.
+        """
+        integrator = self.integrator
+        if parts == 1:
+            openmm.CustomIntegrator.step(integrator, steps)
+            return
+        dt = integrator.getStepSize()._value
+        for _ in range(steps):
+            time, count = context.getTime()._value, context.getStepCount()
+            self.write("phase", 1.0)
+            try:
+                openmm.CustomIntegrator.step(integrator, parts)
+            finally:
+                self.write("phase", 0.0)
+            context.setTime(time + dt)
+            context.setStepCount(count + 1)
 
     # -- listing --------------------------------------------------------------------------------
 

@@ -18,8 +18,10 @@ from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
+from kcons.openmm.integrator.states.calls import Calls
 from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
 from kcons.openmm.integrator.states.hearing import listen
+from kcons.openmm.integrator.states.serialization import ensemble_in, note_in, note_of, note_of_ensemble, read_plain
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
@@ -27,7 +29,7 @@ from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 
 
-class ProjectedIntegrator(StatesOnConstraints, Settings):
+class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
     """Dynamics at constant energy on the constraints of the System, and on more where asked.
 
     One step is that of the same stepper in `kcons.steppers`: kicks v += h f/m, drifts along the constraints, and a
@@ -47,7 +49,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
     scheme : str or Splitting
         'rattle' (velocity Verlet), 'geodesic', 'suzuki4', 'yoshida4', 'kahan-li6', 'blanes-moan4', 'blanes-moan6',
         'blanes-moan6a', or a splitting of kcons.steppers; 'leapfrog', with velocities half a step behind as in
-        openmm.VerletIntegrator, for Systems with virtual sites.
+        openmm.VerletIntegrator.
     parts : sequence of Part
         What else to hold: collective variables, surfaces, constraint objects of kcons.
     tolerance : float, optional
@@ -66,7 +68,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
 
     Notes
     -----
-    Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
+    A member of a CompoundIntegrator makes its steps with all its checks, as long as kcons is imported.
     """
 
     #: Steps between two checks, if nothing else is asked for, ...
@@ -193,76 +195,6 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         assert self._guard is not None
         return self._guard
 
-    def step(self, steps: int) -> None:
-        """Make `steps` steps.
-
-        Raises
-        ------
-        KconsError
-            A solve of one of the parts failed: positions, velocities, time and step count are those before that
-            step, `error.step` is its number. (What barostats and CMMotionRemover did at its beginning stays.) Or a
-            check failed, or a NaN appeared: they are those of the last check.
-        InputError, UnsupportedError
-            At the first step: the System cannot be propagated, or the start is not on the constraints.
-        """
-        guard = self._watch()
-        if guard.disturbed:
-            guard.begin()
-        if self._plan.kept and guard.surroundings_changed():
-            self.refresh()
-        guard.meet_others()
-        while steps > 0:
-            block = min(steps, self.check_every - guard.since_check) if self.check_every else steps
-            self._run_block(guard, block)
-            guard.count(block)
-            steps -= block
-        guard.leave()
-        if self._plan.kept:
-            guard.note_surroundings()
-
-    def _run_block(self, guard: Guard, steps: int) -> None:
-        """Where the program can do less in steps whose end nobody looks at, let it."""
-        unseen = steps - self._plan.observed if self._plan.lazy else 0
-        if self._plan.lean:
-            self.program.write("lean", guard.undisturbed)
-            self.program.write("moving", guard.moving)
-        if unseen > 0 and guard.undisturbed and not (self._plan.joined and guard.moving):
-            self.program.write("between", 1.0)
-            try:
-                self._run(guard, unseen)
-            finally:
-                self.program.write("between", 0.0)
-            steps -= unseen
-        self._run(guard, steps)
-
-    def _run(self, guard: Guard, steps: int) -> None:
-        context = guard.context
-        time, first = context.getTime().value_in_unit(unit.picosecond), context.getStepCount()
-        before = self.getGlobalVariableByName("good_steps") if self.parts else 0.0
-        for part in self.parts:
-            part.begin_run()
-        try:
-            super().step(steps)
-        except openmm.OpenMMException as error:
-            guard.put_back()
-            if "NaN" not in str(error):
-                raise
-            raise guard.explosion(str(error), first) from error
-        code = int(self.getGlobalVariableByName("failed")) if self.parts else 0
-        done = int(self.getGlobalVariableByName("good_steps") - before) if code else steps
-        # OpenMM's clock goes on with the first step size after setStepSize.
-        expected = time + done * self._dt
-        if code or abs(context.getTime().value_in_unit(unit.picosecond) - expected) > 1e-6 * self._dt:
-            context.setTime(expected)
-        if code:
-            context.setStepCount(first + done)
-            guard.since_check += done
-            failure = self._failure(code, first + done + 1)
-            if self._plan.lean and self.getGlobalVariableByName("loose"):
-                self.program.write("between", 0.0)
-                self.applyVelocityConstraints(context)
-            raise failure
-
     def _failure(self, code: int, step: int) -> KconsError:
         error = self.parts[code - 1].failure(self, step)
         self.program.write("failed", 0.0)
@@ -361,7 +293,7 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
         program.write("first_stage", first)
         program.write("end_stage", end)
         try:
-            super().step(1)
+            openmm.CustomIntegrator.step(self, 1)
         finally:
             for name in ("first_stage", "end_stage"):
                 program.write(name, (program.settings | program.idle)[name])
@@ -435,21 +367,42 @@ class ProjectedIntegrator(StatesOnConstraints, Settings):
 
     @classmethod
     def from_xml(cls, xml: str, **arguments: Any) -> ProjectedIntegrator:
-        """The integrator that XmlSerializer wrote; OpenMM itself reads it as a plain CustomIntegrator.
+        """The integrator that XmlSerializer wrote, with its parts.
+
+        Without parts XmlSerializer.deserialize does the same.
 
         Parameters
         ----------
         xml : str
             The text of the file.
         **arguments
-            `parts`, `check_every` and `ensemble`, which the file does not contain.
+            `parts`, which the file does not contain; `check_every` and `ensemble` where they are to be others.
 
         Raises
         ------
         InputError
             The file has no program of this class with these parts.
         """
-        return as_projected(cls, openmm.XmlSerializer.deserialize(xml), **arguments)
+        return cls._of_note(read_plain(xml), note_in(xml) or {}, **arguments)
+
+    def _note(self) -> dict[str, Any]:
+        return note_of(self, ensemble=note_of_ensemble(self.ensemble), parts=len(self.parts))
+
+    @classmethod
+    def _of_note(cls, plain: openmm.CustomIntegrator, note: dict[str, Any], **arguments: Any) -> ProjectedIntegrator:
+        if not note:
+            return as_projected(cls, plain, **arguments)
+        if note["parts"] and not arguments.get("parts"):
+            raise InputError(
+                f"the integrator in the file holds {note['parts']} parts, which no file contains; read it by "
+                "ProjectedIntegrator.from_xml(text, parts=[...]) with the same parts as when it was made",
+                item="parts",
+            )
+        made = as_projected(
+            cls, plain, **{"check_every": note["check_every"], "ensemble": ensemble_in(note), **arguments}
+        )
+        made.asked_tolerance = note["tolerance"]
+        return made
 
     @classmethod
     def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> ProjectedIntegrator:

@@ -8,6 +8,8 @@ half kick are those of the first of the next call: n steps cost n evaluations, i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import openmm
@@ -18,6 +20,7 @@ from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import settings_of
+from kcons.openmm.integrator.states.serialization import note_of
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
@@ -53,6 +56,30 @@ class Ends(ProjectedIntegrator):
 
     _check_every = 1000
     _writer = EndWriter
+
+    def settle(self) -> None:
+        """End the leapfrog steps that were made."""
+        if self._take_owed():
+            assert self._guard is not None
+            context = self._guard.context
+            time, count = context.getTime(), context.getStepCount()
+            with self.way_back(count):
+                self.execute(_END)
+            context.setTime(time)
+            context.setStepCount(count)
+            self._guard.disturbed = False
+
+    @contextmanager
+    def way_back(self, first: int) -> Iterator[None]:
+        """Leapfrog steps are made; where that fails, v is that of half a step before, and the last check holds."""
+        try:
+            yield
+        except BaseException as error:
+            guard = self._watch()
+            guard.put_back()
+            if isinstance(error, openmm.OpenMMException) and "NaN" in str(error):
+                raise guard.explosion(str(error), first) from error
+            raise
 
     def execute(self, end: float) -> None:
         """Begin or end leapfrog steps; OpenMM takes that for a step, and moves its clock."""
@@ -148,35 +175,38 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
             At the first step: the System cannot be propagated, or the start is not on the constraints.
         """
         ends = self._ends
+        begun = bool(ends._take_owed())
         guard = self._watch()
         if guard.disturbed:
             guard.begin()
-        guard.meet_others()
+        if not begun:
+            guard.meet_others()
         while steps > 0:
             block = steps
             if ends.check_every and steps > (due := ends.check_every - guard.since_check) + ends.check_every // 2:
                 block = due
-            if block < FEW or not guard.undisturbed:
-                ends._run(guard, block)
+            check_is_due = 0 < ends.check_every <= guard.since_check + block
+            goes_on = ends.unseen and block == steps and not check_is_due and guard.undisturbed
+            if begun or goes_on or (block >= FEW and guard.undisturbed):
+                self._leap(guard, block, begun, goes_on)
             else:
-                self._leap(guard, block)
+                ends._run(guard, block)
             guard.count(block)
             steps -= block
+            begun = goes_on
         guard.leave()
+        ends._owe(int(begun))
 
-    def _leap(self, guard: Guard, steps: int) -> None:
+    def _leap(self, guard: Guard, steps: int, begun: bool, goes_on: bool) -> None:
+        """Leapfrog steps, which others may have begun, and others may end."""
         context = guard.context
         time, first = context.getTime()._value, context.getStepCount()
-        try:
-            self._ends.execute(_BEGIN)
-            self._verlet.step(steps - 1)
-            self._ends.execute(_END)
-        except BaseException as error:
-            # In the middle v is that of half a step before.
-            guard.put_back()
-            if isinstance(error, openmm.OpenMMException) and "NaN" in str(error):
-                raise guard.explosion(str(error), first) from error
-            raise
+        with self._ends.way_back(first):
+            if not begun:
+                self._ends.execute(_BEGIN)
+            self._verlet.step(steps if begun else steps - 1)
+            if not goes_on:
+                self._ends.execute(_END)
         context.setTime(time + steps * self._dt)
         context.setStepCount(first + steps)
 
@@ -282,6 +312,15 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     def _making(self) -> tuple[Any, ...]:
         every = None if self._ends.spare else self.check_every
         return self._dt, self._ends.asked_tolerance, every, settings_of(self._ends)
+
+    def _note(self) -> dict[str, Any]:
+        return {**note_of(self._ends), "class": "RattleIntegrator"}
+
+    @classmethod
+    def _of_note(cls, plain: openmm.CompoundIntegrator, note: dict[str, Any]) -> RattleIntegrator:
+        ends = plain.getIntegrator(0)
+        settings = {"groups": ends.getIntegrationForceGroups()}
+        return _remade(ends.getStepSize()._value, note["tolerance"], note["check_every"], settings)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()

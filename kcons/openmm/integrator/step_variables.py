@@ -9,6 +9,8 @@ What begins and ends a step, and what may be left out of it, goes by a few numbe
 - `failed` is set by the part whose solve failed. Nothing moves then until Python has read it and set it back to 0; x
   and v go back to `x_last` and `v_last`, the forces are computed anew (`stale`), and `loose` says whether v had been
   complete.
+- `phase` is other than 0 where virtual sites are placed at the end of an execution of the program only: each execution
+  is then the part of a step from one force evaluation to the next, and counts on by itself.
 - `first_stage` and `end_stage` are other than 0 and the number of drifts only while constraints are applied outside of
   steps: then the program starts at a drift without kicks, or behind it.
 
@@ -32,7 +34,9 @@ class Variable(NamedTuple):
 
 VARIABLES = {
     # where a step is
+    "phase": Variable("control", "0 for a whole step; else the number of the part of it that is made"),
     "stage": Variable("number", "number of the drift"),
+    "stop": Variable("number", "the drift that is left to the next part"),
     "h": Variable("number", "length of the drift"),
     "per_h": Variable("number", "1/h after the drift"),
     "kick": Variable("number", "length of a kick as a fraction of the step, with what the last step left out"),
@@ -45,7 +49,7 @@ VARIABLES = {
     # what was left out, and what is known
     "between": Variable("control", "1 if nobody looks at the velocities after this step"),
     "lean": Variable("control", "1 where v may do without half a kick between steps"),
-    "behind": Variable("number", "1 where v (or raw, where a call has ended) lacks half a kick"),
+    "behind": Variable("number", "1 where v (or raw, where a call has ended) lacks what ends a step"),
     "led": Variable("number", "the same when the last drift began"),
     "looked": Variable("number", "1 if somebody may have looked since the last step", 1.0),
     "moving": Variable("control", "1 where barostats may move x between steps"),

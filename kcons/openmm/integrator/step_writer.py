@@ -55,38 +55,67 @@ class StepWriter:
                 part.declare(p)
             self._write_guarded()
         else:
-            p.let_others_act()
             self._write_plain()
 
     # -- a step without parts -------------------------------------------------------------------
 
     def _write_plain(self) -> None:
-        p, drifts, kicks = self.program, self.drifts, self.kicks
-        if kicks[0]:
-            self._kick(_of_dt(kicks[0]), tangent=True)
-        if self.halves:
-            self.ensemble.middle(p, self._drift("(0.5*dt)"), self._project)
-            self._kick("0.5*dt", self._drift("(0.5*dt)"))
-        elif len(drifts) == 1:
-            impulse = self._drift("dt")
-            if kicks[1]:
-                self._kick(_of_dt(kicks[1]), impulse)
+        p = self.program
+        use(p, "phase")
+        if len(self.drifts) == 1 or self.halves:
+            self._write_plain_single()
+        else:
+            self._write_plain_loop()
+        p.let("phase", f"select(phase, select({self.phases}-phase, phase+1, 1), 0)", "what follows")
+
+    @property
+    def phases(self) -> int:
+        """Executions of the program that a step takes where virtual sites are placed at the end of each only."""
+        return 2 if self.halves else len(self.drifts) + 1
+
+    def _write_plain_single(self) -> None:
+        p, kicks = self.program, self.kicks
+        h = "(0.5*dt)" if self.halves else "dt"
+        with p.when("phase != 2", "up to the new positions"):
+            p.let_others_act()
+            self.ensemble.open(p)
+            if kicks[0]:
+                self._kick(_of_dt(kicks[0]), tangent=True)
+            if self.halves:
+                self.ensemble.middle(p, self._drift(h), self._project)
+            impulse = self._drift(h)
+        with p.when("phase != 1", "with the forces there"):
+            if kicks[-1]:
+                self._kick(_of_dt(kicks[-1]), impulse)
             else:
                 p.each("v", f"v+{impulse}", "the constraint forces act on v as well")
-        else:
-            p.table("drift_share", drifts, "length of drift k as a fraction of the step")
-            p.table("kick_share", kicks, "length of the kick before drift k as a fraction of the step")
-            use(p, "stage", "h")
-            p.let("stage", "0", "first drift")
-            # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
-            with p.loop(f"stage < {len(drifts)}", "all drifts and kicks of the scheme"):
-                p.let("h", "dt*drift_share(stage)", "length of this drift")
-                p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
-                p.let("stage", "stage+1", "what follows")
-                with p.when("kick_share(stage) != 0", "a kick follows"):
-                    self._kick("dt*kick_share(stage)")
-        if self.scheme is not None and not self._ends_tangent:
-            self._project()
+            if self.scheme is not None and not self._ends_tangent:
+                self._project()
+            self.ensemble.close(p)
+
+    def _write_plain_loop(self) -> None:
+        p, n = self.program, len(self.drifts)
+        p.table("drift_share", self.drifts, "length of drift k as a fraction of the step")
+        p.table("kick_share", self.kicks, "length of the kick before drift k as a fraction of the step")
+        use(p, "stage", "stop", "h")
+        p.let("stage", "select(phase, phase-1, 0)", "first drift")
+        p.let("stop", f"select(phase, min(phase, {n}), {n})", "where to stop")
+        with p.when("stage = 0", "a step begins"):
+            p.let_others_act()
+            self.ensemble.open(p)
+        # One loop over tables: unrolled, or with more blocks, the set-up of OpenMM takes long.
+        with p.loop("stage < stop", "all drifts and kicks of the scheme"):
+            with p.when("kick_share(stage) != 0", "a kick comes first"):
+                self._kick("dt*kick_share(stage)")
+            p.let("h", "dt*drift_share(stage)", "length of this drift")
+            p.each("v", f"v+{self._drift('h')}", "the constraint forces act on v as well")
+            p.let("stage", "stage+1", "what follows")
+        with p.when(f"phase*({self.phases}-phase) = 0", "the step ends"):
+            if self.kicks[-1]:
+                self._kick(_of_dt(self.kicks[-1]))
+            if not self._ends_tangent:
+                self._project()
+            self.ensemble.close(p)
 
     # -- a step that is taken back when a part fails --------------------------------------------
 
@@ -125,6 +154,7 @@ class StepWriter:
                 p.each("x_last", "x", "to come back to")
             p.let("stale", "0", "forces belong to x")
             p.each("v_last", "v", "to come back to")
+            self.ensemble.open(p)
             if self.kicks[0]:
                 self._kick("dt*kick_share(first_stage)", tangent=True)
             p.let("stage", "first_stage", "first drift")
@@ -149,12 +179,14 @@ class StepWriter:
                         self._kick_after("per_h*(x-xu)")
                     if not self._ends_tangent:
                         self._project()
+                    self.ensemble.close(p)
                     p.let("good_steps", "good_steps+delta(failed)", "count it")
                     if self.kept:
                         p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
             with p.when("failed != 0", "a solve failed"):
                 p.each("x", "x_last", "back to where the step began")
                 p.each("v", "v_last", "back to where the step began")
+                self.ensemble.take_back(p)
                 p.let("stale", "1", "forces are those of elsewhere")
 
     def _write_single(self) -> None:

@@ -18,6 +18,7 @@ from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
+from kcons.openmm.integrator.interface import Integrator
 from kcons.plan.plan import make_plan
 
 IntArray = NDArray[np.int64]
@@ -27,9 +28,12 @@ ROW_NAME, SURFACE_NAME = "kcons row", "kcons surface"
 
 #: Forces that need an integrator of their own.
 _FOREIGN = {
-    "DrudeForce": "Drude particles need openmm.DrudeLangevinIntegrator or openmm.DrudeSCFIntegrator",
+    "DrudeForce": "moved like atoms, Drude particles take up the heat of the molecules, and polarisation is lost. Use "
+    "openmm.DrudeLangevinIntegrator or openmm.DrudeSCFIntegrator, which keep them cold",
     "RPMDMonteCarloBarostat": "ring polymers need openmm.RPMDIntegrator",
 }
+#: Platforms that place virtual sites where a program ends. GPUs do so wherever positions are constrained.
+_LATE = ("Reference", "CPU")
 BAROSTATS = frozenset(
     {"MonteCarloBarostat", "MonteCarloAnisotropicBarostat", "MonteCarloMembraneBarostat", "MonteCarloFlexibleBarostat"}
 )
@@ -187,14 +191,14 @@ def refuse_motion_remover(system: openmm.System, kind: str) -> None:
         )
 
 
-def check_system(system: openmm.System, *, leapfrog: bool) -> None:
+def check_system(system: openmm.System) -> None:
     """Refuse Systems that a CustomIntegrator of kicks and drifts cannot propagate.
 
     Raises
     ------
     UnsupportedError
-        Virtual sites in any scheme but the leapfrog, particles or forces that need an integrator of their own, a
-        barostat that scales atoms one by one although bonds are held.
+        Particles or forces that need an integrator of their own, a barostat that scales atoms one by one although
+        bonds are held.
     """
     for force in forces_of(system):
         name = type(force).__name__
@@ -206,15 +210,35 @@ def check_system(system: openmm.System, *, leapfrog: bool) -> None:
                 "MonteCarloFlexibleBarostat with scaleMoleculesAsRigid=False moves the atoms of a molecule apart and "
                 "breaks the constraints; let it scale molecules as rigid"
             )
-    if leapfrog:
-        return
+
+
+def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
+    """Whether steps must be made in parts: forces are needed within the step, and virtual sites are placed at its end.
+
+    Raises
+    ------
+    UnsupportedError
+        There are such sites, and steps cannot be made in parts.
+    """
+    system, platform = context.getSystem(), context.getPlatform().getName()
     sites = [k for k in range(system.getNumParticles()) if system.isVirtualSite(k)]
-    if sites:
+    if not sites or integrator.scheme is None:
+        return False
+    late = platform in _LATE
+    where = f"particle {sites[0]} is a virtual site"
+    if integrator.parts:
         raise UnsupportedError(
-            f"particle {sites[0]} is a virtual site: OpenMM places virtual sites at the end of a step only, and every "
-            "scheme but 'leapfrog' needs forces within the step, where the sites would still be those of the step "
-            "before. Use scheme='leapfrog'"
+            f"{where}, and beside parts= only scheme='leapfrog' computes all forces where virtual sites were placed; "
+            "use that, or water without virtual sites"
         )
+    owner = getattr(context, "_integrator", integrator)
+    if late and isinstance(owner, openmm.CompoundIntegrator) and not getattr(owner, "closed", False):
+        raise UnsupportedError(
+            f"{where}: {platform} places virtual sites at the end of a program only, and within a CompoundIntegrator "
+            "OpenMM runs it as a whole, with forces of sites that are one step old. Use scheme='leapfrog', or the "
+            "integrator alone"
+        )
+    return late
 
 
 def refuse_barostat(context: openmm.Context, rows: Iterable[Sequence[int]], kind: str) -> None:

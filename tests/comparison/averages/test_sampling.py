@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.averages import sampling
 from kcons.errors import InputError
 from kcons.steppers import State
@@ -17,7 +17,7 @@ from kcons.thermostats import Isokinetic, configurational_temperature, mean, the
 
 @pytest.fixture(scope="module")
 def dumbbells():
-    return scenes.build_fluid("thermostat-dumbbells", 8)
+    return test_systems.build_fluid("thermostat-dumbbells", 8)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_steps_that_are_too_large_are_shown(dumbbells):
 
 def test_water():
     found = sampling.compare(
-        scenes.build_fluid("thermostat-water").with_time_steps([2.0]), methods=["isokinetic"], most=100
+        test_systems.build_fluid("thermostat-water").with_time_steps([2.0]), methods=["isokinetic"], most=100
     )
     (m,) = found.measurements
     assert found.scene["degrees_of_freedom"] == 159

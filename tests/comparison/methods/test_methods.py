@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons import steppers
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods.method import Method
 from kcons.comparison.work_precision import measure, report
@@ -76,7 +76,7 @@ NAMED = {
 
 @pytest.fixture
 def pendulum():
-    return scenes.build("double-pendulum")
+    return test_systems.build("double-pendulum")
 
 
 def test_every_stepper_is_a_method():
@@ -94,7 +94,7 @@ def test_every_stepper_is_a_method():
 @pytest.mark.parametrize("name", NAMED)
 def test_every_stepper_runs_dependent_rows_and_finds_the_trajectory(name):
     # 21 rows of rank 19.
-    scene = scenes.build("ethanol", forces="emt").shortened(4)
+    scene = test_systems.build("ethanol", forces="emt").shortened(4)
     found = measure.compare(scene.with_time_steps([0.5, 0.25]), methods=[name])
     assert [m.status for m in found.measurements] == ["ok", "ok"]
     assert found.measurements[-1].error < 1e-4
@@ -155,8 +155,8 @@ def test_onlookers_do_not_save_a_stepper_its_evaluations(monkeypatch, pendulum):
 
 
 def test_energies_are_read_without_being_counted(pendulum):
-    potential = scenes.build("butane").potential
-    x = scenes.build("butane").positions
+    potential = test_systems.build("butane").potential
+    x = test_systems.build("butane").positions
     potential.forget()
     potential.forces(x)
     assert potential.watched_energy(x) == potential.energy(x)
@@ -184,7 +184,7 @@ def test_usual_methods_and_all(monkeypatch):
 
 
 def test_hosts_fix_the_atoms_of_the_slab():
-    scene = scenes.build("slab")
+    scene = test_systems.build("slab")
     for name in ("ase-bonds", "ase-internals", "ase-kcons"):
         run = methods.METHODS[name].start(scene, scene.time_steps[0])
         run.advance()
@@ -197,7 +197,7 @@ def test_hosts_fix_the_atoms_of_the_slab():
 @pytest.mark.parametrize("name", ["triple-pendulum", "rotor", "bead-rotating"])
 def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name):
     # Along a constraint that moves, too.
-    scene = scenes.build(name)
+    scene = test_systems.build(name)
     found = measure.compare(scene, methods=["dop853", "dop853-projected"])
     for free, held in zip(found.of("dop853"), found.of("dop853-projected"), strict=True):
         assert held.evaluations_per_time == pytest.approx(free.evaluations_per_time, rel=0.05)

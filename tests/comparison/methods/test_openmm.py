@@ -1,4 +1,4 @@
-"""OpenMM as an MD engine of scenes: the same system, the same trajectories, and costs that are counted right."""
+"""OpenMM as an MD engine of test systems: the same system, the same trajectories, and costs that are counted right."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import openmm
 import pytest
 from openmm import unit
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods import openmm as openmm_methods
-from kcons.comparison.scenes.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
 from kcons.comparison.work_precision import measure, report
 
 HOSTED = {
@@ -29,7 +29,7 @@ HOSTED = {
 
 
 def build(name):
-    return scenes.build(name.removesuffix("-box"), HOSTED[name])
+    return test_systems.build(name.removesuffix("-box"), HOSTED[name])
 
 
 @pytest.fixture(scope="module", params=HOSTED)
@@ -39,7 +39,7 @@ def scene(request):
 
 @pytest.fixture(scope="module")
 def rotor():
-    return scenes.build("rotor").shortened(4)
+    return test_systems.build("rotor").shortened(4)
 
 
 def errors(scene, *names, **options):
@@ -77,7 +77,7 @@ def test_forces_masses_and_distances_are_those_of_the_scene(scene):
 
 
 def test_water_has_the_same_forces_in_single_precision():
-    scene = scenes.build("water", 8)
+    scene = test_systems.build("water", 8)
     host = scene.openmm
     assert host.platform == "CPU"
     x = scene.positions
@@ -88,7 +88,7 @@ def test_water_has_the_same_forces_in_single_precision():
 
 
 def test_water_cut_off_by_ase_has_no_system():
-    assert scenes.build("water", 8, forces="ase").openmm is None
+    assert test_systems.build("water", 8, forces="ase").openmm is None
 
 
 # -- the same trajectories --------------------------------------------------------------------------
@@ -127,7 +127,7 @@ def test_higher_orders_are_the_same_scheme(name, scheme):
 
 @pytest.mark.parametrize("scheme", ["geodesic", "suzuki4", "blanes-moan6"])
 def test_schemes_on_spheres(scheme):
-    scene = scenes.build("sphere-pendulum", 2)
+    scene = test_systems.build("sphere-pendulum", 2)
     scene = replace(scene, time_steps=scene.time_steps[-2:])
     _, (core, hosted) = errors(scene, scheme, f"openmm-surface-{scheme}")
     assert hosted == pytest.approx(core, rel=1e-3)
@@ -185,7 +185,7 @@ def field(state):
 @pytest.fixture
 def counted():
     """A rotor in a field that counts how often it is asked for."""
-    plain = scenes.build("rotor")
+    plain = test_systems.build("rotor")
     force = openmm.PythonForce(field)
     x, pairs = plain.positions, plain.bonds
     lengths = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
@@ -286,21 +286,21 @@ def test_usual_methods_of_a_scene_at_home_in_openmm():
     assert names == [m.name for m in methods.chosen(["openmm"], scene)]
 
 
-def test_guests_on_other_scenes(rotor):
+def test_guests_on_other_test_systems(rotor):
     hosted = [m.name for m in methods.chosen(None, rotor) if m.host == "openmm"]
     assert hosted == ["openmm-verlet", "openmm-kcons-rattle"]
-    sphere = scenes.build("sphere", 2)
+    sphere = test_systems.build("sphere", 2)
     assert [m.name for m in methods.chosen(None, sphere) if m.host == "openmm"] == ["openmm-surface-rattle"]
-    assert not [m for m in methods.chosen(None, scenes.build("butane")) if m.host == "openmm"]
+    assert not [m for m in methods.chosen(None, test_systems.build("butane")) if m.host == "openmm"]
     assert not [m for m in methods.chosen() if m.host == "openmm"]
 
 
 def test_refusals(monkeypatch, rotor):
-    sphere = scenes.build("sphere", 2)
+    sphere = test_systems.build("sphere", 2)
     assert methods.METHODS["openmm-verlet"].refuses(sphere) == "a System holds distances only"
     assert "no particle" in methods.METHODS["openmm-surface-rattle"].refuses(rotor)
     assert methods.METHODS["openmm-free"].refuses(sphere) is None
-    assert "no OpenMM System" in methods.METHODS["openmm-verlet"].refuses(scenes.build("butane"))
+    assert "no OpenMM System" in methods.METHODS["openmm-verlet"].refuses(test_systems.build("butane"))
     assert "kelvin" in methods.METHODS["openmm-middle-bath"].refuses(rotor)
     monkeypatch.setattr(openmm_methods, "find_spec", lambda name: None)
     assert "not installed" in methods.METHODS["openmm-verlet"].refuses(rotor)

@@ -10,7 +10,7 @@ import pytest
 
 from kcons.cli import main
 from kcons.comparison.stability import (
-    SCENES,
+    SYSTEMS,
     attempt,
     drift,
     fuzz,
@@ -74,10 +74,10 @@ def test_largest_step_of_the_free_rotor_is_one():
     assert attempt("Rattle", "rotor", 0.99, 50)[0] == "stable"
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", SYSTEMS)
 def test_copies_have_the_forces_of_the_scene(scene):
-    problem = SCENES[scene](2)
-    copies = Copies([SCENES[scene](1), problem])
+    problem = SYSTEMS[scene](2)
+    copies = Copies([SYSTEMS[scene](1), problem])
     y = problem.x + 0.01 * np.random.default_rng(0).standard_normal(problem.x.shape)
     both = np.vstack([y, y])
     np.testing.assert_allclose(copies.forces(both, 0.0)[problem.n_atoms :], problem.forces(y), atol=1e-14)
@@ -140,7 +140,7 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
         encoding="utf-8",
     )
     numbers.write_text(json.dumps(stored), encoding="utf-8")
-    found = run(only=["drift"], scenes=["butane"], quick=True)
+    found = run(only=["drift"], test_systems=["butane"], quick=True)
     assert list(found["pieces"]) == ["drift/butane"]
     with pytest.raises(InputError, match="quick"):
         put_into(found, numbers)
@@ -165,4 +165,4 @@ def test_a_scene_that_is_added_goes_into_results_and_page(tmp_path):
 
 def test_a_scene_that_is_not_there():
     with pytest.raises(InputError, match="no test system 'methane'"):
-        run(only=["drift"], scenes=["methane"], quick=True)
+        run(only=["drift"], test_systems=["methane"], quick=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import method as runs
 from kcons.comparison.methods import methods
 from kcons.comparison.work_precision import measure
@@ -18,7 +18,7 @@ from kcons.steppers import State, System, run
 
 @pytest.fixture(scope="module")
 def chain():
-    return scenes.build("chain", 4)
+    return test_systems.build("chain", 4)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def result(chain):
 
 @pytest.fixture(scope="module")
 def spheres():
-    return measure.compare(scenes.build("sphere-pendulum", 2), budget=30)
+    return measure.compare(test_systems.build("sphere-pendulum", 2), budget=30)
 
 
 def test_all_methods_are_there(chain, result):
@@ -125,7 +125,7 @@ def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
 
 
 def test_energy_slope_is_the_fit():
-    scene = scenes.build("sphere", 2)
+    scene = test_systems.build("sphere", 2)
     log = measure._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
     slope, error = measure._energy_slope(scene, log)
     assert slope == pytest.approx(2.0 / scene.motion.degrees_of_freedom)
@@ -248,7 +248,7 @@ COMPOSED = ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_quick_comparison(name):
-    scene = scenes.build(name, quick=True)
+    scene = test_systems.build(name, quick=True)
     steps = scene.time_steps[:2]
     result = measure.compare(replace(scene, time_steps=steps), budget=60)
     refused = {m.method: m.note for m in result.measurements if m.status == "not run" and m.setting == 0}

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods.method import STRETCH, OverBudgetError, Run, Stopwatch
 from kcons.comparison.methods.peers import lammps_shake, shake
@@ -32,12 +32,12 @@ SHORT = Rounds(least=2, most=2, seconds=0.0, pass_seconds=1e-4)
 
 @pytest.fixture(scope="module")
 def chain():
-    return scenes.build("chain", 6)
+    return test_systems.build("chain", 6)
 
 
 @pytest.fixture(scope="module")
 def spheres():
-    return scenes.build("sphere-pendulum", 2)
+    return test_systems.build("sphere-pendulum", 2)
 
 
 MARCHING = ("rattle", "suzuki4", "blanes-moan6", "geodesic", "projected-rk4", "baumgarte", "verlet")
@@ -70,7 +70,7 @@ def test_marching_is_advancing(chain, name):
 
 @pytest.mark.parametrize("name", ["rattle", "mici", "kahan-li6"])
 def test_marching_is_advancing_with_friction(name):
-    fekete = scenes.build("fekete", 4)
+    fekete = test_systems.build("fekete", 4)
     looked_at, alone = started(fekete, name), started(fekete, name)
     for _ in range(3):
         looked_at.advance()
@@ -406,7 +406,7 @@ def test_openmm_makes_many_steps_at_a_stretch(chain):
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
 def test_openmm_is_timed_in_rounds():
-    scene = scenes.build("chain", 4)
+    scene = test_systems.build("chain", 4)
     scene = replace(scene, time_steps=scene.time_steps[:1])
     found = measure.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
     assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import pytest
 
 from kcons.cli import main
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
 from kcons.comparison.study import machine, tables
 from kcons.comparison.study.study import Watcher
@@ -315,7 +315,7 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
     plan = {item.key: item for item in parts_of_the_whole.PLAN}
     assert len(plan) == len(parts_of_the_whole.PLAN)
     for item in plan.values():
-        assert item.module or item.scene in scenes.SCENES
+        assert item.module or item.scene in test_systems.SYSTEMS
     assert {"sphere", "sphere-pendulum", "sphere-pendulum-top", "pendulum", "triple-pendulum", "rotor"} <= set(plan)
     assert {"dumbbells", "fekete", "ethanol", "water-216", "water-900", "water-5000"} <= set(plan)
     assert [plan[f"chain-1e{k}"].size for k in range(2, 7)] == [10**k for k in range(2, 7)]
@@ -329,7 +329,7 @@ def test_the_plan_has_every_scene_that_was_asked_for(monkeypatch):
 
 def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
     monkeypatch.undo()
-    scene = scenes.build("chain", 3)
+    scene = test_systems.build("chain", 3)
     names, left_out = whole.methods_of(Item("x", "x", "chain"), scene, False)
     for name in ("rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853", "verlet"):
         assert name in names

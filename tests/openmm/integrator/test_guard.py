@@ -7,6 +7,7 @@ import openmm
 import pytest
 from openmm import unit
 from openmm_systems import (
+    GPUS,
     PLATFORMS,
     alanine,
     dumbbell,
@@ -275,3 +276,40 @@ def test_clock_follows_the_step_size():
     integrator.step(4)
     assert context.getTime() / PS == pytest.approx(0.005, rel=1e-12)
     assert context.getStepCount() == 7
+
+
+# -- molecules that cross the box ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", [g for g in GPUS if "mixed" in str(g)])
+@pytest.mark.parametrize("crossed, molecules, refused", [(1, 1, False), (2, 4, False), (3, 4, True)])
+def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_crossed(
+    platform, crossed, molecules, refused
+):
+    """In mixed precision OpenMM rounds positions of molecules that it moves back into the box."""
+    system = openmm.System()
+    system.setDefaultPeriodicBoxVectors(*(8.0 * np.eye(3)))
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    x = np.zeros((2 * molecules, 3))
+    for k in range(molecules):
+        x[2 * k] = (7.0 + 0.01 * np.pi, 1.3 * k + np.pi / 10, 7.0 + np.e / 10)
+        x[2 * k + 1] = x[2 * k] + 0.1 * np.array([2, 3, 6]) / 7
+        system.addConstraint(system.addParticle(12.0), system.addParticle(1.0), 0.1)
+        for _ in range(2):
+            force.addParticle(0.0, 0.3, 0.0)
+        force.addException(2 * k, 2 * k + 1, 0.0, 0.3, 0.0)
+    system.addForce(force)
+    integrator = ProjectedIntegrator(0.001)
+    context = started(system, integrator, x, platform=platform)
+    integrator.step(1)
+    given = x.copy()
+    given[: 2 * crossed] = given[: 2 * crossed].astype(np.float32)
+    assert integrator.context is context
+    watch = integrator._guard
+    assert (np.abs(watch.rows.stretches(given)) > watch.limit(given))[:crossed].all()
+    if refused:
+        with pytest.raises(ConvergenceError):
+            watch.check_rows(given, 1)
+    else:
+        watch.check_rows(given, 1)

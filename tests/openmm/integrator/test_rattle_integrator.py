@@ -243,7 +243,7 @@ def test_steps_without_python():
     """What OpenMM makes of it where Python is not asked is RATTLE as well."""
     system, x, v = alanine()
     (ours, compiled), (theirs, program) = both(system, x, v)
-    openmm.CompoundIntegrator.step(compiled, 10)
+    openmm._openmm.CompoundIntegrator_step(compiled, 10)
     program.step(10)
     np.testing.assert_array_equal(state_of(ours), state_of(theirs))
 
@@ -252,13 +252,11 @@ def test_steps_without_python():
 
 
 def test_what_cannot_be_propagated_is_refused():
-    system = openmm.System()
-    for m in (16.0, 1.0, 1.0, 0.0):
-        system.addParticle(m)
-    system.setVirtualSite(3, openmm.ThreeParticleAverageSite(0, 1, 2, 0.8, 0.1, 0.1))
+    system, x, v = dumbbell()
+    system.addForce(openmm.DrudeForce())
     integrator = RattleIntegrator(1e-3)
-    context = started(system, integrator, np.eye(4, 3))
-    with pytest.raises(UnsupportedError, match="virtual"):
+    context = started(system, integrator, x, v)
+    with pytest.raises(UnsupportedError, match="Drude"):
         integrator.step(5)
     assert context.getStepCount() == 0
 
@@ -365,19 +363,3 @@ def test_reporters():
     gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
     kinetic = np.array([row[2] for row in rows])
     np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
-
-
-def test_steps_of_others_in_a_compound():
-    """OpenMM keeps the forces of a CustomIntegrator while another integrator moves x; `step` sees that."""
-    system, x, v = alanine()
-    compound, ours, other = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3), openmm.VerletIntegrator(1e-3)
-    other.setConstraintTolerance(1e-10)
-    compound.addIntegrator(ours)
-    compound.addIntegrator(other)
-    context = started(system, compound, x, v)
-    ours.step(2)
-    other.step(5)
-    fresh = started(system, alone := ProjectedIntegrator(1e-3), *state_of(context))
-    ours.step(1)
-    alone.step(1)
-    np.testing.assert_allclose(state_of(context)[0], state_of(fresh)[0], rtol=0, atol=1e-8)

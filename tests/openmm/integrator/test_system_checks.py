@@ -9,8 +9,6 @@ from openmm import app, unit
 from openmm_systems import (
     PLATFORMS,
     dumbbell,
-    forces_at,
-    masses_of,
     started,
     state_of,
     total_energy,
@@ -18,7 +16,6 @@ from openmm_systems import (
 
 from kcons.errors import UnsupportedError
 from kcons.openmm import ProjectedIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
 from kcons.openmm.integrator.system_checks import SystemRows, refuse_motion_remover
 
 platforms = pytest.mark.parametrize("platform", PLATFORMS)
@@ -47,31 +44,6 @@ def water_with_sites():
     context.setVelocitiesToTemperature(300, 1)
     integrator.step(20)
     return system, *state_of(context)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_virtual_sites_are_refused_within_steps(water_with_sites, scheme):
-    system, x, v = water_with_sites
-    integrator = ProjectedIntegrator(1e-3, scheme)
-    context = started(system, integrator, x, v)
-    with pytest.raises(UnsupportedError, match=r"particle 3 is a virtual site.*leapfrog"):
-        integrator.step(1)
-    np.testing.assert_array_equal(state_of(context), [x, v])
-
-
-def test_why_virtual_sites_are_refused(water_with_sites):
-    """Forces of the middle of a step are those of the sites at its beginning."""
-    system, x, v = water_with_sites
-    plain = openmm.CustomIntegrator(1e-3)
-    plain.addPerDofVariable("seen", 0)
-    plain.addComputePerDof("x", "x+dt*v")
-    plain.addConstrainPositions()
-    plain.addComputePerDof("seen", "f")
-    context = started(system, plain, x, v)
-    plain.step(1)
-    seen, now = np.array(plain.getPerDofVariableByName("seen")), forces_at(context)
-    massive = masses_of(system) > 0
-    assert np.abs(seen - now)[massive].max() > 1e-3 * np.abs(now).max()
 
 
 @platforms

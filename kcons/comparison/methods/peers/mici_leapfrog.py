@@ -11,7 +11,7 @@ import numpy as np
 
 from kcons.comparison.methods.method import Method, Run, Steps
 from kcons.comparison.methods.peers.smallness import dense_rows, one_thread, plain_set, too_much
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.target import FloatArray
 
 #: Its own defaults, and what is left of rounding.
@@ -22,16 +22,16 @@ SOLVES = ("projection_solver", "_project_onto_cotangent_space")
 
 
 class _MiciRun(Steps):
-    def __init__(self, scene: Scene, dt: float, tolerances: dict[str, float]) -> None:
+    def __init__(self, test_system: TestSystem, dt: float, tolerances: dict[str, float]) -> None:
         from mici.integrators import ConstrainedLeapfrogIntegrator
         from mici.states import ChainState
         from mici.systems import DenseConstrainedEuclideanMetricSystem
 
-        super().__init__(dt, round(scene.horizon / dt))
+        super().__init__(dt, round(test_system.horizon / dt))
         one_thread("mici")
-        potential, shape = scene.potential, scene.positions.shape
-        value, jacobian = dense_rows(plain_set(scene))
-        self._weights = np.repeat(scene.masses, 3)
+        potential, shape = test_system.potential, test_system.positions.shape
+        value, jacobian = dense_rows(plain_set(test_system))
+        self._weights = np.repeat(test_system.masses, 3)
         system = DenseConstrainedEuclideanMetricSystem(
             lambda q: potential.energy(q.reshape(shape)),
             value,
@@ -41,12 +41,12 @@ class _MiciRun(Steps):
         )
         self._integrator = ConstrainedLeapfrogIntegrator(system, step_size=dt, projection_solver_kwargs=tolerances)
         self.constraints.watch(self._integrator, SOLVES)
-        momenta = self._weights * scene.velocities.ravel()
-        self._state: Any = ChainState(pos=scene.positions.ravel().copy(), mom=momenta, dir=1)
+        momenta = self._weights * test_system.velocities.ravel()
+        self._state: Any = ChainState(pos=test_system.positions.ravel().copy(), mom=momenta, dir=1)
         self._shape = shape
-        self._share = math.exp(-0.5 * scene.friction * dt)
-        self._scene, self._system, self._start = scene, system, self._state.copy()
-        potential.forces(scene.positions)
+        self._share = math.exp(-0.5 * test_system.friction * dt)
+        self._test_system, self._system, self._start = test_system, system, self._state.copy()
+        potential.forces(test_system.positions)
 
     def advance(self) -> None:
         if self._share != 1.0:
@@ -67,7 +67,7 @@ class _MiciRun(Steps):
         self._done += steps
 
     def rewind(self) -> None:
-        self._scene.potential.forces(self._scene.positions)
+        self._test_system.potential.forces(self._test_system.positions)
         # What a state knows goes on to its copies, as it does from step to step.
         self._system.grad_neg_log_dens(self._start)
         self._system.inv_gram(self._start)
@@ -96,16 +96,16 @@ class Mici(Method):
 
     tight: bool = False
 
-    def refuses(self, scene: Scene) -> str | None:
+    def refuses(self, test_system: TestSystem) -> str | None:
         if find_spec("mici") is None:
             return "mici is not installed; python -m pip install mici"
-        return super().refuses(scene) or too_much(scene)
+        return super().refuses(test_system) or too_much(test_system)
 
-    def warm_up(self, scene: Scene) -> None:
-        self.start(scene, min(scene.time_steps)).advance()
+    def warm_up(self, test_system: TestSystem) -> None:
+        self.start(test_system, min(test_system.time_steps)).advance()
 
-    def start(self, scene: Scene, setting: float) -> Run:
-        return _MiciRun(scene, setting, TIGHT if self.tight else DEFAULT)
+    def start(self, test_system: TestSystem, setting: float) -> Run:
+        return _MiciRun(test_system, setting, TIGHT if self.tight else DEFAULT)
 
 
 def mici_methods() -> list[Method]:

@@ -1,4 +1,4 @@
-"""What solvers with dense matrices need: few rows at rest, the rows as plain arrays, and one thread for BLAS."""
+"""What solvers with dense matrices need: few rows with constant targets, plain arrays, one thread for BLAS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from kcons.comparison.methods.method import independent_rows
-from kcons.comparison.scenes import Scene
+from kcons.comparison.test_systems import TestSystem
 from kcons.constraints import Distance, Sphere
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -18,14 +18,14 @@ from kcons.constraints.target import FloatArray
 MOST_ATOMS, MOST_ROWS = 40, 60
 
 
-def too_much(scene: Scene) -> str | None:
+def too_much(test_system: TestSystem) -> str | None:
     """Why a dense solver cannot run the test system, or None."""
-    held = scene.constraint_set
+    held = test_system.constraint_set
     if held.moving:
         return "its constraints cannot move"
     if not held.holonomic.all():
         return "it holds functions of the positions only"
-    if scene.n_atoms > MOST_ATOMS or held.n_rows > MOST_ROWS:
+    if test_system.n_atoms > MOST_ATOMS or held.n_rows > MOST_ROWS:
         return f"its matrices are dense; more than {MOST_ATOMS} atoms or {MOST_ROWS} rows take too long"
     return None
 
@@ -42,12 +42,12 @@ def one_thread(after: str) -> None:
         threadpool_limits(1)
 
 
-def plain_set(scene: Scene) -> ConstraintSet:
+def plain_set(test_system: TestSystem) -> ConstraintSet:
     """What the test system holds as independent rows, by distances alone where that is the same."""
-    if scene.bonds is None or len(scene.fixed) or scene.cell is not None:
-        return independent_rows(scene)
-    held = ConstraintSet(Distance(scene.bonds), scene.positions, scene.masses)
-    return independent_rows(scene, held)
+    if test_system.bonds is None or len(test_system.fixed) or test_system.cell is not None:
+        return independent_rows(test_system)
+    held = ConstraintSet(Distance(test_system.bonds), test_system.positions, test_system.masses)
+    return independent_rows(test_system, held)
 
 
 Rows = tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]

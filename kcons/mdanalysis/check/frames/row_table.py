@@ -84,11 +84,11 @@ class RowTable:
 
     @property
     def only_lengths(self) -> bool:
-        """Whether compiled code does all of it, so that whole blocks of a file can be looked at."""
+        """Whether compiled loops evaluate all rows, so that whole blocks of a file can be read at once."""
         return self._others is None
 
     def fresh(self) -> RowTable:
-        """One that shares all but what is changed while frames are looked at; each worker needs its own to look."""
+        """A copy for one worker: it shares the rows and has statistics and a cell of its own."""
         other = copy.copy(self)
         other._box, other._dimensions = np.zeros((2, 3, 3)), ()
         other._lengths = self._lengths.fresh()
@@ -311,8 +311,10 @@ def cell_matrix(dimensions: Any) -> FloatArray | None:
     # Exactly 90 degrees has no rounding.
     cosines = [0.0 if angle == 90.0 else float(np.cos(np.radians(angle))) for angle in (alpha, beta, gamma)]
     sine = 1.0 if gamma == 90.0 else float(np.sin(np.radians(gamma)))
+    if not sine > 0:
+        return None
     x, y = c * cosines[1], c * (cosines[0] - cosines[1] * cosines[2]) / sine
     rest = c * c - x * x - y * y
-    if not (rest > 0 and sine > 0):
+    if not rest > 0:
         return None
     return np.array([[a, 0.0, 0.0], [b * cosines[2], b * sine, 0.0], [x, y, np.sqrt(rest)]])

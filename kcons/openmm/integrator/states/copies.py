@@ -16,7 +16,7 @@ from kcons.openmm.integrator.step_variables import VARIABLES
 from kcons.steppers.splitting import Splitting
 
 #: Globals that belong to a run, not to the integrator: a copy starts without them.
-RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"growth", "lost"}
+RUN_STATE = frozenset(name for name, kind in VARIABLES.items() if kind.kind == "number") | {"lost"}
 
 
 def settings_of(integrator: openmm.CustomIntegrator) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def apply_settings(integrator: Integrator, settings: dict[str, Any]) -> None:
     integrator.setRandomNumberSeed(settings["seed"])
     openmm.Integrator.setIntegrationForceGroups(integrator, settings["groups"])
     for name, value in settings["globals"].items():
-        if name not in program.settings and name not in program.idle:
+        if name not in program.settings and name not in program.idle and name not in program.memory:
             program.write(name, value)
     for name, value in settings["settings"].items():
         program.set(name, value)
@@ -72,7 +72,7 @@ def as_projected(
         making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
         made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
         if program_of(made) == wanted:
-            apply_settings(made, settings_of(integrator))
+            apply_settings(made, settings_of(integrator) | {"settings": {}})  # the ensemble is the one that is given
             return made
     raise InputError(
         f"this CustomIntegrator has no program of {kind.__name__} with "

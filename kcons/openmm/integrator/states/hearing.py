@@ -1,4 +1,4 @@
-"""What a Context is told, its integrator must hear: OpenMM tells no integrator that is written in Python.
+"""Changes of a Context, passed on to its integrator: OpenMM does not notify integrators written in Python.
 
 On import, some methods of OpenMM's classes are wrapped. They look whether the Context belongs to an integrator of
 kcons, alone or within a CompoundIntegrator; for all others they do what they did, and nothing else.
@@ -11,6 +11,8 @@ kcons, alone or within a CompoundIntegrator; for all others they do what they di
 * `Context.getState`: groups that carry rows are no part of energy and forces, unless asked for.
 * `LocalEnergyMinimizer.minimize`: knows no parts, so that `minimizeEnergy` of the integrator takes its place.
 * `updateParametersInContext` of all Forces: forces that were kept are old.
+* `Simulation.step`, `runForClockTime`: nobody sees the end of a call of `step` within them (see `calls`), and what an
+  integrator has put off there is made before the Context answers.
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ from collections.abc import Callable
 from typing import Any
 
 import openmm
+from openmm import app
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.states.calls import settle
 
 logger = logging.getLogger("kcons.openmm")
 
@@ -38,8 +42,13 @@ _FOREIGN = ("IntegratorParameters", "global variable name", "per-DOF variable na
 
 
 def listen(integrator: Integrator) -> None:
-    """Let this integrator hear what its Context is told."""
+    """Notify this integrator of changes of its Context."""
     _LIVE[int(integrator.this)] = integrator
+
+
+def live(integrator: openmm.Integrator) -> Integrator | None:
+    """The integrator of kcons that OpenMM hands out as a plain one; None for others."""
+    return _LIVE.get(int(integrator.this))
 
 
 def listeners(context: openmm.Context) -> list[Integrator]:
@@ -50,8 +59,7 @@ def listeners(context: openmm.Context) -> list[Integrator]:
     heard = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
         heard = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
-    found = (_LIVE.get(int(one.this)) for one in heard)
-    return [one for one in found if one is not None]
+    return [found for one in heard if (found := live(one)) is not None]
 
 
 # -- states and checkpoints -------------------------------------------------------------------------
@@ -207,13 +215,40 @@ def _update_parameters(original: Callable[..., None], force: openmm.Force, conte
             one.refresh()
 
 
+# -- Simulations ------------------------------------------------------------------------------------
+
+
+def _in_simulation(original: Callable[..., None], simulation: app.Simulation, *args: Any, **kwargs: Any) -> None:
+    context = simulation.context
+    heard = listeners(context)
+    for one in heard:
+        one.unseen = True
+    try:
+        original(simulation, *args, **kwargs)
+    finally:
+        for one in heard:
+            one.unseen = False
+        settle(context)
+
+
 # -- wrapping ---------------------------------------------------------------------------------------
 
 
-def _wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+def wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+    """What calls `call` with the original method and its arguments."""
+
     @functools.wraps(original)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         return call(original, *args, **kwargs)
+
+    return wrapper
+
+
+def _settled(original: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def wrapper(context: openmm.Context, *args: Any, **kwargs: Any) -> Any:
+        settle(context)
+        return original(context, *args, **kwargs)
 
     return wrapper
 
@@ -242,13 +277,17 @@ def _wrap_all() -> None:
         **dict.fromkeys(_MOVING, _moving),
     }
     for name, call in calls.items():
-        setattr(openmm.Context, name, _wrapped(getattr(openmm.Context, name), call))
+        setattr(openmm.Context, name, wrapped(getattr(openmm.Context, name), call))
+    for name in (*calls, "getStepCount", "getTime", "setStepCount", "setParameter", "computeVirtualSites"):
+        setattr(openmm.Context, name, _settled(getattr(openmm.Context, name)))
+    for name in ("step", "runForClockTime"):
+        setattr(app.Simulation, name, wrapped(getattr(app.Simulation, name), _in_simulation))
     minimizer = openmm.LocalEnergyMinimizer
-    minimizer.minimize = staticmethod(_wrapped(minimizer.minimize, _minimize))
+    minimizer.minimize = staticmethod(wrapped(minimizer.minimize, _minimize))
     for kind in vars(openmm).values():
         if isinstance(kind, type) and issubclass(kind, openmm.Force) and "updateParametersInContext" in vars(kind):
             name = "updateParametersInContext"
-            setattr(kind, name, _wrapped(getattr(kind, name), _update_parameters))
+            setattr(kind, name, wrapped(getattr(kind, name), _update_parameters))
 
 
 _wrap_all()

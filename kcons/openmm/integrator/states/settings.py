@@ -1,4 +1,4 @@
-"""What an integrator was made with, what it was told since, and what it hears of its Context."""
+"""Settings of an integrator: those it was made with, later changes, and changes of its Context."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def picoseconds(timestep: Any) -> float:
     dt = value_in(timestep, unit.picosecond)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
-            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
+            f"the time step is {timestep}; give a positive one; to go back in time, reverse the velocities",
             item="timestep",
         )
     return dt

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
 from kcons.errors import ConvergenceError, InputError
 
@@ -22,7 +22,7 @@ def displaced(scene, dt):
 @pytest.mark.parametrize(("name", "size"), [("rotor", 1), ("chain", 20), ("chain-free", 20), ("dumbbells", 8)])
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-12])
 def test_positions_and_velocities_are_those_of_the_engine(name, size, tolerance):
-    scene = scenes.build(name, size)
+    scene = test_systems.build(name, size)
     dt = scene.time_steps[-1]
     moved, v = displaced(scene, dt)
     found, speeds = moved.copy(), v.copy()
@@ -47,7 +47,7 @@ def test_positions_and_velocities_are_those_of_the_engine(name, size, tolerance)
 
 
 def test_a_looser_tolerance_takes_fewer_sweeps_and_leaves_more():
-    scene = scenes.build("chain", 50)
+    scene = test_systems.build("chain", 50)
     dt = scene.time_steps[0]
     taken, left = [], []
     for tolerance in (1e-3, 1e-6, 1e-9):

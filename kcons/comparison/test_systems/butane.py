@@ -1,0 +1,140 @@
+"""A chain of four atoms with bonds and angles held and a free torsion, k (1 + cos 3 phi), in free flight.
+
+Solution: the equations of motion of a body that turns and twists, with the torsion and a quaternion as coordinates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
+from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+
+MASSES = np.array([1.5, 1.0, 1.2, 2.0])
+LENGTHS = (1.0, 1.1, 0.9)
+ANGLES = (1.9, 2.0)
+BARRIER = 0.8
+POSITIONS = np.array(
+    [
+        [-0.5222284052877127, 0.8165610926072225, 0.24597860628670823],
+        [0.0, 0.0, 0.0],
+        [1.0726873599219975, 0.21744449281949224, 0.10981675831151097],
+        [1.317274914365431, 0.4903896668543006, 0.9318130236208423],
+    ]
+)
+VELOCITIES = np.array(
+    [
+        [-0.0701639869182561, -0.23806819562769413, -0.08489628217113311],
+        [0.1, -0.2, 0.15],
+        [0.05640165024592506, 0.07035356216888246, 0.04054954181941717],
+        [0.14987079439327575, -0.31847001788834944, 0.14184699760931987],
+    ]
+)
+BONDS = np.array([[0, 1], [1, 2], [2, 3]])
+TRIPLES = np.array([[0, 1, 2], [1, 2, 3]])
+
+
+def build(size: int = 1, seed: int = 1) -> TestSystem:
+    """One molecule.
+
+    Parameters
+    ----------
+    size : int
+        Has to be 1.
+    seed : int
+        Without meaning: the start is fixed.
+
+    Raises
+    ------
+    InputError
+        Another size.
+    """
+    single(size, "butane is one molecule")
+    return TestSystem(
+        name="butane",
+        title=f"four-atom chain, 3 bonds and 2 angles held, torsion {BARRIER:g} (1 + cos 3φ)",
+        constraint_set=ConstraintSet([Distance(BONDS, LENGTHS), Angle(TRIPLES, ANGLES)], POSITIONS, MASSES),
+        positions=POSITIONS,
+        velocities=VELOCITIES,
+        potential=Potential(torsion, "torsion"),
+        symbols=["C"] * 4,
+        horizon=5.0,
+        time_steps=(0.1, 0.05, 0.025, 0.0125),
+        tolerances=(1e-3, 1e-6, 1e-9),
+        units=BARE,
+        # Between held arms, an angle is the distance of its ends.
+        bonds=np.concatenate([BONDS, TRIPLES[:, [0, 2]]]),
+        angles=TRIPLES,
+        angle_bonds=BONDS,
+        solution=lambda time: twist(POSITIONS, VELOCITIES, MASSES, time),
+    )
+
+
+def torsion(x: FloatArray) -> tuple[float, FloatArray]:
+    """Energy k (1 + cos 3 phi) and forces, shape (4, 3).
+
+    Gradient of phi as in Blondel and Karplus, J. Comput. Chem. 17, 1132 (1996).
+    """
+    first, middle, last = x[0] - x[1], x[1] - x[2], x[3] - x[2]
+    a, b = np.cross(first, middle), np.cross(last, middle)
+    length = float(np.linalg.norm(middle))
+    phi = float(np.arctan2(np.cross(b, a) @ middle / length, a @ b))
+    a, b = a / (a @ a), b / (b @ b)
+    shared = (first @ middle) / length * a - (last @ middle) / length * b
+    gradient = np.stack([-length * a, length * a + shared, -length * b - shared, length * b])
+    return BARRIER * (1.0 + np.cos(3.0 * phi)), 3.0 * BARRIER * np.sin(3.0 * phi) * gradient
+
+
+def twist(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Reference:
+    """Free flight of a body whose last atom turns about the bond before it.
+
+    In axes fixed to the first three atoms, r(s) are the places relative to the centre of mass after a twist by s.
+    With I = inertia, h = sum m r x r', G = sum m r'^2 (primes: d/ds), momenta Pi = I omega + h s_t and
+    p = h . omega + G s_t obey Pi_t = Pi x omega and p_t = dT/ds - dV/ds.
+    """
+    total = masses.sum()
+    center, drift = masses @ x / total, masses @ v / total
+    axis = (x[2] - x[1]) / np.linalg.norm(x[2] - x[1])
+    arm = x[3] - x[2]
+    along = (arm @ axis) * axis
+    across, normal = arm - along, np.cross(axis, arm)
+
+    def shape(s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """r, r', r''."""
+        parts = (np.cos(s) * across + np.sin(s) * normal, np.cos(s) * normal - np.sin(s) * across)
+        places, change, bend = x.copy(), np.zeros_like(x), np.zeros_like(x)
+        places[3], change[3], bend[3] = x[2] + along + parts[0], parts[1], -parts[0]
+        return tuple(p - masses @ p / total for p in (places, change, bend))  # type: ignore[return-value]
+
+    def inertia(r: FloatArray, change: FloatArray) -> FloatArray:
+        """The 4 x 4 matrix of the kinetic energy in omega and s_t."""
+        matrix = np.empty((4, 4))
+        matrix[:3, :3] = np.sum(masses[:, None] * r**2) * np.eye(3) - r.T @ (masses[:, None] * r)
+        matrix[:3, 3] = matrix[3, :3] = masses @ np.cross(r, change)
+        matrix[3, 3] = np.sum(masses[:, None] * change**2)
+        return matrix
+
+    def rate(_: float, y: FloatArray) -> FloatArray:
+        q, s, momenta = y[:4], y[4], y[5:]
+        r, change, bend = shape(s)
+        speeds = np.linalg.solve(inertia(r, change), momenta)
+        omega, pace = np.asarray(speeds[:3], dtype=float), float(speeds[3])
+        velocity = np.cross(omega, r) + pace * change
+        uphill = np.sum(masses[:, None] * velocity * (np.cross(omega, change) + pace * bend))
+        torque = np.sum(torsion(r)[1] * change)
+        return np.concatenate([spin(q, omega), [pace], np.cross(momenta[:3], omega), [uphill + torque]])
+
+    r, change, _ = shape(0.0)
+    # The four speeds that give v; the rest of it would violate the constraints.
+    columns = [np.cross(e, r).ravel() for e in np.eye(3)] + [change.ravel()]
+    speeds = np.linalg.lstsq(np.stack(columns, axis=1), (v - drift).ravel(), rcond=None)[0]
+    start = np.concatenate([[0.0, 0.0, 0.0, 1.0, 0.0], inertia(r, change) @ speeds])
+
+    def place(y: FloatArray) -> FloatArray:
+        return np.asarray(center + drift * time + turned(y[:4], shape(y[4])[0]))
+
+    return integrated(rate, start, time, place, "equations of rotation and torsion")

@@ -1,0 +1,104 @@
+"""A rigid body of four atoms in free flight, all six distances held: an asymmetric top.
+
+The `tennis-racket` start turns about the axis of the middle moment of inertia, where a tilt of 1e-4 grows until the
+body flips. Solution: Euler's equations and a quaternion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
+from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.potential import Potential
+from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
+from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+
+MASSES = np.array([1.0, 2.0, 1.5, 0.7])
+POSITIONS = np.array(
+    [
+        [-0.6810050701294086, -0.04689210401958078, -0.0867483363253967],
+        [0.3707170845488072, 0.17144232982387025, 0.678895565470517],
+        [0.15133031135557973, -0.5747138913599262, -0.6354941550220699],
+        [-0.4106065228593934, 0.8086832591596137, -0.4540022315464751],
+    ]
+)
+VELOCITIES = {
+    "rotor": np.array(
+        [
+            [0.13796480607479455, -0.8074444071755572, 0.31140198090556137],
+            [0.0029354124267923906, 0.8044989900216032, 0.03721532090612076],
+            [0.6146502709656857, -0.34002335920550963, 0.5848385341801507],
+            [-0.7797300533955827, -0.7878836200848351, -0.31870060569718417],
+        ]
+    ),
+    "tennis-racket": np.array(
+        [
+            [-0.06690174447834107, -0.023004325741292467, 0.5376373818959249],
+            [0.513574469166469, 0.4336589204594628, -0.3899544186845428],
+            [-0.5019283051131194, -0.4314239165393928, 0.2706371881629262],
+            [-0.29622105169274, -0.2816823433836341, -0.2338347525303267],
+        ]
+    ),
+}
+PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> TestSystem:
+    """The body, with one of two starts.
+
+    Parameters
+    ----------
+    size : int
+        Has to be 1.
+    seed : int
+        Without meaning: the start is fixed.
+    start : {'rotor', 'tennis-racket'}
+
+    Raises
+    ------
+    InputError
+        Another size.
+    """
+    single(size, f"{start} is one rigid body")
+    v = VELOCITIES[start]
+    lengths = np.linalg.norm(POSITIONS[PAIRS[:, 0]] - POSITIONS[PAIRS[:, 1]], axis=1)
+    # Half of the tennis racket's horizon lies before its first flip.
+    horizon = 10.0 if start == "rotor" else 20.0
+    what = "turning about its middle axis (tennis racket)" if start == "tennis-racket" else "in free flight"
+    return TestSystem(
+        name=start,
+        title=f"asymmetric top, 4 atoms and 6 distances, {what}",
+        constraint_set=ConstraintSet(Distance(PAIRS), POSITIONS, MASSES),
+        positions=POSITIONS,
+        velocities=v,
+        potential=Potential(lambda x: (0.0, np.zeros_like(x)), "no forces"),
+        symbols=["X"] * len(MASSES),
+        horizon=horizon,
+        time_steps=(0.1, 0.05, 0.025, 0.0125),
+        tolerances=(1e-3, 1e-6, 1e-9),
+        units=BARE,
+        bonds=PAIRS,
+        solution=lambda time: flight(POSITIONS, v, MASSES, time),
+        openmm=OpenMMHost(lambda: system_of(MASSES, pairs=PAIRS, lengths=lengths), length=1.0, time=1.0),
+    )
+
+
+def flight(x: FloatArray, v: FloatArray, masses: FloatArray, time: float) -> Reference:
+    """Free flight of a rigid body that starts at x, v: I omega' = (I omega) x omega in body axes."""
+    total = masses.sum()
+    center, drift = masses @ x / total, masses @ v / total
+    r = x - center
+    inertia = np.sum(masses * np.einsum("ij,ij->i", r, r)) * np.eye(3) - np.einsum("i,ij,ik->jk", masses, r, r)
+    omega = np.linalg.solve(inertia, masses @ np.cross(r, v - drift))
+
+    def rate(_: float, y: FloatArray) -> FloatArray:
+        w = y[4:]
+        return np.concatenate([spin(y[:4], w), np.linalg.solve(inertia, np.cross(inertia @ w, w))])
+
+    start = np.concatenate([[0.0, 0.0, 0.0, 1.0], omega])
+    return integrated(
+        rate, start, time, lambda y: center + drift * time + turned(y[:4], r), "Euler's equations and a quaternion"
+    )

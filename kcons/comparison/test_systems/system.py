@@ -1,0 +1,267 @@
+"""The contract of a test system: a system to run, small or at size N, that knows its own solution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from ase import Atoms, units
+
+from kcons.comparison.test_systems.openmm_host import OpenMMHost
+from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.motion.motion import Motion
+from kcons.steppers import BlanesMoan6, State, System
+
+
+@dataclass(frozen=True)
+class Units:
+    """Names of the units that a test system's numbers carry, and how long their units of time are internally.
+
+    Time steps are shown in `time`; costs and slopes are stated per `long_time`.
+    """
+
+    length: str
+    energy: str
+    time: str
+    time_unit: float
+    long_time: str
+    long_time_unit: float
+
+
+#: What ASE computes in; times are shown in femtoseconds.
+ASE_UNITS = Units("Å", "eV", "fs", units.fs, "ps", 1000 * units.fs)
+#: Radius, m v0² and R/v0 of the test systems that have no unit of their own.
+REDUCED = Units("R", "ε", "τ", 1.0, "τ", 1.0)
+#: For test systems that are given by bare numbers.
+BARE = Units("length", "energy", "τ", 1.0, "τ", 1.0)
+
+#: Progress: called with (steps done, steps in all).
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Where the trajectory is at the horizon.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (n_atoms, 3)
+    error : float
+        Estimated root-mean-square error an atom; 0 for closed forms.
+    how : str
+        How it was obtained.
+    """
+
+    positions: FloatArray
+    error: float
+    how: str
+
+
+@dataclass(frozen=True)
+class TestSystem:
+    """One system with its start, its forces and its reference solution.
+
+    Attributes
+    ----------
+    name, title : str
+    constraint_set : ConstraintSet
+        What is held; also the masses and the cell.
+    positions, velocities : ndarray, shape (n_atoms, 3)
+        Start, on the constraints and tangent to them.
+    potential : Potential
+    symbols : str or sequence of str
+        For ASE.
+    horizon : float
+        Time at which trajectories are compared; short enough that chaos does not decide.
+    time_steps : sequence of float
+        Default steps, internal units; each divides the horizon.
+    tolerances : sequence of float
+        Default relative tolerances for adaptive integrators.
+    units : Units
+    bonds : ndarray of int, shape (n, 2), or None
+        Pairs whose distances, all held, are the same thing as the constraint set; None if there are none.
+    angles : ndarray of int, shape (n, 3)
+        With `angle_bonds`, the same as bonds and angles.
+    angle_bonds : ndarray of int, shape (n, 2), or None
+        The bonds that go with `angles`; None takes `bonds`.
+    fixed : ndarray of int, shape (n,)
+        Atoms that the constraint set holds by FixedAtoms; MD engines that hold `bonds` fix them in their own way.
+    refusals : mapping
+        Method name -> why it cannot run this test system.
+    solution : callable, optional
+        The reference at a given time, in closed form or by an independent integrator; without it the test system is
+        converged at a step far below those compared.
+    cell : ndarray, shape (3,) or (3, 3), or None
+    openmm : OpenMMHost, optional
+        How OpenMM runs it: the same masses and forces as a System.
+    reference_pace : float
+        The finest step compared, times this, decides about the work of a converged reference.
+    friction : float
+        Rate at which velocities die away, beside the forces; methods that have no friction cannot run the test system.
+    shortfall : callable, optional
+        Where the goal is known and not the way: what is taken for the error, as a function of the positions.
+    """
+
+    #: For pytest, which collects classes of such names.
+    __test__ = False
+
+    name: str
+    title: str
+    constraint_set: ConstraintSet
+    positions: FloatArray
+    velocities: FloatArray
+    potential: Potential
+    symbols: str | Sequence[str]
+    horizon: float
+    time_steps: Sequence[float]
+    tolerances: Sequence[float] = (1e-2, 1e-4, 1e-6)
+    units: Units = ASE_UNITS
+    bonds: IntArray | None = None
+    angles: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
+    angle_bonds: IntArray | None = None
+    fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    refusals: Mapping[str, str] = field(default_factory=dict)
+    solution: Callable[[float], Reference] | None = None
+    cell: FloatArray | None = None
+    openmm: OpenMMHost | None = None
+    reference_pace: float = 1.0
+    friction: float = 0.0
+    shortfall: Callable[[FloatArray], float] | None = None
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The engine for this test system, set up once."""
+        return Motion(self.constraint_set, self.positions)
+
+    @property
+    def masses(self) -> FloatArray:
+        return self.constraint_set.masses
+
+    @property
+    def n_atoms(self) -> int:
+        return len(self.positions)
+
+    def atoms(self) -> Atoms:
+        """ASE atoms at the start, with the test system's forces and nothing held."""
+        atoms = Atoms(self.symbols, positions=self.positions, masses=self.masses)
+        if self.cell is not None:
+            atoms.set_cell(self.cell)
+            atoms.pbc = True
+        atoms.calc = PotentialCalculator(self.potential)
+        atoms.set_velocities(self.velocities)
+        return atoms
+
+    def with_time_steps(self, shown: Sequence[float]) -> TestSystem:
+        """The same test system with other steps, in the unit of time it shows.
+
+        Raises
+        ------
+        InputError
+            A step that is not positive, or does not divide the horizon.
+        """
+        steps = []
+        for dt in shown:
+            internal = dt * self.units.time_unit
+            if not (np.isfinite(internal) and 0 < internal <= self.horizon * (1 + 1e-9)):
+                raise InputError(
+                    f"time step {dt:g} {self.units.time}: give a positive step of at most the horizon, "
+                    f"{self.horizon / self.units.time_unit:g} {self.units.time}",
+                    item="dt",
+                )
+            count = self.horizon / internal
+            if abs(count - round(count)) > 1e-6 * count:
+                raise InputError(
+                    f"time step {dt:g} {self.units.time} does not divide the horizon of "
+                    f"{self.horizon / self.units.time_unit:g} {self.units.time}; try "
+                    f"{self.horizon / self.units.time_unit / max(1, round(count)):g}",
+                    item="dt",
+                )
+            steps.append(internal)
+        return replace(self, time_steps=tuple(sorted(set(steps), reverse=True)))
+
+    def shortened(self, factor: int) -> TestSystem:
+        """The same test system with its horizon divided by `factor` and only the steps that still divide it."""
+        horizon = self.horizon / factor
+        steps = tuple(dt for dt in self.time_steps if abs(horizon / dt - round(horizon / dt)) < 1e-6 and dt < horizon)
+        return replace(self, horizon=horizon, time_steps=steps or (horizon / 4, horizon / 8))
+
+    def reference(self, progress: Progress | None = None) -> Reference:
+        """The solution at the horizon."""
+        if self.solution is not None:
+            return self.solution(self.horizon)
+        return converged(self, self.reference_pace * min(self.time_steps), progress=progress)
+
+    def deviation(self, positions: FloatArray, reference: FloatArray) -> float:
+        """Root-mean-square distance an atom; the shortfall where the test system has one."""
+        if self.shortfall is not None:
+            return self.shortfall(positions)
+        return float(np.sqrt(np.mean(np.sum((positions - reference) ** 2, axis=1))))
+
+    def residuals(self, x: FloatArray, v: FloatArray, time: float = 0.0) -> tuple[float, float]:
+        """max |sigma| in natural units, and max |A v - c| / v_rms with rows scaled to unit norm."""
+        report = self.motion.report(x, v, time, condition=False)
+        speed = float(np.sqrt(np.mean(v**2)))
+        return report.residual, report.velocity_residual / speed if speed > 0 else report.velocity_residual
+
+
+#: Force evaluations of a converged reference, as a multiple of those of RATTLE at the finest step compared.
+REFERENCE_WORK = 8
+#: The step of the second run that tells the error of the first, as a multiple of its step.
+REFERENCE_CHECK = 1.5
+
+
+def converged(test_system: TestSystem, dt: float, *, progress: Progress | None = None) -> Reference:
+    """Order 6 at `REFERENCE_WORK` times the force evaluations of RATTLE at `dt`.
+
+    The error estimate is the difference from a second run with longer steps. The error of the first is
+    smaller by a factor of ten where it is that of the scheme; where forces are noisy, as in single precision or
+    with a self-consistent field, both runs are equally far off.
+    """
+    stepper = BlanesMoan6()
+    fine = max(3, round(REFERENCE_WORK * test_system.horizon / dt / stepper.force_evaluations))
+    coarse = max(2, round(fine / REFERENCE_CHECK))
+    system = System(test_system.motion, test_system.potential.forces)
+    done = 0
+    ends: list[FloatArray] = []
+    for count in (coarse, fine):
+        state = State(test_system.positions, test_system.velocities)
+        for _ in range(count):
+            state = stepper.step(system, state, test_system.horizon / count)
+            done += 1
+            if progress is not None:
+                progress(done, coarse + fine)
+        ends.append(state.positions)
+    shown = test_system.horizon / fine / test_system.units.time_unit
+    how = f"{type(stepper).__name__} at {shown:.3g} {test_system.units.time}"
+    return Reference(ends[1], test_system.deviation(*ends), how)
+
+
+def thermal_velocities(
+    motion: Motion,
+    positions: FloatArray,
+    temperature: float,
+    seed: int,
+    *,
+    at_rest: bool = True,
+) -> FloatArray:
+    """Maxwellian velocities at `temperature` (kelvin), tangent to the constraints, total momentum removed.
+
+    Scaled so that the kinetic energy is exactly g k_B T/2.
+    """
+    rng = np.random.default_rng(seed)
+    masses = motion.masses[:, None]
+    v = rng.standard_normal(positions.shape) * np.sqrt(units.kB * temperature / masses)
+    if at_rest:
+        v -= np.sum(masses * v, axis=0) / masses.sum()
+    v = motion.project_velocities(positions, v)
+    freedom = motion.degrees_of_freedom - (3 if at_rest else 0)
+    kinetic = 0.5 * float(np.sum(masses * v**2))
+    if freedom > 0 and kinetic > 0:
+        v *= np.sqrt(0.5 * freedom * units.kB * temperature / kinetic)
+    return v

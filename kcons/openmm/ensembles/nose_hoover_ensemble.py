@@ -1,0 +1,298 @@
+"""Nose-Hoover chains in OpenMM: canonical dynamics without noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import openmm
+from openmm import unit
+
+from kcons.errors import InputError, OverdeterminedError, UnsupportedError
+from kcons.openmm.ensembles.conserved_momenta import (
+    Momenta,
+    Momentum,
+    check_momentum,
+    conserved_momenta,
+    warn_of_conserved_momenta,
+)
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.guard import velocities_of
+from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.schemes import operations_of
+from kcons.openmm.integrator.step_variables import use
+from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion
+from kcons.steppers.operations import Operation
+from kcons.steppers.splitting import Splitting
+from kcons.thermostats.freedom import positive
+from kcons.thermostats.nose_hoover import HALF, chain_fractions, chain_length
+
+#: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
+_FASTEST = 1.4
+
+
+class NoseHoover(ConstantEnergy):
+    """Canonical ensemble without noise, for `ProjectedIntegrator(ensemble=...)`: a chain that scales velocities.
+
+    Half a step of the chain, a step on the constraints, half a step of the chain: the trajectory is that of
+    `kcons.thermostats.NoseHooverChain` with period 2 pi/frequency. g, the independent momenta, is three for each
+    particle with a mass, less the rank of all constraints, less one for each direction in which total momentum is
+    conserved. The masses of the chain are kT/frequency^2, times g for the first link.
+
+    Parameters
+    ----------
+    temperature : Quantity or float
+        In K if a float.
+    frequency : Quantity or float
+        As the collision frequency of openmm.NoseHooverIntegrator, in 1/ps if a float. A Quantity of time is the
+        relaxation time, 1/frequency. At most a tenth of a step's inverse.
+    length : int
+        Links of the chain.
+    chain_order : {2, 4, 6}
+        Of the motion of the chain at fixed velocities.
+    repeats : int
+        In how many parts of the time it is made.
+    momentum : {'auto', 'conserved', 'free'}
+        As for `Isokinetic`.
+
+    Raises
+    ------
+    InputError
+        Temperature or frequency not positive, no links, an unknown order.
+
+    Warns
+    -----
+    UserWarning
+        At the first step: total momentum is conserved and not zero, or no torque acts (a free cluster).
+
+    Notes
+    -----
+    Schemes of order 2 but the leapfrog. Targets must rest. Single oscillators and other small systems without
+    collisions need not visit all states, whatever the length of the chain: use Langevin there.
+
+    References
+    ----------
+    Martyna, Tuckerman, Tobias and Klein, Mol. Phys. 87, 1117 (1996).
+    """
+
+    owes = True
+    temperature: float
+    frequency: float
+    length: int
+    chain_order: int
+    repeats: int
+    momentum: Momentum
+
+    def __init__(
+        self,
+        temperature: unit.Quantity | float,
+        frequency: unit.Quantity | float,
+        *,
+        length: int = 3,
+        chain_order: int = 4,
+        repeats: int = 1,
+        momentum: Momentum = "auto",
+    ) -> None:
+        check_momentum(momentum)
+        chain_fractions(chain_order, repeats)
+        self._keep(
+            temperature=positive(kelvins(temperature), "temperature"),
+            frequency=positive(_per_picosecond(frequency), "frequency"),
+            length=chain_length(length),
+            chain_order=chain_order,
+            repeats=int(repeats),
+            momentum=momentum,
+        )
+
+    def __repr__(self) -> str:
+        return f"NoseHoover({self.temperature:g} K, {self.frequency:g}/ps, length={self.length})"
+
+    def check(self, scheme: Splitting | None) -> None:
+        """Raise `UnsupportedError` for the leapfrog and for schemes of another order than 2."""
+        if scheme is None:
+            raise UnsupportedError(
+                "NoseHoover needs velocities at the time of the positions, and those of the leapfrog are half a step "
+                "behind; use scheme='rattle'"
+            )
+        if scheme.order != 2:
+            raise UnsupportedError(f"{scheme!r} has order {scheme.order}, the chain 2; use scheme='rattle'")
+
+    def operations(self, scheme: Splitting | None) -> tuple[Operation, ...]:
+        """The chain moves before the scheme's own operations and after them."""
+        return HALF, *operations_of(scheme), HALF
+
+    # -- program --------------------------------------------------------------------------------
+
+    def declare(self, program: Program) -> None:
+        p = program
+        p.setting("kT", "Boltzmann's constant times the temperature, kJ/mol", self.settings()["kT"])
+        p.setting("frequency", "of the chain, 1/ps", self.frequency)
+        p.number("momenta", "g, independent momenta; 0 until the first step")
+        for name in self._links():
+            p.remember(name, "velocity of a link of the chain, 1/ps")
+        p.remember("chain_place", "g times the place of the first link, and those of the others")
+        for name, words in (
+            ("chain_inertia", "mass of a link; that of the first is g times as large"),
+            ("twice", "2K"),
+            ("scale", "what the chain scales velocities by"),
+            ("chain_part", "part of the time in which the chain moves"),
+            ("chain_h", "its length"),
+        ):
+            p.number(name, words)
+        shares = chain_fractions(self.chain_order, self.repeats)
+        p.table("chain_share", (*shares, *shares), "length of part k as a fraction of the time, twice")
+        if "between" in p.numbers:
+            use(p, "behind")
+
+    def open(self, program: Program) -> None:
+        p = program
+        if "failed" in p.numbers:
+            for name in self._state():
+                p.let(p.number(_before(name), f"{name} before the step"), name, "to come back to")
+        self._advance(p, "1+behind" if "behind" in p.numbers else "1")
+
+    def close(self, program: Program) -> None:
+        p = program
+        if "between" not in p.numbers:
+            self._advance(p, "1")
+            return
+        with p.when("between = 0", "somebody looks at the velocities"):
+            self._advance(p, "1")
+        p.let("behind", "between", "the next step makes up for it")
+
+    def take_back(self, program: Program) -> None:
+        for name in self._state():
+            program.let(name, _before(name), "the chain is back where the step began")
+
+    def _advance(self, program: Program, halves: str) -> None:
+        """Move the chain on for half a step, or two halves one after the other; see `kcons.thermostats.nose_hoover`."""
+        p, links = program, self._links()
+        parts = len(p.tables["chain_share"]) // 2
+        # Where constraints are applied alone, no time passes.
+        time = f"{HALF.fraction!r}*dt" + ("*delta(first_stage)" if "first_stage" in p.numbers else "")
+        p.sum("twice", "m*v*v", "2K, the only sum")
+        p.let("chain_inertia", "kT/frequency^2", "mass of a link")
+        p.let("scale", "1", "nothing done yet")
+        p.let("chain_part", "0", "first part")
+        with p.loop(f"chain_part < {parts}*({halves})" if halves != "1" else f"chain_part < {parts}", "all parts"):
+            p.let("chain_h", f"{time}*chain_share(chain_part)", "length of this part")
+            for k in reversed(range(len(links))):
+                p.let(links[k], self._pushed(k), "half a push")
+            p.let("scale", "scale*exp(-chain_h*link1)", "the first link scales velocities")
+            moved = "+".join(["momenta*link1", *links[1:]])
+            p.let("chain_place", f"chain_place+chain_h*({moved})", "links move")
+            for k in range(len(links)):
+                p.let(links[k], self._pushed(k), "half a push")
+            p.let("chain_part", "chain_part+1", "what follows")
+        p.each("v", "scale*v", "the chain scales velocities")
+
+    def _pushed(self, k: int) -> str:
+        """The velocity of a link after half of the time, pushed by the one before and damped by the next."""
+        link = f"link{k + 1}"
+        if k == 0:
+            # g is not known before the first step, where constraints may be applied alone.
+            push = "select(chain_h, 0.5*chain_h*(twice*scale^2-momenta*kT)/(momenta*chain_inertia), 0)"
+        else:
+            mass = "momenta*chain_inertia" if k == 1 else "chain_inertia"
+            push = f"0.5*chain_h*({mass}*link{k}^2-kT)/chain_inertia"
+        if k + 1 == self.length:
+            return f"{link}+{push}"
+        damp = f"exp(-0.25*chain_h*link{k + 2})"
+        return f"({link}*{damp}+{push})*{damp}"
+
+    def _links(self) -> list[str]:
+        return [f"link{k + 1}" for k in range(self.length)]
+
+    def _state(self) -> list[str]:
+        return [*self._links(), "chain_place"]
+
+    # -- a run ----------------------------------------------------------------------------------
+
+    def begin(self, integrator: Integrator, context: openmm.Context) -> None:
+        """Find g.
+
+        Raises
+        ------
+        InputError
+            A time step that the chain cannot follow.
+        OverdeterminedError
+            No degree of freedom is left.
+        UnsupportedError
+            Targets move.
+        """
+        moving = [part for part in integrator.parts if part.driven]
+        if moving:
+            raise UnsupportedError(
+                f"targets of {moving[0]!r} move, and scaled velocities would not follow them; use Langevin"
+            )
+        dt = float(integrator.getStepSize()._value)
+        if dt * self.frequency > _FASTEST:
+            raise InputError(
+                f"a chain of frequency {self.frequency:g}/ps cannot follow a time step of {dt:g} ps; take a frequency "
+                f"of at most {0.1 / dt:.3g}/ps",
+                item="frequency",
+            )
+        system = context.getSystem()
+        momenta = conserved_momenta(integrator, context, self.momentum)
+        count = self._count(integrator, momenta)
+        masses, v = integrator._watch().rows.masses, velocities_of(context)
+        if removes_centre_of_mass_motion(system):
+            v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover will do
+        warn_of_conserved_momenta(momenta, masses, v, turns=momenta.angular)
+        integrator.program.write("momenta", count)
+
+    def _count(self, integrator: Integrator, momenta: Momenta) -> int:
+        count = integrator.independent_momenta() - len(momenta.directions)
+        if count < 1:
+            raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
+        integrator._watch().thermal = count
+        return count
+
+    # -- what can be read -----------------------------------------------------------------------
+
+    def count(self, integrator: Integrator) -> int:
+        """g of an integrator: its momenta that are thermostatted and independent."""
+        guard = integrator._watch()
+        if guard.thermal is not None:
+            return int(guard.thermal)
+        return self._count(integrator, conserved_momenta(integrator, guard.context, self.momentum))
+
+    def warmth(self, integrator: Integrator) -> float:
+        return integrator.degrees_of_freedom() / self.count(integrator)
+
+    def settings(self) -> dict[str, float]:
+        return {"kT": GAS_CONSTANT * self.temperature, "frequency": self.frequency}
+
+    def at(self, temperature: float) -> NoseHoover:
+        given: dict[str, Any] = dict(self.__dict__)
+        return NoseHoover(**{**given, "temperature": temperature})
+
+    def conserved_energy(self, integrator: Integrator) -> float:
+        """Energy of the System and of the chain in kJ/mol; its fluctuation is of order dt^2."""
+        state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
+        energy = (state.getPotentialEnergy() + integrator.kinetic_energy()).value_in_unit(unit.kilojoule_per_mole)
+        kT, read = self.settings()["kT"], integrator.getGlobalVariableByName
+        speeds = np.array([read(name) for name in self._links()])
+        weights = np.ones(self.length)
+        weights[0] = self.count(integrator)
+        inertia = kT / self.frequency**2
+        return float(energy + 0.5 * inertia * (weights @ speeds**2) + kT * read("chain_place"))
+
+
+def _before(name: str) -> str:
+    return f"{name}_last"
+
+
+def _per_picosecond(frequency: unit.Quantity | float) -> float:
+    value: Any = frequency
+    if unit.is_quantity(value):
+        if value.unit.is_compatible(unit.picosecond):
+            value = 1 / value
+        if not value.unit.is_compatible(unit.picosecond**-1):
+            raise InputError(
+                f"frequency is {frequency}; give it in 1/ps, or the relaxation time in ps", item="frequency"
+            )
+        value = value.value_in_unit(unit.picosecond**-1)
+    return float(value)

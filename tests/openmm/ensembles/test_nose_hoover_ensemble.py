@@ -1,0 +1,416 @@
+"""Nosé-Hoover chains on the constraints in OpenMM."""
+
+import copy
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import run, twice_kinetic
+from openmm import unit
+from openmm_systems import (
+    GPUS,
+    PLATFORMS,
+    alanine,
+    context_of,
+    dumbbell,
+    hexagon,
+    loose_alanine,
+    masses_of,
+    residuals,
+    started,
+    state_of,
+    water_box,
+)
+
+from kcons import ConstraintSet, Motion, State
+from kcons import System as CoreSystem
+from kcons.constraints import Angle, Distance, Sphere
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
+from kcons.openmm import (
+    CollectiveRows,
+    NoseHoover,
+    ProjectedIntegrator,
+    Row,
+    SurfaceIntegrator,
+    hold,
+    positions_of,
+    surface_parts,
+)
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.thermostats import NoseHooverChain
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque", "ignore:total momentum")
+
+
+# -- trajectories ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "geodesic"])
+@pytest.mark.parametrize(
+    "options", [{"length": 1}, {"length": 3}, {"length": 10}, {"chain_order": 2, "repeats": 3}, {"chain_order": 6}]
+)
+def test_one_bond_as_the_core_stepper(scheme, options):
+    """The same motion of atoms and chain, to rounding, in calls of any length."""
+    system, x, v = dumbbell()
+    dt, frequency = 0.5e-3, 20.0
+    motion = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x)
+    v = motion.project_velocities(x, v)
+    ensemble = NoseHoover(300 * unit.kelvin, frequency, **options)
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14, ensemble=ensemble)
+    context = started(system, integrator, x, v)
+    k, c = 50.0, 500.0
+
+    def force(r, t):
+        x, y, z = r.T
+        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
+
+    def potential(r, t):
+        x, y, z = r.T
+        return float(np.sum(k * (x**2 + 1.3 * y**2 + 0.7 * z**2) + c * x * y**3))
+
+    core = CoreSystem(motion, force, potential=potential)
+    stepper = NoseHooverChain(
+        300 * GAS_CONSTANT, 2 * np.pi / frequency, stepper=integrator.scheme, momentum="free", **options
+    )
+    assert integrator.operations() == stepper.operations()
+    listed = "\n".join(f"  {operation}" for operation in stepper.operations())
+    assert listed in integrator.listing()
+    state, n = State(x, v), ensemble.length
+    # Velocities are differences of positions over a drift, an eighth of a step with 'geodesic'.
+    limit = 1e-12 if scheme == "rattle" else 2e-11
+    for steps in (1, 1, 48, 250):
+        for _ in range(steps):
+            state = stepper.step(core, state, dt)
+        integrator.step(steps)
+        r, u = state_of(context)
+        assert np.abs(r - state.positions).max() <= limit
+        assert np.abs(u - state.velocities).max() <= 100 * limit
+        links = [integrator.getGlobalVariableByName(f"link{i + 1}") for i in range(n)]
+        np.testing.assert_allclose(links, state.thermostat[n : 2 * n], rtol=1e3 * limit, atol=1e3 * limit)
+        place = state.thermostat[2 * n] * state.thermostat[0] + state.thermostat[1:n].sum()
+        assert integrator.getGlobalVariableByName("chain_place") == pytest.approx(place, rel=1e3 * limit)
+        assert ensemble.conserved_energy(integrator) == pytest.approx(stepper.conserved_energy(core, state), rel=1e-11)
+
+
+def test_calls_of_any_length_make_the_same_motion():
+    """Two halves of the chain at one place need one sum: in between, nobody looks at K."""
+    system, x, v = alanine()
+    ends = []
+    for blocks in ([60], [1] * 60, [7, 30, 23]):
+        ensemble = NoseHoover(300.0, 20.0)
+        integrator = ProjectedIntegrator(1e-3, tolerance=1e-13, ensemble=ensemble)
+        context = started(system, integrator, x, v)
+        for steps in blocks:
+            integrator.step(steps)
+        ends.append((*state_of(context), ensemble.conserved_energy(integrator)))
+    for other in ends[1:]:
+        assert np.abs(other[0] - ends[0][0]).max() <= 1e-12
+        assert np.abs(other[1] - ends[0][1]).max() <= 1e-10
+        assert other[2] == pytest.approx(ends[0][2], rel=1e-10)
+    unseen, seen = integrator.counts(seen=False), integrator.counts()
+    assert (unseen.constraint_solves, unseen.passes, unseen.synchronisations) == (2, 6, 1)
+    assert (seen.constraint_solves, seen.passes, seen.synchronisations) == (2, 8, 2)
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *GPUS])
+def test_conserved_energy_is_kept_to_order_two(platform):
+    """Alanine dipeptide, bonds with hydrogen held: what it fluctuates by at half the step is a quarter."""
+    # All bonds are too much for the solvers of OpenCL in single precision, whatever the integrator.
+    system, x, v = alanine("HBonds")
+    coarse = "single" in platform
+    spans = []
+    for n in (1, 2, 4):
+        ensemble = NoseHoover(300.0, 20.0)
+        integrator = ProjectedIntegrator(1e-3 / n, ensemble=ensemble)
+        context = started(system, integrator, x, v, platform)
+        values = []
+        for _ in range(100):
+            integrator.step(n)
+            values.append(ensemble.conserved_energy(integrator))
+        spans.append(np.std(values))
+        assert residuals(system, context)[0] <= (3e-5 if coarse else 1e-7)
+    slopes = -np.diff(np.log2(spans))
+    if coarse:  # energies of some hundred kJ/mol in single precision; rounding enters at the smallest step
+        assert slopes[0] == pytest.approx(2, abs=0.5)
+    else:
+        np.testing.assert_allclose(slopes, 2, atol=0.2)
+
+
+# -- what is held ----------------------------------------------------------------------------------------
+
+
+def test_rows_that_are_carried_move_as_those_of_the_system():
+    """The same bonds held by OpenMM and by kcons: one trajectory of atoms and chain, although others move x."""
+    system, x, v = loose_alanine()
+    other = copy.deepcopy(system)
+    carried = hold(other, [], positions=x, take="all")
+    ends = []
+    for this, parts in ((system, ()), (other, (carried,))):
+        ensemble = NoseHoover(300.0, 20.0, momentum="free")
+        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=ensemble)
+        context = run(this, integrator, x, v, 10)
+        r, u = state_of(context)
+        context.setPositions(r + 0.7)
+        context.setVelocities(u)
+        integrator.step(10)
+        ends.append((*state_of(context), integrator.program.remembered()))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
+    assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
+
+
+def test_parts_keep_their_rows():
+    system = openmm.System()
+    x = np.array([[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]])
+    springs = openmm.CustomBondForce("200*(r-0.5)^2")
+    for i in range(6):
+        system.addParticle(12.0 + i)
+        for j in range(i):
+            springs.addBond(j, i)
+    system.addForce(springs)
+    carried = hold(system, [Angle([(0, 1, 2)], 1.9)], positions=x)
+    distance = openmm.CustomBondForce("r")
+    distance.addBond(3, 4)
+    rows = CollectiveRows(system, [Row(distance, 0.5)])
+    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
+    ensemble = NoseHoover(300.0, 5.0)
+    integrator = ProjectedIntegrator(1e-3, parts=(carried, rows, sphere), ensemble=ensemble)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300, 4)
+    values = []
+    for _ in range(50):
+        integrator.step(4)
+        integrator.check()
+        values.append(ensemble.conserved_energy(integrator))
+        r, u = state_of(context)
+        assert abs(np.linalg.norm(r[3] - r[4]) - 0.5) < 1e-12
+        assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
+        assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
+    # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
+    assert ensemble.count(integrator) == 15
+    assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
+    with pytest.raises(UnsupportedError, match="multipliers_at"):
+        rows.multipliers(integrator)
+
+
+def test_a_step_that_fails_leaves_the_chain_where_it_was():
+    system, x, v = loose_alanine()
+    part = hold(system, [], positions=x, take="all")
+    integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=NoseHoover(300.0, 20.0))
+    context = run(system, integrator, x, v, 20)
+    r, u = state_of(context)
+    before = integrator.program.remembered()
+    assert all(abs(value) > 1e-3 for value in before.values())
+    context.setVelocities(30 * u)
+    with pytest.raises(ConvergenceError):
+        integrator.step(1)
+    assert integrator.program.remembered() == before
+    assert np.array_equal(positions_of(context), r)
+
+
+def test_a_nan_leaves_the_chain_of_the_last_check():
+    system, x, v = alanine()
+    mine = copy.deepcopy(system)
+    bomb = openmm.CustomExternalForce("select(step(x-edge), sqrt(edge-x), 0)")
+    bomb.addGlobalParameter("edge", 1e6)
+    bomb.addParticle(0, [])
+    mine.addForce(bomb)
+    integrator = ProjectedIntegrator(1e-3, check_every=10, ensemble=NoseHoover(300.0, 20.0))
+    context = run(mine, integrator, x, v, 10)
+    before, good = integrator.program.remembered(), state_of(context)
+    context.setParameter("edge", -1e6)
+    with pytest.raises(NonFiniteError):
+        integrator.step(10)
+    assert integrator.program.remembered() == before
+    assert np.array_equal(state_of(context), good)
+    context.setParameter("edge", 1e6)
+    integrator.step(5)
+    assert np.isfinite(state_of(context)[1]).all()
+
+
+def test_surfaces_alone():
+    system = openmm.System()
+    springs = openmm.CustomBondForce("100*(r-0.5)^2")
+    x = np.array([[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
+    for k in range(3):
+        system.addParticle(20.0)
+        for j in range(k):
+            springs.addBond(j, k)
+    system.addForce(springs)
+    ensemble = NoseHoover(300.0, 10.0)
+    integrator = SurfaceIntegrator(
+        1e-3, surfaces=Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5), system=system, ensemble=ensemble
+    )
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    values = []
+    for _ in range(10):
+        integrator.step(10)
+        values.append(ensemble.conserved_energy(integrator))
+    np.testing.assert_allclose(np.linalg.norm(positions_of(context), axis=1), 0.5, atol=1e-13)
+    assert ensemble.count(integrator) == 6
+    assert np.ptp(values) < 1e-3
+
+
+# -- degrees of freedom ----------------------------------------------------------------------------------
+
+
+def rigid_bodies():
+    """Flat hexagons of 12 distances each and linear molecules of three: redundant rows, and rows of no rank."""
+    system, ring = hexagon(12)
+    x = [ring, ring + 0.6]
+    pairs = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    for _ in ring:
+        system.addParticle(12.0)
+    for i, j, d in pairs:
+        system.addConstraint(i + 6, j + 6, d)
+    return system, np.vstack(x)
+
+
+def test_degrees_of_freedom_of_rigid_bodies_are_counted_by_rank():
+    """Rigid bodies with more rows than they need (openmm#3993): 3 n less the number of rows is not g."""
+    system, x = rigid_bodies()
+    assert 3 * 12 - system.getNumConstraints() == 12
+    rank = 2 * np.linalg.matrix_rank(_jacobian(system, x)[:12], tol=1e-9)
+    for remover in (False, True):
+        mine = copy.deepcopy(system)
+        if remover:
+            mine.addForce(openmm.CMMotionRemover())
+        ensemble = NoseHoover(300.0, 5.0, momentum="auto" if remover else "free")
+        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+        context = run(mine, integrator, x, np.random.default_rng(1).normal(size=x.shape), 2)
+        assert ensemble.count(integrator) == 36 - rank - 3 * remover
+        assert integrator.getGlobalVariableByName("momenta") == 36 - rank - 3 * remover
+        del context
+
+
+def _jacobian(system, x):
+    rows = np.zeros((system.getNumConstraints(), x.size))
+    for k in range(len(rows)):
+        i, j, _ = system.getConstraintParameters(k)
+        d = x[i] - x[j]
+        rows[k, 3 * i : 3 * i + 3], rows[k, 3 * j : 3 * j + 3] = d, -d
+    return rows
+
+
+#: Five atoms, ten distances of rank nine.
+BODY = 0.063 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+
+
+def test_rigid_bodies_of_more_rows_than_they_need_have_the_temperature():
+    """<2K> = 36 kT for six rigid bodies, within three standard errors; rows counted one by one would leave 30."""
+    system = openmm.System()
+    field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+60*sin(5*x)*cos(4*y+1)*cos(6*z)")
+    x = np.vstack([BODY + 0.1 * b for b in range(6)])
+    for k in range(30):
+        field.addParticle(system.addParticle(12.0 + k), [])
+    pairs = [(i + b, j + b) for b in range(0, 30, 5) for i in range(5) for j in range(i)]
+    system.addForce(field)
+    part = hold(system, [Distance(pairs)], positions=x)
+    ensemble = NoseHoover(300.0, 20.0)
+    integrator = ProjectedIntegrator(2e-3, parts=[part], ensemble=ensemble)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(500)
+    assert ensemble.count(integrator) == 36
+    values = []
+    for _ in range(300):
+        integrator.step(10)
+        values.append(twice_kinetic(system, state_of(context)[1]) / (300 * GAS_CONSTANT))
+    blocks = np.reshape(values, (15, -1)).mean(axis=1)
+    error = blocks.std(ddof=1) / np.sqrt(15)
+    assert abs(blocks.mean() - 36) <= 3 * error < 3
+
+
+def test_kinetic_energy_of_rigid_water_is_that_of_its_degrees_of_freedom():
+    """<2K> = g kT and Var(2K) = 2 g (kT)^2 within three standard errors, in 20 ps."""
+    system, x = water_box()
+    ensemble = NoseHoover(300.0, 20.0)
+    integrator = ProjectedIntegrator(2e-3, ensemble=ensemble)
+    context = context_of(system, integrator, "CPU")
+    context.setPositions(x)
+    integrator.minimizeEnergy(context, maxIterations=50)
+    integrator.setVelocitiesToTemperature(context, 300, 3)
+    masses, v = masses_of(system), state_of(context)[1]
+    context.setVelocities(v - masses @ v / masses.sum())
+    integrator.step(1000)
+    values = []
+    for _ in range(1000):
+        integrator.step(10)
+        values.append(twice_kinetic(system, state_of(context)[1]) / (300 * GAS_CONSTANT))
+    g = 6 * 27 - 3
+    assert ensemble.count(integrator) == g
+    values = np.array(values)
+    for found, wanted in ((values, g), ((values - g) ** 2, 2 * g)):
+        blocks = found.reshape(20, -1).mean(axis=1)
+        assert abs(blocks.mean() - wanted) <= 3 * blocks.std(ddof=1) / np.sqrt(20)
+    kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
+    assert kelvin == pytest.approx(300 * values[-1] / g, rel=1e-9)
+
+
+# -- settings --------------------------------------------------------------------------------------------
+
+
+def test_frequency_or_relaxation_time():
+    assert NoseHoover(300, 20) == NoseHoover(300 * unit.kelvin, 50 * unit.femtosecond)
+    assert NoseHoover(300, 20).frequency == pytest.approx(NoseHoover(300, 0.02 / unit.femtosecond).frequency)
+    for arguments, match in (
+        ((0.0, 1.0), "temperature"),
+        ((300.0, 0.0), "frequency"),
+        ((300.0, 1.0 * unit.nanometer), "frequency is 1.0 nm; give it in 1/ps, or the relaxation time in ps"),
+        ((1.0 * unit.nanometer, 1.0), "give it in K"),
+    ):
+        with pytest.raises(InputError, match=match):
+            NoseHoover(*arguments)
+    for options, match in (
+        ({"length": 0}, "length is 0"),
+        ({"chain_order": 3}, "give 2, 4 or 6"),
+        ({"repeats": 0}, "repeats is 0"),
+        ({"momentum": "maybe"}, "momentum"),
+    ):
+        with pytest.raises(InputError, match=match):
+            NoseHoover(300.0, 1.0, **options)
+
+
+def test_what_cannot_be_thermostatted_is_refused():
+    for scheme in ("leapfrog", "suzuki4", "blanes-moan6", "isokinetic4"):
+        with pytest.raises(UnsupportedError, match=r"leapfrog|order"):
+            ProjectedIntegrator(1e-3, scheme, ensemble=NoseHoover(300.0, 20.0))
+    system, x, v = dumbbell()
+    with pytest.raises(InputError, match="take a frequency of at most 100/ps"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 5000.0)), x, v, 1)
+    system.addParticle(14.0)
+    x, v = np.vstack([x, x[:1] + 0.2]), np.vstack([v, v[:1]])
+    part = hold(system, [Distance([[0, 2]], lambda t: np.sqrt(0.12) + 0.5 * t)], positions=x)
+    with pytest.raises(UnsupportedError, match=r"targets of .* move"):
+        run(system, ProjectedIntegrator(1e-3, parts=[part], ensemble=NoseHoover(300.0, 20.0)), x, v, 1)
+    one = openmm.System()
+    one.addParticle(1.0)
+    with pytest.raises(OverdeterminedError, match="no degree of freedom"):
+        run(one, ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0)), np.zeros((1, 3)), np.ones((1, 3)), 1)
+
+
+def test_the_chain_belongs_to_the_state_and_temperature_to_the_integrator():
+    system, x, v = alanine()
+    first = ProjectedIntegrator(1e-3, ensemble=NoseHoover(300.0, 20.0))
+    context = run(system, first, x, v, 20)
+    chain = first.program.remembered()
+    kept = context.getState(positions=True, velocities=True, parameters=True, integratorParameters=True)
+    text = openmm.XmlSerializer.serialize(kept)
+    other = ProjectedIntegrator(1e-3, ensemble=NoseHoover(350.0, 10.0))
+    there = started(system, other, x, v)
+    there.setState(openmm.XmlSerializer.deserialize(text))
+    assert other.program.remembered() == chain
+    other.step(1)
+    assert other.getTemperature() == 350 * unit.kelvin
+    assert other.getGlobalVariableByName("frequency") == 10.0
+    twin = copy.copy(first)
+    assert all(value == 0 for value in twin.program.remembered().values())
+    plain = ProjectedIntegrator(1e-3)
+    elsewhere = run(system, plain, x, v, 2)
+    there.setState(elsewhere.getState(positions=True, velocities=True, integratorParameters=True))
+    assert all(value == 0 for value in other.program.remembered().values())

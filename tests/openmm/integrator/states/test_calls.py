@@ -1,0 +1,274 @@
+"""Steps that a Simulation asks for in tens: the same motion, and the same work, as in one long call."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import alanine, context_of, dumbbell, residuals, started, state_of
+
+from kcons.errors import KconsError, NonFiniteError
+from kcons.openmm import Langevin, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.integrator.states import calls
+from tests.openmm.integrator.states.test_settings import KINDS, carried_at
+
+kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+def topology_of(system):
+    topology = app.Topology()
+    residue = topology.addResidue("X", topology.addChain())
+    for k in range(system.getNumParticles()):
+        topology.addAtom(f"C{k}", app.element.carbon, residue)
+    return topology
+
+
+def simulated(made):
+    """A Simulation of what there is."""
+    simulation = app.Simulation.__new__(app.Simulation)
+    simulation.context, simulation.integrator, simulation.reporters = made.context, made.integrator, []
+    simulation._usesPBC = False
+    return simulation
+
+
+class Look:
+    """A reporter that keeps what it is shown."""
+
+    def __init__(self, every, **include):
+        self.every, self.include, self.seen = every, list(include), []
+
+    def describeNextReport(self, simulation):
+        return {"steps": self.every - simulation.currentStep % self.every, "periodic": False, "include": self.include}
+
+    def report(self, simulation, state):
+        arrays = [np.array(state.getPositions(asNumpy=True)._value), np.array(state.getVelocities(asNumpy=True)._value)]
+        self.seen.append((state.getStepCount(), state.getTime()._value, *arrays))
+
+
+@pytest.fixture
+def made_by_openmm(monkeypatch):
+    """How many steps OpenMM makes of each kind: of VerletIntegrator, and of programs by what controls them."""
+    count: Counter[object] = Counter()
+    program, verlet = openmm.CustomIntegrator.step, openmm.VerletIntegrator.step
+
+    def custom(self, steps):
+        read = self.getGlobalVariableByName
+        count[tuple(read(name) for name in ("between", "end") if name in self.program.numbers)] += steps
+        program(self, steps)
+
+    def leapfrog(self, steps):
+        count["leapfrog"] += steps
+        verlet(self, steps)
+
+    monkeypatch.setattr(openmm.CustomIntegrator, "step", custom)
+    monkeypatch.setattr(openmm.VerletIntegrator, "step", leapfrog)
+    return count
+
+
+def begun(kind):
+    """Random numbers of the Reference platform belong to the process: they begin with the Context."""
+    made = KINDS[kind]()
+    if "Langevin" in kind:
+        state = made.context.getState(positions=True, velocities=True)
+        made.integrator.setRandomNumberSeed(4)
+        made.context.reinitialize()
+        made.context.setState(state)
+    made.integrator.step(1)
+    return made
+
+
+@kinds
+def test_tens_cost_what_one_call_costs(kind, made_by_openmm):
+    """Step by step of each kind, whatever it computes; and no bit of the motion differs."""
+    ends, work = [], []
+    for whole in (True, False):
+        made = begun(kind)
+        made_by_openmm.clear()
+        if whole:
+            made.integrator.step(95)
+        else:
+            simulated(made).step(95)
+        work.append(dict(made_by_openmm))
+        ends.append(state_of(made.context))
+        assert made.context.getStepCount() == 96
+        assert made.context.getTime()._value == pytest.approx(0.192, rel=1e-12)
+    np.testing.assert_array_equal(*ends)
+    assert work[0] == work[1]
+    assert sum(work[0].values()) in (95, 96)
+
+
+@kinds
+def test_reporters_see_complete_states(kind):
+    made, other = begun(kind), begun(kind)
+    if "Langevin" in kind:  # one after the other, for they share their random numbers
+        made = begun(kind)
+    look = Look(25, positions=True, velocities=True)
+    simulation = simulated(made)
+    simulation.reporters.append(look)
+    simulation.step(60)
+    if "Langevin" in kind:
+        other = begun(kind)
+    for (count, time, x, v), steps in zip(look.seen, (24, 25), strict=True):
+        other.integrator.step(steps)
+        assert count == other.context.getStepCount()
+        assert time == pytest.approx(other.context.getTime()._value, rel=1e-12)
+        np.testing.assert_array_equal([x, v], state_of(other.context))
+
+
+@pytest.mark.parametrize("kind", ["RattleIntegrator", "carried", "Isokinetic"])
+def test_what_a_context_says_between_calls(kind):
+    """Whatever is asked or told, what was put off is made first."""
+    acts = [
+        lambda c: c.getStepCount(),
+        lambda c: c.getTime(),
+        lambda c: c.getState(velocities=True),
+        lambda c: c.createCheckpoint(),
+        lambda c: c.setVelocities(0.9 * state_of(c)[1]),
+        lambda c: c.setPositions(state_of(c)[0]),
+        lambda c: c.setTime(c.getTime()),
+        lambda c: c.applyVelocityConstraints(1e-10),
+        lambda c: c.reinitialize(True),
+    ]
+    for act in acts:
+        ends = []
+        for unseen in (False, True):
+            made = begun(kind)
+            member = getattr(made.integrator, "_ends", made.integrator)
+            member.unseen = unseen
+            made.integrator.step(10)
+            made.integrator.step(10)
+            assert bool(member._owed) == unseen == bool(calls._OWING)
+            act(made.context)
+            assert not calls._OWING
+            assert made.context.getStepCount() == 21
+            made.integrator.step(10)
+            ends.append(state_of(made.context))
+            assert not calls._OWING
+        # How calls divide steps changes the rounding of these two.
+        within = 1e-12 if kind in ("RattleIntegrator", "Isokinetic") else 0.0
+        np.testing.assert_allclose(*ends, rtol=0, atol=within)
+
+
+def test_checks_in_tens():
+    """Every 20 steps: those at whose end there is a check are complete, and failures are found there."""
+    made = carried_at()
+    made.integrator.check_every = 20
+    simulation = simulated(made)
+    simulation.step(100)
+    solve = made.part.motion.project_positions
+
+    def astray(*arguments, **options):
+        result = solve(*arguments, **options)
+        options["velocities"][0] += 1e-5
+        return result
+
+    made.part.motion.project_positions = astray
+    with pytest.raises(KconsError, match="back at step 100"):
+        simulation.step(95)
+    assert made.context.getStepCount() == 100
+    assert not calls._OWING
+    made.part.motion.project_positions = solve
+    simulation.step(20)
+    assert made.context.getStepCount() == 120
+
+
+@pytest.mark.parametrize("kind", [RattleIntegrator, ProjectedIntegrator])
+def test_explosions_in_tens(kind):
+    system, x, v = dumbbell()
+    system.addForce(openmm.CustomCompoundBondForce(2, "k*sqrt(0.2-x1); k=1"))
+    system.getForce(1).addBond([0, 1], [])
+    v = v + np.array([8.0, 0, 0])
+    integrator = kind(1e-3, check_every=50)
+    place = openmm.Platform.getPlatformByName("Reference")
+    simulation = app.Simulation(topology_of(system), system, integrator, place)
+    simulation.context.setPositions(x - [0.3, 0, 0])
+    simulation.context.setVelocities(v)
+    with pytest.raises(NonFiniteError):
+        simulation.step(200)
+    assert simulation.currentStep == 0
+    assert not calls._OWING
+    assert np.isfinite(state_of(simulation.context)).all()
+
+
+def test_an_interruption_leaves_a_complete_state():
+    system, x, v = alanine()
+    context = started(system, integrator := RattleIntegrator(1e-3), x, v)
+    simulation = app.Simulation.__new__(app.Simulation)
+    simulation.context, simulation.integrator, simulation._usesPBC = context, integrator, False
+
+    class Stop(Look):
+        def report(self, simulation, state):
+            raise KeyboardInterrupt
+
+    simulation.reporters = [Stop(30)]
+    leap, left = integrator._leap, []
+    integrator._leap = lambda *given: left.append(1) or leap(*given)
+    with pytest.raises(KeyboardInterrupt):
+        simulation.step(100)
+    assert len(left) == 3
+    assert simulation.currentStep == 30
+    assert residuals(system, context)[1] < 1e-9
+    simulation.reporters = []
+    simulation.step(10)
+    other = started(system, whole := RattleIntegrator(1e-3), x, v)
+    whole.step(40)
+    np.testing.assert_allclose(state_of(context), state_of(other), rtol=0, atol=1e-9)
+
+
+def test_run_for_clock_time(tmp_path):
+    system, x, v = alanine()
+    simulation = app.Simulation(
+        topology_of(system), system, RattleIntegrator(1e-3), openmm.Platform.getPlatformByName("Reference")
+    )
+    simulation.context.setPositions(x)
+    simulation.context.setVelocities(v)
+    simulation.runForClockTime(0.05 * unit.second, stateFile=str(tmp_path / "end.xml"))
+    steps = simulation.currentStep
+    assert steps > 0
+    assert residuals(system, simulation.context)[1] < 1e-9
+    saved = openmm.XmlSerializer.deserialize((tmp_path / "end.xml").read_text())
+    np.testing.assert_allclose(saved.getVelocities(asNumpy=True)._value, state_of(simulation.context)[1])
+    context = started(system, whole := RattleIntegrator(1e-3), x, v)
+    whole.step(min(steps, 200))
+    if steps <= 200:
+        np.testing.assert_allclose(state_of(context)[0], state_of(simulation.context)[0], rtol=0, atol=1e-8)
+
+
+def test_evaluations_of_forces_in_tens():
+    """OpenMM evaluates the forces once a step, and once more at the start."""
+    system, x, v = dumbbell()
+    evaluations = []
+
+    def nothing(state):
+        evaluations.append(1)
+        return 0.0, np.zeros((2, 3))
+
+    system.addForce(openmm.PythonForce(nothing))
+    for make in (
+        lambda: RattleIntegrator(1e-3),
+        lambda: ProjectedIntegrator(1e-3),
+        lambda: ProjectedIntegrator(1e-3, "leapfrog"),
+        lambda: ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1.0)),
+    ):
+        simulation = app.Simulation(topology_of(system), system, make(), openmm.Platform.getPlatformByName("Reference"))
+        simulation.context.setPositions(x)
+        simulation.context.setVelocities(v)
+        simulation.step(1)
+        evaluations.clear()
+        simulation.step(200)
+        assert len(evaluations) == 200
+
+
+def test_others_are_left_alone():
+    system, x, _ = dumbbell()
+    context = context_of(system, openmm.VerletIntegrator(1e-3))
+    context.setPositions(x)
+    simulation = app.Simulation.__new__(app.Simulation)
+    simulation.context, simulation.integrator = context, context.getIntegrator()
+    simulation.reporters, simulation._usesPBC = [], False
+    simulation.step(25)
+    assert simulation.currentStep == 25
+    assert app.Simulation.step.__doc__.startswith("Advance the simulation")

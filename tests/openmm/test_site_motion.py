@@ -1,0 +1,387 @@
+"""Dynamics with virtual sites: energies, forces, temperatures and averages are those of sites at the right place."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import twice_kinetic
+from openmm import app, unit
+from openmm_systems import (
+    GPUS,
+    PLATFORMS,
+    dumbbell,
+    forces_at,
+    holding,
+    loose_alanine,
+    masses_of,
+    residuals,
+    started,
+    state_of,
+    total_energy,
+)
+
+from kcons.errors import UnsupportedError
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.openmm.integrator.system_checks import parts_of_steps
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
+MODELS = ("tip4pew", "tip4pd", "tip5p", "mixed")
+#: Integrators at constant energy and their orders.
+CONSERVING = {
+    "rattle": (lambda dt: ProjectedIntegrator(dt, tolerance=1e-13), 2),
+    "geodesic": (lambda dt: ProjectedIntegrator(dt, "geodesic", tolerance=1e-13), 2),
+    "compiled": (lambda dt: RattleIntegrator(dt, tolerance=1e-13), 2),
+    "yoshida4": (lambda dt: ProjectedIntegrator(dt, "yoshida4", tolerance=1e-13), 4),
+}
+
+
+def water(model, molecules=8):
+    """Some molecules of a box of water, without walls."""
+    field = app.ForceField("tip5p.xml" if model == "tip5p" else "amber14/tip4pew.xml")
+    box = app.Modeller(app.Topology(), [])
+    box.addSolvent(field, model="tip5p" if model == "tip5p" else "tip4pew", boxSize=openmm.Vec3(1.9, 1.9, 1.9))
+    box.delete(list(box.topology.residues())[molecules:])
+    system = field.createSystem(box.topology, removeCMMotion=False)
+    if model == "tip4pd":
+        nonbonded = next(f for f in system.getForces() if isinstance(f, openmm.NonbondedForce))
+        for first in range(0, system.getNumParticles(), 4):
+            for k, charge in enumerate((0.0, 0.58, 0.58, -1.16)):
+                nonbonded.setParticleParameters(first + k, charge, 0.3165, 0.0 if k else 0.936554)
+            share = 0.01546 / (2 * 0.09572 * np.cos(np.radians(104.52 / 2)))
+            place = openmm.ThreeParticleAverageSite(first, first + 1, first + 2, 1 - 2 * share, share, share)
+            system.setVirtualSite(first + 3, place)
+    return system, box.positions
+
+
+def mixed_sites():
+    """Two rigid triangles, whose charges sit on an average of two, an out-of-plane and a local-coordinates site."""
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    x = []
+    for n in range(2):
+        first = system.getNumParticles()
+        for m in (16.0, 2.0, 3.0, 0.0, 0.0, 0.0):
+            system.addParticle(m)
+            force.addParticle(0.0, 0.25, 0.4 if m == 16.0 else 0.0)
+        a, b, c, pair, plane, local = range(first, first + 6)
+        for i, j, d in ((a, b, 0.1), (a, c, 0.12), (b, c, 0.15)):
+            system.addConstraint(i, j, d)
+        system.setVirtualSite(pair, openmm.TwoParticleAverageSite(b, c, 0.3, 0.7))
+        system.setVirtualSite(plane, openmm.OutOfPlaneSite(a, b, c, -0.3, -0.3, 4.0))
+        system.setVirtualSite(
+            local,
+            openmm.LocalCoordinatesSite(
+                [a, b, c], [0.5, 0.3, 0.2], [-1.0, 0.5, 0.5], [0.0, -1.0, 1.0], openmm.Vec3(0.03, 0.02, -0.04)
+            ),
+        )
+        for site, charge in ((pair, 0.8), (plane, -0.5), (local, -0.3)):
+            force.setParticleParameters(site, charge, 0.1, 0.0)
+        for i in range(6):
+            for j in range(i):
+                force.addException(first + i, first + j, 0, 1, 0)
+        height = (0.1**2 - 0.12**2 + 0.15**2) / 0.3
+        x += [[0, np.sqrt(0.1**2 - height**2), 0.32 * n], [-height, 0, 0.32 * n], [0.15 - height, 0, 0.32 * n]]
+        x += [[0.0, 0.0, 0.0]] * 3
+    system.addForce(force)
+    return system, np.array(x)
+
+
+@cache
+def prepared(model):
+    """A System, and a start at 300 K on its constraints."""
+    system, positions = mixed_sites() if model == "mixed" else water(model)
+    context = started(system, RattleIntegrator(1e-3, tolerance=1e-12), positions)
+    integrator = context.getIntegrator()
+    context.computeVirtualSites()
+    openmm.LocalEnergyMinimizer.minimize(context, 1, 200)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(100)
+    x, v = state_of(context)
+    masses = masses_of(system)[:, None]
+    return system, x, np.where(masses > 0, v - np.sum(masses * v, axis=0) / masses.sum(), 0.0)
+
+
+def spread(model, integrator, time, platform="Reference"):
+    """How far the total energy is off along a run, root mean square."""
+    system, x, v = prepared(model)
+    context = started(system, integrator, x, v, platform)
+    energies = [total_energy(context)]
+    for _ in range(round(time / integrator.getStepSize()._value)):
+        integrator.step(1)
+        energies.append(total_energy(context))
+    assert context.getState().getTime()._value == pytest.approx(time)
+    assert residuals(system, context)[0] < 1e-7
+    return float(np.sqrt(np.mean(np.subtract(energies, energies[0]) ** 2)))
+
+
+# -- where sites are -------------------------------------------------------------------------------
+
+
+def test_which_steps_are_made_in_parts():
+    """Forces of the middle of a program are those of sites at its beginning, on Reference and CPU."""
+    system, x, v = prepared("tip4pew")
+    for platform in PLATFORMS:
+        plain = openmm.CustomIntegrator(1e-3)
+        plain.addPerDofVariable("seen", 0)
+        plain.addComputePerDof("x", "x+dt*v")
+        plain.addConstrainPositions()
+        plain.addComputePerDof("seen", "f")
+        context = started(system, plain, x, v, platform)
+        plain.step(1)
+        seen, now = np.array(plain.getPerDofVariableByName("seen")), forces_at(context)
+        massive = masses_of(system) > 0
+        assert np.abs(seen - now)[massive].max() > 1e-3 * np.abs(now).max()
+        del context
+        for scheme, in_parts in (("rattle", True), ("leapfrog", False)):
+            integrator = ProjectedIntegrator(1e-3, scheme)
+            context = started(system, integrator, x, v, platform)
+            assert parts_of_steps(context, integrator) is in_parts
+            del context
+    system, x, v = dumbbell()
+    context = started(system, integrator := ProjectedIntegrator(1e-3), x, v)
+    assert not parts_of_steps(context, integrator)
+
+
+@pytest.mark.parametrize("platform", GPUS)
+def test_gpus_place_sites_where_positions_are_constrained(platform):
+    system, x, v = prepared("tip4pew")
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v, platform)
+    assert not parts_of_steps(context, integrator)
+
+
+# -- constant energy --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", CONSERVING)
+@pytest.mark.parametrize("model", MODELS)
+def test_energy_is_conserved_to_the_order_of_the_scheme(model, kind):
+    made, order = CONSERVING[kind]
+    steps = np.array([2e-3, 1e-3, 5e-4]) / (2 if model == "mixed" else 1)
+    errors = [spread(model, made(dt), 0.02) for dt in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, abs=0.25)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_motion_is_that_of_openmm(model):
+    """VerletIntegrator, whose velocities are half a step behind, has the same positions."""
+    system, x, v = prepared(model)
+    dt, tolerance = 1e-3, 1e-12
+    verlet = openmm.VerletIntegrator(dt)
+    verlet.setConstraintTolerance(tolerance)
+    context = started(system, verlet, x, v)
+    inverse = np.divide(1, masses_of(system), out=np.zeros(len(x)), where=masses_of(system) > 0)
+    # Half a kick back, with accelerations along the constraints.
+    context.setVelocities(inverse[:, None] * forces_at(context))
+    context.applyVelocityConstraints(tolerance)
+    context.setVelocities(v - 0.5 * dt * state_of(context)[1])
+    runs = [(verlet, context)]
+    for ours in (ProjectedIntegrator(dt, tolerance=tolerance), RattleIntegrator(dt, tolerance=tolerance)):
+        runs.append((ours, started(system, ours, x, v)))
+    for steps in (1, 4, 25):
+        for integrator, _ in runs:
+            integrator.step(steps)
+        for _, ours in runs[1:]:
+            assert np.abs(state_of(ours)[0] - state_of(context)[0]).max() < 1e-8
+    assert np.abs(state_of(context)[0] - x).max() > 1e-3
+    np.testing.assert_allclose(state_of(runs[1][1])[1], state_of(runs[2][1])[1], atol=1e-7)
+
+
+def test_how_steps_are_divided_into_calls_changes_nothing():
+    system, x, v = prepared("tip4pew")
+    for made in (
+        lambda: ProjectedIntegrator(1e-3),
+        lambda: ProjectedIntegrator(1e-3, "blanes-moan4"),
+        lambda: ProjectedIntegrator(1e-3, ensemble=Isokinetic()),
+    ):
+        ends = []
+        for calls in ((12,), (1,) * 12, (5, 7)):
+            context = started(system, integrator := made(), x, v)
+            for steps in calls:
+                integrator.step(steps)
+            assert context.getStepCount() == 12
+            ends.append(state_of(context))
+        np.testing.assert_array_equal(ends[0], ends[1])
+        np.testing.assert_array_equal(ends[0], ends[2])
+
+
+def test_a_step_costs_one_evaluation_of_forces():
+    system, x, v = prepared("tip4pew")
+    system, calls = copy.deepcopy(system), []
+
+    def nothing(state):
+        calls.append(1)
+        return 0.0, np.zeros((len(x), 3))
+
+    system.addForce(openmm.PythonForce(nothing))
+    for integrator in (
+        ProjectedIntegrator(1e-3),
+        ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1)),
+        ProjectedIntegrator(1e-3, ensemble=Isokinetic(momentum="conserved")),
+    ):
+        context = started(system, integrator, x, v)
+        integrator.step(1)
+        calls.clear()
+        integrator.step(10)
+        assert len(calls) == 10
+        del context
+
+
+@pytest.mark.parametrize("platform", GPUS)
+def test_gpus_place_sites_within_steps(platform):
+    """As on Reference, as far as forces and lengths of the precision go."""
+    system, x, v = prepared("tip4pew")
+    for made in (
+        lambda: ProjectedIntegrator(1e-3),
+        lambda: ProjectedIntegrator(1e-3, "yoshida4"),
+    ):
+        ends = []
+        for place in ("Reference", platform):
+            context = started(system, integrator := made(), x, v, place)
+            integrator.step(10)
+            ends.append(state_of(context)[0])
+        assert np.abs(ends[1] - ends[0]).max() < 2e-6
+
+
+# -- ensembles --------------------------------------------------------------------------------------
+
+
+def test_orientations_of_dipoles_in_a_field():
+    """Only sites feel the field: <cos> = coth(a) - 1/a, a = dipole x field/kT; 2K = g kT, sites do not count.
+
+    Both within four standard errors of runs whose friction makes samples independent.
+    """
+    molecules = 40
+    system = openmm.System()
+    field = openmm.CustomExternalForce("-strength*z")
+    field.addPerParticleParameter("strength")
+    x = []
+    kT = GAS_CONSTANT * 300
+    for n in range(molecules):
+        first = system.getNumParticles()
+        for m in (16.0, 1.0, 1.0, 0.0):
+            system.addParticle(m)
+        for i, j, d in ((0, 1, 0.1), (0, 2, 0.1), (1, 2, 0.16)):
+            system.addConstraint(first + i, first + j, d)
+        # From the oxygen along the bisector, whose length to the middle of the hydrogens is 0.06 nm.
+        system.setVirtualSite(
+            first + 3, openmm.ThreeParticleAverageSite(first, first + 1, first + 2, -1 / 3, 2 / 3, 2 / 3)
+        )
+        site = 0.06 * 4 / 3
+        field.addParticle(first + 3, [2 * kT / site])
+        field.addParticle(first, [-2 * kT / site])  # no force on the whole
+        x += [[n, 0, 0], [n + 0.08, 0, 0.06], [n - 0.08, 0, 0.06], [n, 0, site]]
+    system.addForce(field)
+    integrator = ProjectedIntegrator(2e-3, ensemble=Langevin(300, 20))
+    integrator.setRandomNumberSeed(5)
+    context = started(system, integrator, np.array(x, dtype=float))
+    integrator.setVelocitiesToTemperature(context, 300, 3)
+    integrator.step(500)
+    cosines, temperatures = [], []
+    for _ in range(200):
+        integrator.step(50)
+        x, v = state_of(context)
+        cosines.append(np.mean((x[3::4] - x[::4])[:, 2]) / site)
+        temperatures.append(twice_kinetic(system, v) / GAS_CONSTANT / (6 * molecules))
+    assert integrator.degrees_of_freedom() == 6 * molecules
+    for values, exact in ((cosines, 1 / np.tanh(2) - 1 / 2), (temperatures, 300)):
+        blocks = np.mean(np.reshape(values, (20, 10)), axis=1)
+        error = np.std(blocks, ddof=1) / np.sqrt(20)
+        assert error < 0.02 * exact
+        assert abs(np.mean(values) - exact) < 4 * error
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("ensemble", [Isokinetic(), NoseHoover(300, 20)], ids=["Isokinetic", "NoseHoover"])
+def test_energies_of_thermostats_are_conserved_to_second_order(model, ensemble):
+    system, x, v = prepared(model)
+    errors = []
+    steps = np.array([2e-3, 1e-3, 5e-4]) / (2 if model == "mixed" else 1)
+    for dt in steps:
+        integrator = ProjectedIntegrator(dt, tolerance=1e-13, ensemble=ensemble)
+        context = started(system, integrator, x, v)
+        integrator.step(1)
+        energies, kinetic = [], []
+        for _ in range(round(0.02 / dt)):
+            integrator.step(1)
+            energies.append(integrator.ensemble.conserved_energy(integrator))
+            kinetic.append(integrator.kinetic_energy()._value)
+        assert (np.ptp(kinetic) < 1e-12 * kinetic[0]) == (type(ensemble) is Isokinetic)
+        errors.append(np.std(energies))
+        del context
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.25)
+
+
+# -- what cannot be done ----------------------------------------------------------------------------
+
+
+def test_sites_beside_parts_are_refused():
+    system, x, v = loose_alanine()
+    system.addParticle(0.0)
+    for force in system.getForces():
+        if isinstance(force, openmm.NonbondedForce):
+            force.addParticle(0.0, 0.1, 0.0)
+    system.setVirtualSite(len(x), openmm.TwoParticleAverageSite(1, 2, 0.5, 0.5))
+    x, v = np.vstack([x, (x[1] + x[2]) / 2]), np.vstack([v, np.zeros(3)])
+    integrator = ProjectedIntegrator(1e-3, parts=[holding()])
+    context = started(system, integrator, x, v)
+    with pytest.raises(UnsupportedError, match=rf"particle {len(x) - 1} is a virtual site.*leapfrog"):
+        integrator.step(1)
+    np.testing.assert_array_equal(state_of(context), [x, v])
+
+
+def test_programs_that_openmm_runs_by_itself_are_refused():
+    """A CompoundIntegrator runs programs as wholes; where sites are placed at their ends, forces would be old."""
+    system, x, v = prepared("tip4pew")
+    compound = openmm.CompoundIntegrator()
+    ours = ProjectedIntegrator(1e-3)
+    compound.addIntegrator(ours)
+    compound.addIntegrator(openmm.VerletIntegrator(1e-3))
+    context = started(system, compound, x, v)
+    for call in (lambda: ours.step(1), lambda: ours.check(context)):
+        with pytest.raises(UnsupportedError, match=r"particle 3 is a virtual site.*CompoundIntegrator.*leapfrog"):
+            call()
+
+
+def test_after_a_failure_the_next_step_is_whole():
+    """A NaN in the middle of a step leaves nothing half done."""
+    system, x, v = prepared("tip4pew")
+    system = copy.deepcopy(system)
+    wall = openmm.CustomExternalForce("1e-12*sqrt(limit-z)")
+    wall.addGlobalParameter("limit", 100.0)
+    wall.addParticle(0)
+    system.addForce(wall)
+    integrator = ProjectedIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    integrator.step(5)
+    integrator.check()
+    before = state_of(context)
+    context.setParameter("limit", -100.0)
+    with pytest.raises(Exception, match=r"NaN|not finite"):
+        integrator.step(3)
+        integrator.check()
+    context.setParameter("limit", 100.0)
+    np.testing.assert_array_equal(state_of(context), before)
+    integrator.step(5)
+    reference = started(system, other := ProjectedIntegrator(1e-3), x, v)
+    other.step(10)
+    np.testing.assert_allclose(state_of(context)[0], state_of(reference)[0], atol=1e-12)
+
+
+def test_temperature_of_a_simulation_does_not_count_sites():
+    system, x, v = prepared("tip5p")
+    integrator = RattleIntegrator(1e-3)
+    context = started(system, integrator, x, v)
+    integrator.step(3)
+    freedom = 6 * 8
+    assert integrator.degrees_of_freedom() == freedom
+    found = integrator.computeSystemTemperature() / unit.kelvin
+    assert found == pytest.approx(twice_kinetic(system, state_of(context)[1]) / (freedom * GAS_CONSTANT))
