@@ -226,8 +226,8 @@ def show(result: dict[str, Any], console: Console) -> None:
         console.print(_made_on(result["machine"]))
     energies = result["measurements"].get("kinetic")
     if energies:
-        headings = ("integrator", "g", "mean 2K/kT", "variance", "2 g")
-        table = scripts.table(energies["title"], headings, {"integrator"})
+        columns = ("integrator", "g", "mean 2K/kT", "variance", "2 g")
+        table = scripts.table(energies["title"], columns, {"integrator"})
         for name, row in energies["rows"].items():
             mean, variance = (f"{row[what]:.1f} ± {row[f'{what} error']:.1f}" for what in ("mean", "variance"))
             table.add_row(name, f"{row['g']:g}", mean, variance, f"{2 * row['g']:g}")
