@@ -17,6 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.quantities import array
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.
 COARSE = 1e-11
@@ -24,13 +25,7 @@ COARSE = 1e-11
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
     """Positions as an array of shape (n, 3), nm."""
-    plain: Any = positions
-    if unit.is_quantity(plain):
-        plain = plain.value_in_unit(unit.nanometer)
-    try:
-        x = np.array(plain, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"positions are no array of numbers: {error}", item="positions") from None
+    x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
     return x
