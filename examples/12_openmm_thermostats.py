@@ -126,7 +126,7 @@ def mean_energy(make: Make, fs: float, picoseconds: float, system: openmm.System
     context.setVelocitiesToTemperature(TEMPERATURE, 2)
     every = max(1, round(100 / fs))
     samples = round(picoseconds * 1e3 / fs / every)
-    integrator.step(round(min(20.0, picoseconds) * 1e3 / fs))
+    integrator.step(round(min(20.0, 0.1 * picoseconds) * 1e3 / fs))
     values = []
     for _ in range(samples):
         integrator.step(every)

@@ -1,4 +1,4 @@
-"""What a Context is told, its integrator must hear: OpenMM tells no integrator that is written in Python.
+"""Changes of a Context, passed on to its integrator: OpenMM does not notify integrators written in Python.
 
 On import, some methods of OpenMM's classes are wrapped. They look whether the Context belongs to an integrator of
 kcons, alone or within a CompoundIntegrator; for all others they do what they did, and nothing else.
@@ -42,7 +42,7 @@ _FOREIGN = ("IntegratorParameters", "global variable name", "per-DOF variable na
 
 
 def listen(integrator: Integrator) -> None:
-    """Let this integrator hear what its Context is told."""
+    """Notify this integrator of changes of its Context."""
     _LIVE[int(integrator.this)] = integrator
 
 
