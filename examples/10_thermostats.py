@@ -1,8 +1,8 @@
 """Which temperature does a thermostat sample? Small fluids, measured by their configurations alone.
 
     python examples/10_thermostats.py                  short runs, half a minute: large errors
-    python examples/10_thermostats.py --full --out F   twenty minutes on one core; F receives JSON, run by run, and
-                                                       what is in it already is not run again
+    python examples/10_thermostats.py --full --out F   twenty minutes on one core; F receives JSON, run by run; a
+                                                       run that is interrupted is continued
     python examples/10_thermostats.py --show F         the tables of an earlier result
 
 The isokinetic thermostat with 2K = (g - 1) kT and, for comparison, 2K = g kT, and Langevin; the energy also by plain
@@ -13,14 +13,11 @@ kinetic energy has no distribution.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import time
 import warnings
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,8 +27,17 @@ from rich.table import Table
 
 from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, ConstrainedNoseHoover, constrain, draw_velocities
-from kcons.comparison import LennardJones, Potential, PotentialCalculator, fluid, json_files
-from kcons.comparison import measure as compare
+from kcons.cli.progress import Bars
+from kcons.comparison import (
+    LennardJones,
+    Potential,
+    PotentialCalculator,
+    environment,
+    fluid,
+    json_files,
+    scripts,
+    work_off,
+)
 from kcons.constraints import Distance
 from kcons.motion import Motion
 from kcons.steppers import State, Stepper, System, run
@@ -298,42 +304,43 @@ def order(name: str, kind: str, unit: Any) -> dict[str, Any]:
 # -- all of it --------------------------------------------------------------------------------------
 
 
-Job = tuple[str, Callable[[], dict[str, Any]]]
+def timed(group: str, job: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a run found, for this list of the result, with what it took."""
+    begun = time.process_time()
+    found = job()
+    return {"group": group, "cpu_seconds": time.process_time() - begun, **found}
 
 
-def jobs(full: bool) -> dict[str, Job]:
-    """What there is to run: a name, the list of the result it goes to, and the run."""
-    found: dict[str, Job] = {}
+def jobs(full: bool) -> dict[str, Callable[[], dict[str, Any]]]:
+    """What there is to run, by name."""
+    found: dict[str, Callable[[], dict[str, Any]]] = {}
     for which in range(len(FLUIDS)) if full else (1,):
         name, steps = NAMES[which], STEPS[which] if full else 4000
-        found[f"Metropolis, {name}"] = "metropolis", partial(metropolis, which, 600_000 if full else 20_000)
+        moves = partial(metropolis, which, 600_000 if full else 20_000)
+        found[f"Metropolis, {name}"] = partial(timed, "metropolis", moves)
         for thermostat in ("g - 1", "g", "Langevin"):
             taken = steps // 3 if thermostat == "Langevin" else steps
-            found[f"{thermostat}, {name}"] = "runs", partial(sampled, which, thermostat, taken)
+            found[f"{thermostat}, {name}"] = partial(timed, "runs", partial(sampled, which, thermostat, taken))
     for convention in ("g - 1", "g"):
-        found[f"{convention}, trap"] = "trap", partial(trap, convention, 800_000 if full else 4000)
+        found[f"{convention}, trap"] = partial(timed, "trap", partial(trap, convention, 800_000 if full else 4000))
     if full:
         for name in MOLECULES:
             for kind in ("Nose-Hoover", "Langevin"):
-                found[f"{kind}, {name}"] = "physical_validation", partial(judged, name, kind, 100_000)
+                judgement = partial(judged, name, kind, 100_000)
+                found[f"{kind}, {name}"] = partial(timed, "physical_validation", judgement)
     return found
 
 
-def measure(full: bool, out: Path | None) -> dict[str, Any]:
-    """All that is not in `out` yet, written there run by run."""
-    result: dict[str, Any] = {"machine": compare.environment(), "full": full, "parts": {}}
-    if out is not None and out.exists():
-        result["parts"] = json_files.read(out)["parts"]
-    for name, (group, job) in jobs(full).items():
-        if name in result["parts"]:
-            continue
-        begun = time.process_time()
-        found = job()
-        taken = {"group": group, "commit": result["machine"]["commit"], "cpu_seconds": time.process_time() - begun}
-        result["parts"][name] = {**taken, **found}
-        if out is not None:
-            json_files.write(out, result)
-        print(f"{name}: {time.process_time() - begun:.0f} s", file=sys.stderr, flush=True)
+def measure(*, quick: bool, keep: Callable[[dict[str, Any]], None], earlier: dict[str, Any] | None) -> dict[str, Any]:
+    """All runs but those that an earlier measurement has made, kept one by one."""
+    result = {"machine": environment(), "full": not quick, "parts": {}, **(earlier or {})}
+
+    def put(name: str, found: dict[str, Any]) -> None:
+        result["parts"][name] = found
+        keep(result)
+
+    with Bars() as watcher:
+        work_off("thermostats", jobs(not quick), put, result["parts"], watcher)
     return result
 
 
@@ -379,16 +386,12 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="long runs, and physical_validation")
-    parser.add_argument("--out", type=Path, help="JSON file for the results; what is in it is not run again")
-    parser.add_argument("--show", type=Path, help="print the tables of an earlier result and stop")
-    options = parser.parse_args()
-    console = Console(width=120)
+    parser = scripts.options(__doc__, full="long runs, and physical_validation")
+    options, console = parser.parse_args(), Console(width=120)
     if options.show:
         show(json_files.read(options.show), console)
         return
-    show(measure(options.full, options.out), console)
+    show(scripts.continued(options.out, measure, quick=not options.full), console)
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def total_energy(context: openmm.Context) -> float:
 
 def drift(integrator: openmm.Integrator, context: openmm.Context, picoseconds: float, freedom: int) -> dict[str, float]:
     """Slope of the total energy, and its standard error from blocks."""
-    every = 50
+    every = min(50, max(1, round(picoseconds / STEP / 20)))
     samples = max(20, round(picoseconds / STEP / every))
     energies = []
     for _ in range(samples):

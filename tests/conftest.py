@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -22,3 +23,9 @@ def pytest_configure(config: pytest.Config) -> None:
     for kind in ("DeprecationWarning", "PendingDeprecationWarning", "FutureWarning", "SyntaxWarning"):
         config.addinivalue_line("filterwarnings", f"default::{kind}")
         config.addinivalue_line("filterwarnings", rf"error::{kind}:({'|'.join(OWN)})(\.|$)")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """What was collected stays to the end: no search through all objects has to see it."""
+    gc.collect()
+    gc.freeze()

@@ -1,4 +1,4 @@
-"""The engine for one `Atoms`, and what it takes to see that it no longer fits."""
+"""The engine for one `Atoms`, and the tests whether it still fits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FORCES_ONLY = (ase.constraints.Hookean, ase.constraints.ExternalForce)
 
 @dataclass
 class Binding:
-    """The engine for one set of masses and one cell, and what it takes to see that these changed."""
+    """The engine for one set of masses and one cell, with copies that show when these have changed."""
 
     motion: Motion
     given: tuple[Constraint, ...]
@@ -112,7 +112,7 @@ def bind(
 
 
 def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
-    """Refuse ASE constraints that would be applied one after the other with `own`."""
+    """Refuse ASE constraints that share atoms with `own`: ASE would apply them one after the other."""
     if len(present) == len(bound.others) and all(a is b for a, b in zip(present, bound.others, strict=True)):
         return
     for other in present:

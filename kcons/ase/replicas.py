@@ -1,4 +1,4 @@
-"""Rows of some of the atoms, and of a cell that is repeated."""
+"""Constraints of a selection of atoms, and of a repeated cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dynamics classes that move atoms past their constraints, found by what they do with positions."""
+"""Detection of dynamics classes that do not respect the constraints of their atoms."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ ADVICE = (
 
 
 class Watch:
-    """What an MD engine has asked for and got, as far as it shows whether the MD engine respects the constraints.
+    """The positions that an MD engine last asked for and got, which show whether it respects the constraints.
 
-    Only dynamics set momenta. So that is when positions must be on the constraints, and when it shows that the
-    MD engine went on from its own copy of the positions instead of the corrected ones.
+    Only dynamics set momenta. Positions must be on the constraints then; if they are not, the MD engine has
+    continued from its own copy of the positions instead of the corrected ones.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class Watch:
         if self._repeats >= 2:
             self._repeats = 0
             raise UnsupportedError(
-                "this dynamics class asks again for positions that were corrected: it goes on from its own copy "
+                "this dynamics class asks again for positions that were corrected: it continues from its own copy "
                 f"(NoseHooverChainNVT does), so that the constraints have no effect on it. Instead, {ADVICE}"
             )
         if not self._looked:

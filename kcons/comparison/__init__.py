@@ -30,6 +30,7 @@ _NAMES = {
     "test_systems.openmm_host": ("system_of",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
     "study.machine": ("environment",),
+    "study.study": ("work_off",),
     "work_precision.measurement": ("Comparison", "Measurement"),
 }
 

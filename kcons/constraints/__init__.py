@@ -1,6 +1,6 @@
 """What can be held: one kind of constraint a module.
 
-- `arguments`, `target`, `vectors`: arrays from outside, targets and their derivatives, arithmetic
+- `arguments`, `target`, `vectors`: arrays and Quantities from outside, targets and their derivatives, arithmetic
 - `constraint`: the contract of a family
 - `internal`: distances, angles, dihedrals
 - `linear`: fixed atoms, linear relations

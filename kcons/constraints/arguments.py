@@ -1,8 +1,21 @@
-"""Arrays from outside, as the compiled kernels need them, and arrays that are lent to functions of the user."""
+"""What comes from outside: arrays as the compiled kernels need them, and numbers with units.
+
+Constraints take plain numbers in any consistent units. They also take Quantities of OpenMM, which become numbers in its
+units, nm, ps, dalton, radian. A constraint remembers that (`Constraint.units`), and only what knows the positions to be
+in nm, `kcons.openmm`, accepts it then. Angles are the same in all units, and need not be remembered. OpenMM is not
+imported: a Quantity is known by what it can do.
+
+Arrays of the engine that are lent to functions of the user can be read and not changed.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,11 +36,12 @@ def numbers(values: ArrayLike | Any, item: str) -> FloatArray:
     Raises
     ------
     InputError
-        Complex numbers, whose imaginary part would be lost; masked arrays, whose masks would be; objects, text, rows of
-        different length.
+        Complex numbers, whose imaginary part would be lost; masked arrays, whose masks would be; Quantities, whose
+        units would be; objects, text, rows of different length.
     """
     if type(values) is np.ndarray and values.dtype is _FLOAT:
         return values
+    refuse_units(values, item)
     parts = values if isinstance(values, list | tuple) else (values,)
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
         raise InputError(
@@ -106,3 +120,167 @@ def check_pairs(pairs: ArrayLike, n_atoms: int) -> IntArray:
             f"bonds has the pair ({i}, {j}); give two different atoms of 0 to {n_atoms - 1}", item="bonds", atoms=[i, j]
         )
     return table.astype(np.int64)
+
+
+# -- numbers with units -----------------------------------------------------------------------------
+
+#: What numbers made of Quantities are in.
+MD_UNITS = "nm, ps, dalton, radian"
+_PLAIN = (int, float, bool, str, type(None))
+
+
+class Kind(NamedTuple):
+    """What a number is.
+
+    Attributes
+    ----------
+    words : str
+        For messages.
+    exponents : tuple of (str, int), or None
+        Base dimensions by their names in OpenMM; None for any.
+    """
+
+    words: str
+    exponents: tuple[tuple[str, int], ...] | None
+
+    def per_time(self, power: int = 1) -> Kind:
+        """Its rate of change, or with 2 its acceleration."""
+        if self.exponents is None:
+            return self
+        exponents = dict(self.exponents)
+        exponents["time"] = exponents.get("time", 0) - power
+        per = "ps" if power == 1 else f"ps**{power}"
+        return Kind(f"{self.words}/{per}", tuple((name, n) for name, n in exponents.items() if n))
+
+
+ANY = Kind("any unit", None)
+NUMBER = Kind("a plain number", ())
+LENGTH = Kind("nm", (("length", 1),))
+SPEED = LENGTH.per_time()
+ANGLE = Kind("radian", (("angle", 1),))
+TIME = Kind("ps", (("time", 1),))
+#: A vector of which only the direction counts.
+DIRECTION = Kind("one unit for all components", None)
+
+#: What the arguments of constraints are, by name; 'target' is what the family says.
+ARGUMENTS: Mapping[str, Kind] = {
+    **dict.fromkeys(("radius", "minor_radius", "offset", "center", "point", "major_radius", "semi_axes"), LENGTH),
+    **dict.fromkeys(("axis", "normal", "heading", "direction"), DIRECTION),
+    **dict.fromkeys(("coefficients", "weights", "contact", "rotation"), NUMBER),
+    "length": LENGTH,
+    "time_step": TIME,
+    "period": ANY,
+}
+
+
+def has_units(values: Any) -> bool:
+    """Whether there are units, at the first number of nested lists."""
+    while type(values) in (list, tuple) and len(values):
+        values = values[0]
+    if isinstance(values, _PLAIN):
+        return False
+    if type(values) is np.ndarray:
+        return bool(values.dtype == object and values.size and has_units(values.flat[0]))
+    return not callable(values) and (hasattr(values, "unit") or hasattr(values, "units"))
+
+
+def without_units(values: Any, item: str, kind: Kind) -> tuple[Any, bool]:
+    """Numbers in nm, ps, dalton, radian, and whether they would be others in other units.
+
+    Parameters
+    ----------
+    values : Quantity, nested lists of them, or anything else, which stays as it is
+    item : str
+        For messages.
+    kind : Kind
+        What they must be; plain numbers may be angles, too.
+
+    Raises
+    ------
+    InputError
+        Of another kind; of units that are not OpenMM's.
+    """
+    if not has_units(values):
+        return values, False
+    if type(values) is np.ndarray:
+        values = values.tolist()
+    if isinstance(values, list | tuple):
+        parts = [without_units(part, item, kind) for part in values]
+        return [plain for plain, _ in parts], any(remembered for _, remembered in parts)
+    system = getattr(sys.modules.get(type(values).__module__.rpartition(".")[0]), "md_unit_system", None)
+    if system is None or not hasattr(values, "value_in_unit_system"):
+        raise InputError(f"{item} has units that are not those of openmm.unit; give plain numbers", item=item)
+    found = {dimension.name: power for dimension, power in values.unit.iter_base_dimensions() if power}
+    if kind.exponents is not None and found != dict(kind.exponents) and (found or kind is not ANGLE):
+        raise InputError(f"{item} is {shown(values)}; give it in {kind.words}", item=item)
+    matters = kind is not DIRECTION and not set(found) <= {"angle"}
+    return values.value_in_unit_system(system), matters
+
+
+def shown(values: Any) -> str:
+    """The beginning of a Quantity in words, on one line."""
+    words = " ".join(str(values).split())
+    return words if len(words) <= 60 else f"{words[:50]} ..."
+
+
+def refuse_units(values: Any, item: str) -> None:
+    """Raise `InputError` for Quantities where nobody knows which units the other numbers are in."""
+    if has_units(values):
+        raise InputError(
+            f"{item} has units ({shown(values)}), and only kcons.openmm knows what the other numbers are in; "
+            "give plain numbers in the units of the run",
+            item=item,
+        )
+
+
+@dataclass(frozen=True)
+class Unitless:
+    """A function whose results are taken without their units; for those that may return Quantities."""
+
+    function: Callable[..., Any]
+    item: str
+    kind: Kind
+
+    def __call__(self, *arguments: Any) -> Any:
+        found = self.function(*arguments)
+        if type(found) is tuple:  # several results, each of its own kind
+            return tuple(without_units(part, self.item, ANY)[0] for part in found)
+        return without_units(found, self.item, self.kind)[0]
+
+
+def taking_quantities(init: Callable[..., None]) -> Callable[..., None]:
+    """Let `Constraint.__init__` of a family see plain numbers only, and the object remember what they are in."""
+
+    @functools.wraps(init)
+    def with_quantities(self: Any, *args: Any, **kwargs: Any) -> None:
+        if not any(_carries(value) for value in (*args, *kwargs.values())):
+            init(self, *args, **kwargs)
+            return
+        bound = inspect.signature(init).bind(self, *args, **kwargs)
+        remembered = False
+        for name, value in _given(bound):
+            kind = self.held if name == "target" else ARGUMENTS.get(name, NUMBER)
+            bound.arguments[name], matters = plain_target(value, f"{self.family}: {name}", kind)
+            remembered = remembered or matters
+        init(*bound.args, **bound.kwargs)
+        if remembered:
+            self.units = MD_UNITS
+
+    return with_quantities
+
+
+def _given(bound: inspect.BoundArguments) -> Iterator[tuple[str, Any]]:
+    return iter(list(bound.arguments.items())[1:])
+
+
+def _carries(value: Any) -> bool:
+    return has_units(value) or has_units(getattr(value, "time_step", None))
+
+
+def plain_target(target: Any, item: str, kind: Kind) -> tuple[Any, bool]:
+    """`without_units` for what may also be a `MovingTarget`, whose time step is looked at."""
+    step = getattr(target, "time_step", None)
+    if not has_units(step):
+        return without_units(target, item, kind)
+    plain, matters = without_units(step, f"{item}: time_step", TIME)
+    return target.with_time_step(float(plain)), matters

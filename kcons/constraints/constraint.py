@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import LENGTH, MD_UNITS, Kind, numbers, plain_target, taking_quantities
 from kcons.constraints.target import FloatArray, MovingTarget, Target, as_target
 from kcons.constraints.vectors import first_true
 from kcons.errors import ConstraintError, InputError, SingularGeometryError
@@ -51,6 +51,10 @@ class Constraint(ABC):
         Atoms of each row, in the order the family documents.
     target : float, array_like, MovingTarget, callable of time, or None
         What each row is held at; None takes the value found when the set is built.
+
+    Notes
+    -----
+    Quantities of OpenMM are taken wherever numbers are, see `kcons.constraints.arguments`.
     """
 
     family: ClassVar[str]
@@ -63,9 +67,13 @@ class Constraint(ABC):
     shared: ClassVar[tuple[str, ...]] = ()
     #: Python functions the object holds; with one of them it cannot be written to a file.
     functions: ClassVar[tuple[str, ...]] = ()
+    #: What targets are, for Quantities.
+    held: ClassVar[Kind] = LENGTH
     #: Whether the coordinate depends on the masses of its atoms.
     uses_masses: ClassVar[bool] = False
 
+    #: What its numbers are in, where it was given Quantities; None for any consistent units.
+    units: str | None = None
     #: True if q depends on differences of positions alone, so that minimum images apply.
     translation_invariant: bool = False
     #: Period of the coordinate (2 pi for dihedrals); sigma is taken to the nearest image.
@@ -77,6 +85,11 @@ class Constraint(ABC):
     #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.images`.
     whole: NDArray[np.bool_] | None = None
     windings: IntArray | None = None
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "__init__" in cls.__dict__:
+            cls.__init__ = taking_quantities(cls.__init__)  # type: ignore[method-assign]
 
     def __init__(self, atoms: ArrayLike, target: Target = None) -> None:
         self.atoms: IntArray = _atom_table(atoms, type(self).__name__, self.row_width)
@@ -220,7 +233,10 @@ class Constraint(ABC):
         """Copy of this object held at another target."""
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
-        copy.target = as_target(target, self.n_rows)
+        plain, matters = plain_target(target, f"{self.family}: target", self.held)
+        copy.target = as_target(plain, self.n_rows)
+        if matters:
+            copy.units = MD_UNITS
         return copy
 
     def select(self, rows: Sequence[int] | IntArray) -> Self:
@@ -272,6 +288,8 @@ class Constraint(ABC):
         target = None if self.target is None else self.target.tolist()  # type: ignore[union-attr]
         data = {name: getattr(self, name).tolist() for name in self.per_row}
         data |= {name: getattr(self, name) for name in self.shared}
+        if self.units is not None:
+            data["units"] = self.units
         return {"family": self.family, "atoms": self.atoms.tolist(), "target": target, **data}
 
     @classmethod
@@ -284,8 +302,9 @@ class Constraint(ABC):
             If an entry is missing, unknown or of the wrong shape.
         """
         names = {"family", "atoms", "target", *cls.per_row, *cls.shared}
-        if cls.functions or set(data) != names:
-            wrong = sorted(names.symmetric_difference(data)) or list(cls.functions)
+        found = set(data) - {"units"}
+        if cls.functions or found != names:
+            wrong = sorted(names.symmetric_difference(found)) or list(cls.functions)
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
         item = object.__new__(cls)
         Constraint.__init__(item, data["atoms"], data["target"])
@@ -293,6 +312,7 @@ class Constraint(ABC):
             setattr(item, name, data[name])
         item._keep(**{name: data[name] for name in cls.per_row})
         item._settle()
+        item.units = data.get("units")
         return item
 
     def __repr__(self) -> str:

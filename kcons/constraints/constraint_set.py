@@ -89,6 +89,12 @@ class ConstraintSet(InCell):
         for item in given:
             if not isinstance(item, Constraint):
                 raise InputError(f"{item!r} is no kcons constraint", item="constraints")
+            if item.units is not None:
+                raise InputError(
+                    f"{item!r} was given Quantities and is in {item.units}, and nobody knows what the positions are "
+                    "in; hold it in OpenMM (kcons.openmm), or give plain numbers in the units of the positions",
+                    item="units",
+                )
         x = contiguous(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             raise InputError(f"positions must have shape (n_atoms, 3), not {x.shape}", item="positions")

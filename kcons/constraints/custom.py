@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import ANY, lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
@@ -26,6 +26,7 @@ class FunctionRows(Constraint):
     time derivatives by eighth-order formulas with step `time_step`.
     """
 
+    held = ANY
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
 
     def __init__(

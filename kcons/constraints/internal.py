@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import ANGLE
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import cross, dot, norm
@@ -103,6 +104,7 @@ class Angle(Constraint):
 
     family = "Angle"
     row_width = 3
+    held = ANGLE
     translation_invariant = True
     kind = RowKind.ANGLE
 
@@ -189,6 +191,7 @@ class Dihedral(Constraint):
 
     family = "Dihedral"
     row_width = 4
+    held = ANGLE
     translation_invariant = True
     period = 2 * np.pi
     kind = RowKind.DIHEDRAL

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,6 +36,10 @@ class MovingTarget:
     rate: TimeFunction | None = None
     acceleration: TimeFunction | None = None
     time_step: float = 0.02
+
+    def with_time_step(self, time_step: float) -> MovingTarget:
+        """The same with other steps of the differences."""
+        return replace(self, time_step=time_step)
 
     def at(self, time: float, rows: int) -> FloatArray:
         """Target at `time`, shape (rows,)."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import lent, numbers
+from kcons.constraints.arguments import ANY, SPEED, lent, numbers
 from kcons.constraints.constraint import Constraint
 from kcons.constraints.target import FloatArray, Target, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
@@ -25,6 +25,7 @@ class VelocityRows(Constraint):
     """Rows a(r, t) . v = target; zero by default."""
 
     holonomic = False
+    held = SPEED
 
     def __init__(self, atoms: ArrayLike, target: Target = 0.0) -> None:
         super().__init__(atoms, 0.0 if target is None else target)
@@ -258,6 +259,7 @@ class CustomVelocity(VelocityRows):
     """
 
     family = "CustomVelocity"
+    held = ANY
     functions: ClassVar[tuple[str, ...]] = ("coefficients", "derivative")
 
     def __init__(

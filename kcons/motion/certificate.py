@@ -1,4 +1,4 @@
-"""A look at results that shares nothing with the solvers: sigma and A v as the constraint set defines them.
+"""An independent check of results: sigma and A v as the constraint set defines them, without the solvers.
 
 The solvers check their own residuals; where a solver and the set do not mean the same, these say nothing. So a run
 has its states certified from time to time, by NumPy, row by row, with the measures and gradients of the constraint
@@ -73,7 +73,7 @@ def _refuse(held: ConstraintSet, miss: FloatArray, allowed: FloatArray, what: st
         row = int(np.argmax(np.where(bad, np.nan_to_num(miss / allowed, nan=np.inf), -1.0)))
     raise CertificateError(
         f"the {what} are off row {held.row_name(row)}: {residual} is {miss[row]:.3g}, allowed {allowed[row]:.3g}. "
-        "The solver took them for right; this is an error of kcons, or something changed the arrays, the cell or the "
+        "The solver reported success; this is an error of kcons, or something changed the arrays, the cell or the "
         "targets behind its back",
         row=row,
         residual=float(miss[row]),

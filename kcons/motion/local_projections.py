@@ -1,4 +1,4 @@
-"""All solvers of a plan, one after another on local arrays: what each of them found, or nothing changed."""
+"""All solvers of a plan, one after another on local arrays; if one of them fails, nothing is changed."""
 
 from __future__ import annotations
 

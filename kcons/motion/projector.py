@@ -67,7 +67,7 @@ class Projector:
         return 3 * self.constraint_set.n_moving - self.plan.rank
 
     def took(self, iterations: int) -> None:
-        """Remember for reports what a kernel took that did the work of all solvers in one call."""
+        """Remember, for reports, the iterations of a kernel that ran all solvers in one call."""
         self._solve.iterations[:] = [iterations] * len(self.plan.solvers)
 
     # -- cell -----------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 Swap the integrator of a Simulation, and what the System constrains is held to order 2, 4 or 6, together with
 collective variables, surfaces and the constraint objects of kcons.
 
+- `quantities`: numbers with units
 - `topology`: constraints by name
 - `integrator`: the integrators and the programs they run
 - `ensembles`: Langevin, isokinetic, Nosé-Hoover

@@ -13,6 +13,7 @@ from openmm import unit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.openmm.quantities import array
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import Snapshot, Topology, require_standard_form, selected_numbers, sorted_pairs
@@ -75,7 +76,7 @@ def snapshot_of(
     """
     atoms = list(topology.atoms())
     n = len(atoms)
-    x = _plain(positions, unit.nanometer)
+    x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(
             f"the Topology has {n} atoms, but positions have shape {x.shape}; give those of the same system",
@@ -109,7 +110,7 @@ def snapshot_of(
     vectors = box if box is not None else topology.getPeriodicBoxVectors()
     if vectors is None and system is not None and system.usesPeriodicBoundaryConditions():
         vectors = system.getDefaultPeriodicBoxVectors()
-    cell = None if vectors is None else _plain(vectors, unit.nanometer)
+    cell = None if vectors is None else array(vectors, unit.nanometer, "box")
     # One angstrom on all sides is what files without a box say.
     if cell is not None and np.diag(cell).max() < 0.2:
         cell = None
@@ -119,7 +120,7 @@ def snapshot_of(
         ANGSTROM,
         cell,
         np.full(3, cell is not None),
-        None if velocities is None else _plain(velocities, unit.nanometer / unit.picosecond),
+        None if velocities is None else array(velocities, unit.nanometer / unit.picosecond, "velocities"),
         "OpenMM Topology",
     )
 
@@ -178,14 +179,6 @@ def _charges(system: openmm.System) -> FloatArray | None:
         if isinstance(force, openmm.NonbondedForce):
             return np.array([force.getParticleParameters(k)[0]._value for k in range(system.getNumParticles())])
     return None
-
-
-def _plain(values: Any, wanted: Any) -> FloatArray:
-    if unit.is_quantity(values):
-        return np.array(values.value_in_unit(wanted), dtype=np.float64)
-    if isinstance(values, list | tuple) and len(values) and unit.is_quantity(values[0]):
-        return np.array([v.value_in_unit(wanted) for v in values], dtype=np.float64)
-    return np.array(values, dtype=np.float64)
 
 
 def bonds_of(system: openmm.System, x: FloatArray) -> IntArray:

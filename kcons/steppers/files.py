@@ -1,8 +1,10 @@
-"""Files that are either whole or not there, and archives whose damage is noticed."""
+"""Files that are either whole or not there, data as JSON, and archives whose damage is noticed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import SEEK_END, BytesIO
 from os import PathLike
@@ -21,17 +23,44 @@ _LAST_RECORD = Struct("<4s4H2LH")
 def in_one_piece(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     """A binary file to write to, which becomes `path` once all of it is there.
 
-    Whatever goes wrong on the way, a full disk included, leaves an older file as it was and nothing beside it.
+    Whatever goes wrong on the way, a full disk included, leaves an older file as it was and nothing beside it. Links
+    are not followed.
     """
     target = Path(path)
     unfinished = target.with_name(target.name + ".unfinished")
+    unfinished.unlink(missing_ok=True)
     try:
-        with unfinished.open("wb") as opened:
+        with unfinished.open("xb") as opened:
             yield opened
         unfinished.replace(target)
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
+
+
+def plain(value: Any, digits: int | None = None) -> Any:
+    """What JSON has: lists, keys that are text, and None for NaN and infinity.
+
+    Parameters
+    ----------
+    value
+    digits : int, optional
+        Significant digits that are kept of a number.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, digits) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return None
+        return value if digits is None else float(f"{value:.{digits}g}")
+    return value
+
+
+def text(data: Any, indent: int | None = 1) -> str:
+    """Data as JSON."""
+    return json.dumps(plain(data), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def stored_arrays(file: BinaryIO) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Every step taken back again and compared: for finding solves that fail silently."""
+"""Every step is reversed and compared with its start, to find solves that fail silently."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kcons.steppers.stepper import Listed, Stepper, retold
 
 
 class ReversibilityCheck(Listed):
-    """A stepper that takes every step back again and compares; for finding solves that fail silently.
+    """A stepper that reverses every step and compares with its start, to find solves that fail silently.
 
     Projections have more than one solution when a step is large; a step that lands on another branch than the
     one it came from is no longer reversible, and long runs with such steps are wrong without any other sign.

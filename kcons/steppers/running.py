@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
+from kcons.constraints.arguments import refuse_units
 from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.rattle import Rattle
@@ -49,7 +50,7 @@ def run(
     Raises
     ------
     InputError
-        Negative `steps` or `check_every`, or `every` below 1.
+        Negative `steps` or `check_every`, or `every` below 1; a `dt` with units.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -60,6 +61,7 @@ def run(
     """
     if steps < 0 or every < 1:
         raise InputError(f"steps is {steps} and every {every}; give steps >= 0 and every >= 1", item="steps")
+    refuse_units(dt, "dt")
     if stepper is None:
         stepper = Rattle()
     stepper.check(system)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from kcons.constraints.arguments import refuse_units
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -70,6 +71,7 @@ class Langevin(Listed):
         conserve_momentum: bool = False,
     ) -> None:
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
+        refuse_units(friction, "friction")
         if np.ndim(friction) or not (math.isfinite(friction) and friction >= 0):
             raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
         if int(substeps) != substeps or substeps < 1:

@@ -1,4 +1,4 @@
-"""Bonds for systems that come without: by distance and covalent radii, one way for all MD engines."""
+"""Bonds for systems that have none: by distance and covalent radii, the same for all MD engines."""
 
 from __future__ import annotations
 

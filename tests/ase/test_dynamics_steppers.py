@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -90,18 +91,22 @@ def skate_case():
     return atoms, Field, {"constraints": KnifeEdge(0, 1, [0, 0, 1])}, 24 * FS
 
 
+def final(case, by, n) -> np.ndarray:
+    """Positions and velocities at the end, reached in n steps."""
+    atoms, calculator, options, time = case()
+    atoms.calc = calculator()
+    ConstrainedDynamics(atoms, time / n, by, **options).run(n)
+    return np.concatenate([atoms.positions, atoms.get_velocities() * FS])
+
+
+@cache
+def exact(case) -> np.ndarray:
+    return final(case, KahanLi6() if case is skate_case else BlanesMoan6(), 48)
+
+
 def errors(case, stepper, numbers) -> np.ndarray:
     """Errors of positions and velocities after the same time by different numbers of steps."""
-    start, calculator, options, time = case()
-
-    def final(by, n):
-        atoms = start.copy()
-        atoms.calc = calculator()
-        ConstrainedDynamics(atoms, time / n, by, **options).run(n)
-        return np.concatenate([atoms.positions, atoms.get_velocities() * FS])
-
-    exact = final(KahanLi6(), 4 * max(numbers)) if case is skate_case else final(BlanesMoan6(), 48)
-    return np.array([np.abs(final(stepper, n) - exact).max() for n in numbers])
+    return np.array([np.abs(final(case, stepper, n) - exact(case)).max() for n in numbers])
 
 
 @pytest.mark.parametrize("case", [ethanol_case, rotating_case, driven_case], ids=lambda c: c.__name__)

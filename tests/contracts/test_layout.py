@@ -102,7 +102,6 @@ LARGER = {
     "openmm/carried/carried_constraints.py: lines of CarriedConstraints": 385,
     "openmm/collective/collective_rows.py: lines of CollectiveRows": 383,
     "openmm/collective/context_rows.py: lines of ContextRows": 339,
-    "openmm/collective/row_program.py: lines of GroupRows": 304,
     "openmm/ensembles/isokinetic_ensemble.py: lines of Isokinetic": 338,
     "openmm/integrator/guard.py: lines of Guard": 346,
     "openmm/integrator/projected.py: lines of ProjectedIntegrator": 443,

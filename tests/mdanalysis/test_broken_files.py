@@ -277,7 +277,7 @@ def test_targets_from_a_file(tmp_path, x):
         ("[[length]]\nelements=['O','H']\natoms=['O','H']\nvalue=1", "either atoms or elements"),
         ("[[length]]\nelements=['O','H']\nvalue=-1", "positive length"),
         ("[[angle]]\nelements=['H','O','H']\nvalue=190", "between 0 and 180"),
-        ("[[length]]\nelements=['O','H']\nvalue=1\nforce=2", "knows residue"),
+        ("[[length]]\nelements=['O','H']\nvalue=1\nforce=2", "residue is optional"),
     ],
 )
 def test_parameter_files_that_are_wrong(tmp_path, text, match):

@@ -61,7 +61,8 @@ def test_every_kind_is_held(rows, scheme):
     part = hold(system, rows, CROSS)
     context = context_of(system, ProjectedIntegrator(0.001, scheme, parts=[part]))
     start(context, part, CROSS)
-    context.getIntegrator().step(200)
+    # Drifts with velocity rows are solved by iteration, and a step of the composition has five.
+    context.getIntegrator().step(60 if scheme == "suzuki4" and "KnifeEdge" in {row.family for row in rows} else 200)
     part.check(context)
     report = part.report(context)
     assert report.residual <= 1e-12
@@ -69,8 +70,8 @@ def test_every_kind_is_held(rows, scheme):
     assert np.abs(state_of(context)[0] - CROSS).max() > 0.01
 
 
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4", "blanes-moan6"])
-def test_velocity_rows_follow_the_core(scheme):
+@pytest.mark.parametrize(("scheme", "steps"), [("rattle", 20), ("suzuki4", 8), ("blanes-moan6", 3)])
+def test_velocity_rows_follow_the_core(scheme, steps):
     rows = KINDS["knife edge"]
     masses = [12.0, 1.0, 14.0, 16.0, 32.0, 4.0]
     system = free(masses, pull(20.0, 6))
@@ -81,9 +82,9 @@ def test_velocity_rows_follow_the_core(scheme):
     x, v = state_of(context)
     core = System(Motion(ConstraintSet(rows, CROSS, masses), CROSS), lambda x, t: np.tile([0, 0, 20.0], (6, 1)))
     state = core.initial_state(x, v)
-    for _ in range(20):
+    for _ in range(steps):
         state = integrator.scheme.step(core, state, 0.01)
-    integrator.step(20)
+    integrator.step(steps)
     assert np.abs(state_of(context)[0] - state.positions).max() <= 1e-11
 
 

@@ -69,12 +69,12 @@ def test_reversible(kind, scheme):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "blanes-moan6a"])
-def test_the_steps_are_those_of_the_core(kind, scheme):
+@pytest.mark.parametrize(("scheme", "steps"), [("rattle", 20), ("geodesic", 20), ("blanes-moan6a", 4)])
+def test_the_steps_are_those_of_the_core(kind, scheme, steps):
     integrator, context = on_surface(kind, scheme, 0.04, atoms=(0, 2))
-    integrator.step(20)
+    integrator.step(steps)
     x, v = state_of(context)
-    x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, 20, atoms=(0, 2))
+    x_core, v_core = core_run(kind, SCHEMES[scheme](), 0.04, steps, atoms=(0, 2))
     assert np.abs(x - x_core).max() <= 1e-12
     assert np.abs(v - v_core).max() <= 1e-12
 

@@ -1,4 +1,4 @@
-"""What a program is: it takes a `Problem` and is watched on its way."""
+"""The contract of a program: it runs a `Problem` and shows every frame to a watcher."""
 
 from __future__ import annotations
 

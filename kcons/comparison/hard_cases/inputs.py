@@ -1,4 +1,4 @@
-"""Input that means nothing: contradictions, bad masses, coincident atoms, NaN, bad indices, other precision."""
+"""Invalid input: contradictions, bad masses, coincident atoms, NaN, bad indices, other precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All cases through all programs, kept as they come in, so that an interrupted study goes on where it was."""
+"""All cases through all programs; each result is saved at once, so that an interrupted study can be resumed."""
 
 from __future__ import annotations
 

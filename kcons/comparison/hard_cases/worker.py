@@ -1,4 +1,4 @@
-"""Cells run in a process of their own, which may hang or die without taking the table along."""
+"""Cells of the table run in a child process: where one hangs or dies, the study continues."""
 
 from __future__ import annotations
 

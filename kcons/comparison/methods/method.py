@@ -105,7 +105,7 @@ class Run(ABC):
         """One step, or as many as `steps` then says."""
 
     def march(self, steps: int) -> None:
-        """So many steps that nobody looks at: `advance` as often, without what it does for onlookers."""
+        """Make `steps` steps as `advance` does, without recording anything between them."""
         for _ in range(steps):
             self.advance()
 
@@ -114,10 +114,10 @@ class Run(ABC):
         raise NotImplementedError
 
     def settle(self) -> None:
-        """After `rewind`: whatever the first steps from there would set up lazily, at the price of being as many on."""
+        """After `rewind`: make the first steps, which set up what is set up lazily."""
 
     def stretch(self, step_seconds: float, pass_seconds: float) -> int:
-        """How many steps to time at a stretch, though the horizon may be nearer: a run is longer.
+        """How many steps to time in one call; they may lead beyond the horizon.
 
         Parameters
         ----------
@@ -200,7 +200,8 @@ class Method(ABC):
     host : str
         Whose it is: 'kcons', 'ase', 'scipy', 'openmm' or 'peer'.
     guest : bool
-        Whether it runs, unless methods are named, wherever it is able to, and is not mentioned elsewhere.
+        Whether it also runs, unless methods are named, with test systems of other MD engines. Where it cannot
+        run, tables leave it out.
     follows : bool
         Whether it is to follow the reference trajectory. A thermostat does not: no error can be stated.
     remark : str
@@ -208,7 +209,7 @@ class Method(ABC):
     damps : bool
         Whether it can run test systems with friction.
     marches : bool
-        Of the class: whether its runs can `march` and `rewind`, so that steps can be timed with nobody looking on.
+        Of the class: whether its runs can `march` and `rewind`, so that steps can be timed without observation.
         Otherwise whole runs are timed.
     """
 
@@ -228,7 +229,7 @@ class Method(ABC):
     def refuses(self, test_system: TestSystem) -> str | None:
         """Why this method cannot run the test system, or None."""
         if test_system.friction and self.holds and not self.damps:
-            return "it knows no friction"
+            return "it has no friction"
         return test_system.refusals.get(self.name)
 
     def settings(self, test_system: TestSystem) -> tuple[float, ...]:

@@ -175,7 +175,7 @@ class _ExtrapolatedRun(OfStates):
 
 
 class Extrapolated(Method):
-    """`kcons.steppers.Extrapolation`, by itself of the size and order of its steps; its settings are tolerances."""
+    """`kcons.steppers.Extrapolation`, which chooses size and order of its steps; its settings are tolerances."""
 
     def start(self, test_system: TestSystem, setting: float) -> Run:
         return _ExtrapolatedRun(test_system, setting)
@@ -386,9 +386,9 @@ def chosen(names: Iterable[str] | None = None, test_system: TestSystem | None = 
 
 
 def usual(test_system: TestSystem | None = None) -> list[Method]:
-    """What runs where no method is named: the usual ones, of guests only those that can run the test system.
+    """Methods that run by default, of guests only those that can run the test system.
 
-    All of OpenMM's on test systems that are at home there, and nothing else.
+    For test systems whose forces are OpenMM's, all usual methods of OpenMM that can run them, and no others.
     """
     found = [method for method in METHODS.values() if method.usual]
     if test_system is not None and test_system.openmm is not None and test_system.openmm.home:

@@ -91,7 +91,7 @@ def digest(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def put_into(result: dict[str, Any], path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add pieces to results that are there already, without those made quickly.
+    """Add pieces to existing results; pieces of quick runs are left out.
 
     Returns
     -------

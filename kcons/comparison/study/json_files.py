@@ -3,38 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from kcons.errors import InputError
-from kcons.steppers.files import in_one_piece
+from kcons.steppers.files import in_one_piece, plain, text
 
-
-def plain(value: Any, digits: int | None = None) -> Any:
-    """What JSON has: lists, keys that are text, and None for NaN and infinity.
-
-    Parameters
-    ----------
-    value
-    digits : int, optional
-        Significant digits that are kept of a number.
-    """
-    if isinstance(value, Mapping):
-        return {str(key): plain(item, digits) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item, digits) for item in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return value if digits is None else float(f"{value:.{digits}g}")
-    return value
-
-
-def text(data: Any, indent: int | None = 1) -> str:
-    """Data as JSON."""
-    return json.dumps(plain(data), indent=indent, ensure_ascii=False, allow_nan=False)
+__all__ = ["plain", "read", "text", "write"]
 
 
 def write(path: str | Path, data: Any, indent: int | None = 1) -> Path:

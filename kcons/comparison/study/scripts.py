@@ -1,4 +1,4 @@
-"""What scripts share that measure and print: calls timed in turn, tables, and the options by which they are run."""
+"""Shared parts of scripts that measure and print: calls timed in turn, tables, command line options."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def in_turn(
     calls: Mapping[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = process_time
 ) -> dict[str, list[float]]:
-    """Seconds of each call, `repeats` times, one after the other: what disturbs the machine meets all of them.
+    """Seconds of each call, `repeats` times, in turn: disturbances of the machine then affect all calls alike.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A study: named pieces of work, kept in a file as they come in.
+"""A study: named pieces of work, each saved in a file as soon as it is done.
 
 What was interrupted goes on where it was, as long as the code, the test systems and the settings are the same. However
 a study ends, what is done is in its file, and its progress bars are gone.
@@ -20,7 +20,7 @@ Found = TypeVar("Found")
 
 
 class Watcher:
-    """Told what is going on. This one keeps silent; the command line shows progress bars."""
+    """Receives progress. This one shows nothing; that of the command line shows progress bars."""
 
     def begin(self, what: str, total: float) -> None:
         """A piece of work of `total` units starts."""
@@ -32,7 +32,7 @@ class Watcher:
         """It is over."""
 
     def overall(self, what: str, done: float, total: float) -> None:
-        """A part of something larger starts; of its `total` expected seconds `done` are over."""
+        """A part of a longer run starts; `done` of the `total` expected seconds of the run have passed."""
 
     @contextmanager
     def piece(self, what: str, total: float) -> Iterator[None]:

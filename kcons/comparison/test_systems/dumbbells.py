@@ -74,7 +74,8 @@ def build(size: int = 2, seed: int = 1) -> TestSystem:
         return _collision()
     if size < SMALLEST:
         raise InputError(
-            f"{size} dumbbells are neither a collision nor a box; use 2, or at least {SMALLEST}", item="size"
+            f"there is no test system of {size} dumbbells; use 2 (a collision), or at least {SMALLEST} (a box)",
+            item="size",
         )
     return _box(size, seed)
 

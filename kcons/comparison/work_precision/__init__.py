@@ -1,7 +1,7 @@
 """Cost against error: measured, judged, shown.
 
 - `measurement`: what was found, as plain data
-- `timing_rounds`: times of steps that nobody looks at
+- `timing_rounds`: times of steps without observation
 - `measure`: a test system run through methods
 - `fronts`: the Pareto front
 - `recommendation`: which method and step for a wanted error

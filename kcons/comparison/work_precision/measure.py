@@ -2,7 +2,7 @@
 
 Every method starts from the same state with the same forces and is compared with the same reference
 solution at the horizon. Times are medians over steps, after the kernels have been compiled and loaded; with `rounds`,
-those of short runs are medians over rounds in which nobody looks on (`kcons.comparison.work_precision.timing_rounds`).
+those of short runs are medians over rounds without observation (`kcons.comparison.work_precision.timing_rounds`).
 """
 
 from __future__ import annotations

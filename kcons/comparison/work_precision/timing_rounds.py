@@ -1,4 +1,4 @@
-"""Times of steps that nobody looks at, in rounds: every method once, then all again.
+"""Times of steps without observation, in rounds: every method once, then all again.
 
 A run of few short steps that is observed after each tells the time of cold caches and of the observer. Here a method
 starts afresh in every round, warms up, and makes its planned steps again and again until enough of them are timed. The

@@ -14,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from kcons.errors import OccupiedError
+from kcons.steppers.files import in_one_piece
+from kcons.steppers.files import text as as_json
 
 if TYPE_CHECKING:
     from kcons.mdanalysis.check.result import CheckResult
@@ -208,9 +210,7 @@ def _put(
             raise OccupiedError(
                 f"another check writes into {folder}; give another folder (--out)", item="out"
             ) from None
-    whole = json.dumps(
-        _finite({"file": str(Path(trajectory).resolve()), **data}), indent=1, ensure_ascii=False, allow_nan=False
-    )
+    whole = as_json({"file": str(Path(trajectory).resolve()), **data})
     # Names of files need not be text; in JSON the replacement is what stands for such a character.
     contents = [f"{whole}\n".encode(errors="backslashreplace"), picture, text and f"{text}\n".encode(errors="replace")]
     written = []
@@ -218,23 +218,7 @@ def _put(
         if not content:
             path.unlink(missing_ok=True)
             continue
-        unfinished = path.with_name(path.name + ".unfinished")
-        unfinished.unlink(missing_ok=True)
-        try:
-            # Neither the one nor the other follows a link.
-            with unfinished.open("xb") as file:
-                file.write(content)
-            unfinished.replace(path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with in_one_piece(path) as file:
+            file.write(content)
         written.append(path)
     return written
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN: it becomes null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

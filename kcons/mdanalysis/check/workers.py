@@ -33,7 +33,7 @@ class BackendThreads(BackendBase):  # type: ignore[misc]
 
 
 def with_backend(options: dict[str, Any], threads: bool) -> dict[str, Any]:
-    """Options of a run, for MDAnalysis, which knows nothing of threads.
+    """Options for MDAnalysis' `run`, which has no threads: `BackendThreads` in their place.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def with_backend(options: dict[str, Any], threads: bool) -> dict[str, Any]:
 
 @contextmanager
 def inherited(analysis: Any, backend: Any) -> Iterator[None]:
-    """Processes forked within find the analysis in their memory: sending it costs more than many a check.
+    """Processes forked within inherit the analysis; sending it to them can take longer than the check itself.
 
     Does nothing where processes are not forked, and for other backends than MDAnalysis' own processes.
     """

@@ -1,4 +1,4 @@
-"""Positions that are far off the constraints: the way onto them, for starts and not for time steps."""
+"""Positions that are far off, brought onto the constraints; for starts, not for time steps."""
 
 from __future__ import annotations
 

@@ -37,6 +37,7 @@ from kcons.openmm.carried.passage import Passage
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
 from kcons.steppers.stages.compensated_steps import Point
 from kcons.steppers.stages.drifts import NonholonomicFlight
@@ -65,9 +66,10 @@ class Engine:
         masses: FloatArray,
         cell: FloatArray | None,
         degenerate: Literal["convert", "raise"],
-        time: float,
+        time: unit.Quantity | float,
     ) -> None:
         self.key = key
+        time = number(time, unit.picosecond, "time")
         held = ConstraintSet(constraints, positions, masses, cell=cell, time=time)
         self.motion = Motion(held, positions, degenerate=degenerate, time=time)
         self.masses, self.cell = masses, cell

@@ -44,6 +44,7 @@ from kcons.openmm.carried.requirements import (
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.quantities import accepted
 from kcons.openmm.topology import bonds_of
 
 
@@ -58,7 +59,7 @@ class CarriedConstraints(Part):
         Masses and periodicity are taken from it; it is not changed before `add_to`. Particles without mass stay
         where they are.
     constraints : Constraint or iterable of Constraint
-        What is held: lengths in nm, times in ps, masses in dalton.
+        What is held: Quantities, or numbers of nm, ps, dalton, radian. Functions get numbers and may return either.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints, in nm if without unit.
     periodic : bool, optional
@@ -93,9 +94,9 @@ class CarriedConstraints(Part):
         *,
         periodic: bool | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
-        time: float = 0.0,
+        time: unit.Quantity | float = 0.0,
     ) -> None:
-        given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        given = tuple(accepted((constraints,) if isinstance(constraints, Constraint) else constraints))
         if sum(c.n_rows for c in given if isinstance(c, Constraint)) == 0 and all(
             isinstance(c, Constraint) for c in given
         ):

@@ -91,7 +91,7 @@ def hold(
     periodic: bool | None = None,
     degenerate: Literal["convert", "raise"] = "convert",
     join: bool = False,
-    time: float = 0.0,
+    time: unit.Quantity | float = 0.0,
 ) -> CarriedConstraints:
     """Hold rows of kcons in a System: all that has to be done before its Context is made.
 
@@ -103,7 +103,8 @@ def hold(
     system : openmm.System
         Changed in place.
     constraints : Constraint or iterable of Constraint
-        What is held, in nm, ps, dalton, radian. Empty if only constraints of the System are to move over.
+        What is held: Quantities, or plain numbers of nm, ps, dalton, radian. Empty if only constraints of the System
+        are to move over.
     positions : Quantity or array_like, shape (n_particles, 3)
         On or near the constraints; targets left at None are taken from them.
     take : 'touched', 'all', 'hbonds' or iterable of int

@@ -1,9 +1,9 @@
-"""What becomes of positions and corrections on their way through OpenMM.
+"""How OpenMM rounds positions and corrections that pass between it and the engine.
 
 On Reference and CPU they are doubles. GPUs keep forces as multiples of 2^-32, and CustomIntegrator reads them divided
 by 2^32 - 1. In mixed precision positions are pairs of single numbers, 48 bits: a PythonForce of all particles gets
-both, one of some particles only the first. What it returns becomes single numbers: corrections lose up to 6e-8 of
-themselves. Who knows what arrives knows where OpenMM's particles are, to rounding.
+both, one of some particles only the first. What it returns becomes single numbers: corrections have
+relative errors up to 6e-8. From the rounded correction the engine knows the positions in OpenMM, to rounding.
 """
 
 from __future__ import annotations

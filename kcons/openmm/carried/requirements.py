@@ -17,6 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.quantities import array
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.
 COARSE = 1e-11
@@ -24,13 +25,7 @@ COARSE = 1e-11
 
 def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
     """Positions as an array of shape (n, 3), nm."""
-    plain: Any = positions
-    if unit.is_quantity(plain):
-        plain = plain.value_in_unit(unit.nanometer)
-    try:
-        x = np.array(plain, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"positions are no array of numbers: {error}", item="positions") from None
+    x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
     return x
@@ -42,7 +37,7 @@ def masses_of(system: openmm.System) -> FloatArray:
 
 
 def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:
-    """What OpenMM does not move is fixed."""
+    """The constraints, with `FixedAtoms` for particles without mass, which OpenMM does not move."""
     if not all(isinstance(item, Constraint) for item in given):
         return given  # ConstraintSet says what is wrong
     used = [item.atoms.ravel() for item in given]
@@ -69,7 +64,7 @@ def refuse_virtual_sites(system: openmm.System, atoms: IntArray, masses: FloatAr
 
 
 def refuse_single_precision(precision: Precision) -> None:
-    """GPUs hand positions to PythonForces as they keep them."""
+    """Refuse single precision: GPUs hand positions to PythonForces in the precision in which they store them."""
     if precision.name == "single":
         raise UnsupportedError(
             f"{precision} hands positions to rows of kcons' constraint objects that are too coarse for them; make the "
@@ -78,7 +73,7 @@ def refuse_single_precision(precision: Precision) -> None:
 
 
 def refuse_some_particles(force: openmm.PythonForce, precision: Precision) -> None:
-    """Of some particles, mixed precision hands over single numbers."""
+    """Refuse forces on some particles in mixed precision: OpenMM hands over their positions in single precision."""
     if precision.name == "mixed" and force.getParticles():
         raise UnsupportedError(
             f"the forces that carry the rows were made where no GPU was, and {precision} would hand over positions "
@@ -98,7 +93,7 @@ def refuse_shared_atoms(system: openmm.System, touched: set[int]) -> None:
 
 
 def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
-    """Warn of coordinates so large that their rounding becomes velocity; nobody else would see it."""
+    """Warn of coordinates so large that their rounding adds noise to the velocities."""
     if grain <= COARSE * scale:
         return False
     warnings.warn(
@@ -110,7 +105,7 @@ def warned_of_rounding(reach: float, grain: float, scale: float) -> bool:
 
 
 def refuse_agents(system: openmm.System, held: ConstraintSet, molecules: Callable[[], Any]) -> None:
-    """Barostats and others that move particles between steps must not move them off the rows."""
+    """Refuse barostats and other forces that move particles off the rows between steps."""
     bound = next((item for item in held.constraints if not item.translation_invariant), None)
     for force in system.getForces():
         name = type(force).__name__

@@ -1,6 +1,8 @@
 """Collective coordinates held on OpenMM's own platforms.
 
 - `small_algebra`: small systems of equations in the language of CustomIntegrator
+- `forecast`: pushes that are foreseen
+- `clock`: the time of targets that move
 - `row_forces`: values and gradients of rows by OpenMM's forces
 - `plain_rows`: rows that are internal coordinates, as constraints of kcons
 - `context_rows`: the rows in a Context

@@ -115,8 +115,7 @@ class CollectiveRows(GroupRows):
             raise InputError(
                 f"tolerance {tolerance} and max_iterations {max_iterations} must be positive", item="tolerance"
             )
-        self.tolerance = float(tolerance)
-        self.max_iterations = int(max_iterations)
+        self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
         self.n_rows = len(given)
         forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
         self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]
@@ -225,6 +224,7 @@ class CollectiveRows(GroupRows):
             self.tolerance = max(TOLERANCE, precision.forces)
             program.set(f"tolerance{self.code}", self.tolerance)
         program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
+        self._forecast.take_precision(program, precision)
 
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
@@ -250,8 +250,8 @@ class CollectiveRows(GroupRows):
             )
         if scheme is not None and not isinstance(scheme, Rattle | Composition):
             raise UnsupportedError(
-                f"{scheme!r} gives no multipliers at a point by the way; read mean_multipliers(integrator), the mean "
-                "over the last step, or multipliers_at(context), those at the state of a context"
+                f"{scheme!r} has no multipliers at a single point of the step; read mean_multipliers(integrator), the "
+                "mean over the last step, or multipliers_at(context), those at the state of a context"
             )
         return self._read(integrator, "lambda")
 

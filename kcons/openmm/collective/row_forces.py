@@ -54,15 +54,6 @@ class Row:
     name: str = ""
 
 
-#: What a coordinate can be whose unit its Force does not tell.
-_POSSIBLE = (
-    *(unit.nanometer**power for power in (1, 2, 3, 4, 6, -1, -2, -3, -6)),
-    unit.radian,
-    unit.dimensionless,
-    unit.kilojoule_per_mole,
-)
-
-
 def number(value: object, item: str, of: unit.Unit | None = None, per: unit.Unit = unit.dimensionless) -> float:
     """A finite number in nm, ps, radian, kJ/mol from a number or a Quantity.
 
@@ -72,8 +63,8 @@ def number(value: object, item: str, of: unit.Unit | None = None, per: unit.Unit
     item : str
         For messages.
     of : Unit, optional
-        What a Quantity must be a multiple of; of a length or a power of it, an angle, a plain number or an energy if
-        that is not known.
+        What a Quantity must be a multiple of; if that is not known, of what is made of lengths, angles, masses, charges
+        and energies.
     per : Unit
         What that is divided by.
 
@@ -83,12 +74,11 @@ def number(value: object, item: str, of: unit.Unit | None = None, per: unit.Unit
         It is neither, not finite, or of another unit.
     """
     if unit.is_quantity(value):
-        possible = [one / per for one in ((of,) if of is not None else _POSSIBLE)]
-        fitting = next((one for one in possible if value.unit.is_compatible(one)), None)  # type: ignore[attr-defined]
-        if fitting is None:
-            wanted = f"in {possible[0]}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
+        fits = _may_be_a_coordinate(value.unit * per) if of is None else value.unit.is_compatible(of / per)  # type: ignore[attr-defined]
+        if not fits:
+            wanted = f"in {of / per}" if of is not None else "in nm, radian, kJ/mol or what the coordinate is in"
             raise InputError(f"{item} is {value}, and the coordinate is of another kind; give it {wanted}", item=item)
-        value = value.value_in_unit(fitting)  # type: ignore[attr-defined]
+        value = value.value_in_unit_system(unit.md_unit_system)  # type: ignore[attr-defined]
     try:
         result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -96,6 +86,13 @@ def number(value: object, item: str, of: unit.Unit | None = None, per: unit.Unit
     if not math.isfinite(result):
         raise InputError(f"{item} is {result}; give a finite number", item=item)
     return result
+
+
+def _may_be_a_coordinate(of: unit.Unit) -> bool:
+    """Whether Forces can have such energies: time is there only as a part of energies."""
+    powers = {dimension.name: power for dimension, power in of.iter_base_dimensions() if power}
+    mass, time = powers.pop("mass", 0), powers.pop("time", 0)
+    return powers.keys() <= {"length", "angle", "amount", "charge"} and time in (0, -2 * mass)
 
 
 # -- terms ------------------------------------------------------------------------------------------

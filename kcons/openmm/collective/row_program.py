@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import openmm
 
+from kcons.openmm.collective.clock import Clock
+from kcons.openmm.collective.forecast import Forecast, Measured
 from kcons.openmm.collective.small_algebra import Block
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
@@ -94,11 +96,9 @@ class GroupRows(Part):
         p.number(f"held{c}", "whether the rows hold")
         p.number(f"bad_sum{c}", "not a number if a multiplier is none")
         if self._drives:
-            p.number(f"clock{c}", "time of the targets")
-            p.number(f"clock_start{c}", "the same at the start of the step")
-            p.number(f"clock_end{c}", "the same at its end")
-            p.number(f"pending{c}", "whether a step began")
-            p.number(f"step_start{c}", "good_steps when it began")
+            Clock(c).declare(p)
+        self._forecast = (Forecast if self.lean and alone else Measured)(c, self._blocks, self._meet)
+        self._forecast.declare(p)
         self._base, self._start = "xu", "x_last"
         if not alone:
             self._base = p.vector(f"base{c}", "positions as other parts leave them")
@@ -107,7 +107,7 @@ class GroupRows(Part):
             if not self._single:
                 self._start = p.vector(f"start{c}", "positions at the start of the drift")
 
-    def _gradients(self, p: Program, *, sizes: bool, slopes: bool) -> None:
+    def _gradients(self, p: Program, *, sizes: bool, slopes: bool, products: bool = True) -> None:
         """row = M_par^+ gradient, its Gram matrix and the inverse of that, at x."""
         keep = self.meets_system and not (self.lean and not slopes)
         if keep:
@@ -125,18 +125,15 @@ class GroupRows(Part):
                     p.sum(self._of("own", k), f"f{group}*f{group}/m", "its size without those constraints")
             else:
                 p.each(row, f"-f{group}/m", f"M^-1 gradient of {self.names[k]}")
-            for block in self._blocks:
-                if k in block.rows:
-                    for j in block.rows:
-                        if j <= k and self._meet[k][j]:
-                            p.sum(block.gram(k, j), f"-f{group}*{self._of('row', j)}", "Gram matrix")
-                    if sizes and not self.meets_system:
-                        p.let(self._of("own", k), block.gram(k, k), "its size")
         if keep and not slopes:
             p.each("v", f"v_kept{self.code}", "v again")
-        p.let(f"singular{self.code}", f"select(failed, singular{self.code}, 0)", "nothing wrong yet")
-        for block in self._blocks:
-            block.invert(p, f"singular{self.code}")
+        if not products:
+            return
+        self._forecast.products(p)
+        for k in range(self.n_rows) if sizes and not self.meets_system else ():
+            gram = next(block.gram(k, k) for block in self._blocks if k in block.rows)
+            p.let(self._of("own", k), gram, "its size")
+        self._forecast.invert(p)
 
     def begin(self, p: Program) -> None:
         """Gradients where x is not where the last step ended."""
@@ -146,12 +143,14 @@ class GroupRows(Part):
 
     def renew(self, p: Program) -> None:
         """Gradients after a step without `project`. Their sizes, which tell what a small pivot is, may be old."""
-        self._gradients_kept(p, sizes=False)
+        self._gradients(p, sizes=False, slopes=False, products=False)
+        self._forecast.renew(p)
+        self._refuse_dependent(p)
         p.let(f"known{self.code}", "0", "no projection was here")
 
     def remember(self, p: Program) -> None:
         if self._drives:
-            self._set_clock(p)
+            Clock(self.code).begin(p)
         if self._leapfrog:  # no velocity projection has computed them
             self._gradients_kept(p)
         if self._start == f"start{self.code}":
@@ -160,55 +159,44 @@ class GroupRows(Part):
     def _gradients_kept(self, p: Program, sizes: bool = True) -> None:
         """Gradients for the drift; v stays."""
         self._gradients(p, sizes=sizes, slopes=False)
+        self._refuse_dependent(p)
+
+    def _refuse_dependent(self, p: Program) -> None:
         singular = f"select(singular{self.code}, {self.code}, 0)"
         p.let("failed", f"select(failed, failed, {singular})", "rows must be independent")
 
     def _clock(self, variables: dict[str, float]) -> float:
-        if not self._drives:
-            return 0.0
-        c = self.code
-        kept = variables[f"pending{c}"] and variables[f"step_start{c}"] != variables["good_steps"]
-        return variables[f"clock_end{c}" if kept else f"clock_start{c}"]
+        return Clock(self.code).now(variables) if self._drives else 0.0
 
-    def _set_clock(self, p: Program) -> None:
-        """At the first drift of a step. A step that failed is not counted in good_steps, and its time is not kept."""
-        c = self.code
-        p.let(f"held{c}", "delta(stage-first_stage)", "does a step begin?")
-        kept = f"held{c}*pending{c}*(1-{_is(f'step_start{c}', 'good_steps')})"
-        p.let(f"clock_start{c}", f"select({kept}, clock_end{c}, clock_start{c})", "the step before was kept")
-        p.let(f"pending{c}", f"select({kept}, 0, pending{c})", "and is over")
-        p.let(f"clock{c}", f"select(held{c}, clock_start{c}, clock{c})", "time of the targets")
-        begins = f"held{c}*delta(first_stage)"
-        p.let(f"pending{c}", f"select({begins}, 1, pending{c})", "a step begins, and not constraints alone")
-        p.let(f"step_start{c}", f"select({begins}, good_steps, step_start{c})", "to see whether it is kept")
-        p.let(f"clock_end{c}", f"select({begins}, clock_start{c}+dt, clock_end{c})", "time at its end")
+    @property
+    def _pushes(self) -> str:
+        return "+".join(f"{self._of('push', k)}*{self._of('row', k)}" for k in range(self.n_rows))
+
+    def foresee(self, p: Program) -> str:
+        return self._forecast.foresee(p, self._pushes)
 
     def land(self, p: Program, h: str) -> None:
         c = self.code
         rows = range(self.n_rows)
         if self._drives:
-            p.let(f"clock{c}", f"clock{c}+select(first_stage, 0, {h})", "targets at the end of the drift")
+            Clock(c).drift(p, h)
         if self._base != "xu":
             p.each(self._base, "x", "positions as other parts leave them")
         p.let(f"iterations{c}", f"select(failed, iterations{c}, 0)", "a new solve")
         p.let(f"state{c}", "select(failed, 2, 1)", "after a failure only fly")
-        for k in rows:
-            p.let(self._of("push", k), "0", "first without")
-        pushes = "+".join(f"{self._of('push', k)}*{self._of('row', k)}" for k in rows)
         # The first pass is written apart: a block within the loop makes the set-up of OpenMM take 15 times as long.
         if self.meets_system:
             p.hold_positions("onto the constraints of the System")
         self._measure(p)
         self._decide(p, first=True)
-        with p.loop(f"state{c} > 0", "until the rows hold"):
-            if self.meets_system:
-                p.each("x", self._start, "constraints of the System refer to where the drift began")
-                p.hold_positions("refer to here")
-            p.each("x", f"{self._base}+{pushes}", "push along the rows")
-            if self.meets_system:
-                p.hold_positions("onto the constraints of the System")
+        with p.loop(f"step(2.5-state{c})*state{c} > 0", "until the rows hold"):
+            self._push(p)
             self._measure(p)
             self._decide(p, first=False)
+        if self._forecast.foresees:
+            with p.when(f"select(sparing{c}, state{c}, 0) > 2", "one more, which need not be measured", usual=True):
+                self._push(p)
+            p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
         begins = "delta(stage)"  # not so where constraints are applied alone
         for k in rows:
@@ -228,11 +216,20 @@ class GroupRows(Part):
                     f"select({begins}, {at}, {self._of('lambda', k)})",
                     "multiplier where the step began",
                 )
+        self._forecast.keep(p)
         p.let(f"known{c}", "0", "further drifts begin elsewhere")
         if not self._single:
             self._gradients_kept(p)
         if self._leapfrog:
             self._end_step(p)
+
+    def _push(self, p: Program) -> None:
+        if self.meets_system:
+            p.each("x", self._start, "constraints of the System refer to where the drift began")
+            p.hold_positions("refer to here")
+        p.each("x", f"{self._base}+{self._pushes}", "push along the rows")
+        if self.meets_system:
+            p.hold_positions("onto the constraints of the System")
 
     def _measure(self, p: Program) -> None:
         """sigma at x; what the last push did, for the quasi-Newton matrix."""
@@ -258,15 +255,16 @@ class GroupRows(Part):
         for block in () if first else self._blocks:
             block.update(p, f"delta(state{c}-1)*step(1e10-residual{c})")
         p.let(f"iterations{c}", f"iterations{c}+delta(state{c}-1)", "count")
+        going, again = self._forecast.judge(p, first)
         p.let(
             f"state{c}",
-            f"select(delta(state{c}-1)*(1-held{c}), select(step(1e10-residual{c})"
-            f"*step({self.max_iterations - 1}-iterations{c}), 1, 2), 0)",
+            f"select(delta(state{c}-1)*{going}, select(step(1e10-residual{c})"
+            f"*step({self.max_iterations - 1}-iterations{c}), {again}, 2), 0)",
             "done, or once more, or give up",
         )
         for block in self._blocks:
             for k in block.rows:
-                more = f"select(delta(state{c}-1), -({block.solve(k, 'sigma')}), 0)"
+                more = f"select(delta(state{c}-1)+delta(state{c}-3), -({block.solve(k, 'sigma')}), 0)"
                 p.let(self._of("more", k), more, "what is missing")
         for k in rows:
             push = self._of("push", k)
@@ -313,10 +311,6 @@ class GroupRows(Part):
             if self._rates[k] != 0.0:
                 done = f"{work}+select(first_stage+failed, 0, {self._rate(k)}*{impulse})"
                 p.let(work, done, "force times speed of the target")
-
-
-def _is(a: str, b: str) -> str:
-    return f"delta({a}-{b})"
 
 
 def _last_share(integrator: openmm.CustomIntegrator) -> float:

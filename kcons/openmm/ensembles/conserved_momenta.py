@@ -1,4 +1,4 @@
-"""Which momenta a System conserves, as far as its thermostats must know."""
+"""Momenta that a System conserves, and that its thermostat must not count."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def warn_of_conserved_momenta(momenta: Momenta, masses: FloatArray, v: FloatArra
 
 
 def conserved_momenta(integrator: Integrator, context: openmm.Context, momentum: Momentum) -> Momenta:
-    """Look at the forces and at what is held.
+    """Find conserved momenta from the forces and the constraints.
 
     Parameters
     ----------

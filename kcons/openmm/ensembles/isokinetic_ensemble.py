@@ -27,6 +27,7 @@ from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
+from kcons.openmm.quantities import number
 from kcons.steppers.compositions import Composition
 from kcons.steppers.operations import Kick, Operation, Project, Turn
 from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
@@ -227,7 +228,7 @@ class Isokinetic(Value):
         moving = [part for part in integrator.parts if part.driven]
         if moving:
             raise UnsupportedError(
-                f"the isokinetic thermostat in OpenMM needs targets that rest, and those of {moving[0]!r} move; use "
+                f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
         masses, v = self._masses(integrator, context), velocities_of(context)
@@ -271,7 +272,8 @@ class Isokinetic(Value):
         inside[atom_numbers(np.asarray(self.atoms), n)] = True
         if integrator.parts:
             raise UnsupportedError(
-                "a part of the particles can be thermostatted beside constraints of the System, not beside parts="
+                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
+                "thermostat all particles"
             )
         for k in range(system.getNumConstraints()):
             i, j, _ = system.getConstraintParameters(k)
@@ -377,17 +379,11 @@ def kelvins(temperature: unit.Quantity | float) -> float:
     InputError
         It is none.
     """
-    value = temperature
-    if unit.is_quantity(value):
-        if not value.unit.is_compatible(unit.kelvin):  # type: ignore[union-attr]
-            raise InputError(f"temperature is {temperature}; give it in K", item="temperature")
-        value = value.value_in_unit(unit.kelvin)  # type: ignore[union-attr]
-    if not 0 <= float(value) < math.inf:  # type: ignore[arg-type]
+    value = number(temperature, unit.kelvin, "temperature")
+    if not 0 <= value < math.inf:
         raise InputError(f"temperature is {temperature}; give a number of K, not below zero", item="temperature")
-    return float(value)  # type: ignore[arg-type]
+    return value
 
 
 def _energy(energy: unit.Quantity | float) -> float:
-    if unit.is_quantity(energy):
-        energy = energy.value_in_unit(unit.kilojoule_per_mole)  # type: ignore[union-attr]
-    return positive(energy, "kinetic_energy")  # type: ignore[arg-type]
+    return positive(number(energy, unit.kilojoule_per_mole, "kinetic_energy"), "kinetic_energy")

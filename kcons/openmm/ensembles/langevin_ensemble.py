@@ -10,6 +10,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.quantities import number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 
@@ -49,14 +50,10 @@ class Langevin(ConstantEnergy):
     friction: float
 
     def __init__(self, temperature: unit.Quantity | float, friction: unit.Quantity | float) -> None:
-        gamma = friction
-        if unit.is_quantity(gamma):
-            if not gamma.unit.is_compatible(unit.picosecond**-1):  # type: ignore[union-attr]
-                raise InputError(f"friction is {friction}; give it in 1/ps", item="friction")
-            gamma = gamma.value_in_unit(unit.picosecond**-1)  # type: ignore[union-attr]
-        if not 0 <= float(gamma) < float("inf"):  # type: ignore[arg-type]
+        gamma = number(friction, unit.picosecond**-1, "friction")
+        if not 0 <= gamma < float("inf"):
             raise InputError(f"friction is {friction}; give a number in 1/ps, not below zero", item="friction")
-        self._keep(temperature=kelvins(temperature), friction=float(gamma))  # type: ignore[arg-type]
+        self._keep(temperature=kelvins(temperature), friction=gamma)
 
     def __repr__(self) -> str:
         return f"Langevin({self.temperature:g} K, {self.friction:g}/ps)"

@@ -24,6 +24,7 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.step_variables import use
 from kcons.openmm.integrator.system_checks import removes_centre_of_mass_motion
+from kcons.openmm.quantities import number
 from kcons.steppers.operations import Operation
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import positive
@@ -287,12 +288,6 @@ def _before(name: str) -> str:
 
 def _per_picosecond(frequency: unit.Quantity | float) -> float:
     value: Any = frequency
-    if unit.is_quantity(value):
-        if value.unit.is_compatible(unit.picosecond):
-            value = 1 / value
-        if not value.unit.is_compatible(unit.picosecond**-1):
-            raise InputError(
-                f"frequency is {frequency}; give it in 1/ps, or the relaxation time in ps", item="frequency"
-            )
-        value = value.value_in_unit(unit.picosecond**-1)
-    return float(value)
+    if unit.is_quantity(value) and value.unit.is_compatible(unit.picosecond):
+        value = 1 / value
+    return number(value, unit.picosecond**-1, "frequency")

@@ -29,7 +29,7 @@ class Ensemble(Protocol):
         Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
         divided into calls then changes the rounding of the motion.
     owes : bool
-        Whether what ends a step may wait for the next one where nobody looks, see `open`.
+        Whether the end of a step may be left to the next step if the state is not read between; see `open`.
     """
 
     stays_tangent: bool
@@ -125,7 +125,7 @@ class Ensemble(Protocol):
 
 
 class Value:
-    """Attributes that are given once; equal if they are."""
+    """An object whose attributes never change; two are equal if their attributes are."""
 
     owes = False
 

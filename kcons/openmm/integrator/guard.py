@@ -1,10 +1,11 @@
-"""An integrator's view of the Context it belongs to: checks before and during a run, and the way back."""
+"""Checks of an integrator on its Context, before and during a run, and the return to the last good state."""
 
 from __future__ import annotations
 
 import gc
 import logging
 import weakref
+from itertools import chain
 from time import perf_counter
 from typing import Any
 
@@ -40,7 +41,8 @@ _REMEDY = "let kcons hold these constraints: take them out of the System and han
 def find_context(integrator: openmm.Integrator) -> openmm.Context | None:
     """The Context that was made with this integrator, alone or within a CompoundIntegrator."""
     address = int(integrator.this)
-    for thing in gc.get_objects():
+    # Young objects first: it was made just now in most cases, and a process has millions of old ones.
+    for thing in chain.from_iterable(gc.get_objects(generation) for generation in range(3)):
         if issubclass(type(thing), openmm.Context):
             owner = getattr(thing, "_integrator", None)
             if owner is integrator:
@@ -92,7 +94,7 @@ class Guard:
         self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
-        #: Whether velocities may lack half a kick and a projection while nobody looks: a thermostat would.
+        #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
         self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
         #: Whether the set-up was checked.
         self.started = False
@@ -364,8 +366,8 @@ class Guard:
         """Raise `CertificateError` for a miss that the solvers have not told of."""
         if miss is not None:
             raise CertificateError(
-                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers took them for right; take a smaller time "
-                "step, or see what changed the state or the rows behind their back",
+                f"{where}the {miss}, allowed {miss.allowed:.3g}. The solvers reported success; take a smaller time "
+                "step, or find what else changed the state or the constraints",
                 row=miss.row,
                 residual=abs(miss.off),
                 atoms=miss.atoms,

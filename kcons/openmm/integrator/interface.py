@@ -27,7 +27,7 @@ class Integrator(openmm.CustomIntegrator):
     spare : bool
         Whether checks come later where they would take more than a hundredth of the time.
     unseen : bool
-        Whether a Simulation is making steps: nobody looks at the end of a call without asking the Context.
+        Whether a Simulation is making steps: the state at the end of a call is then read through the Context only.
     """
 
     scheme: Splitting | None

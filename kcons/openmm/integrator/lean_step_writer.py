@@ -1,6 +1,6 @@
-"""The program of a step with what nobody looks at left out.
+"""The program of a step without operations that only serve a state that is read.
 
-Between two steps of one call of `step` nobody sees the velocities. The second half kick of a step and the first of the
+Between two steps of one call of `step` velocities are not read. The second half kick of a step and the first of the
 next are then one, and the velocities are not made tangent: the next drift starts where they would be, pushes along
 the same gradients, and absorbs what they have across. The motion is the same; see notes on RATTLE and leapfrog.
 
@@ -23,7 +23,7 @@ SHORT_DRIFT = 1 / 30
 
 
 class LeanStepWriter(StepWriter):
-    """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, leave out what nobody looks at.
+    """As `StepWriter`; velocity Verlet with parts, and the leapfrog without, omit what only readers of the state need.
 
     With an ensemble, velocity Verlet without parts does so, too: two kicks of half a step are made as one.
 

@@ -86,7 +86,7 @@ class Part(ABC):
     The same program applies the constraints alone, outside of steps (`applyConstraints`): the global `first_stage`
     is 0 within a step and not 0 then. Time does not pass then, and v is 0 in the drift.
 
-    Steps at whose end nobody looks may end without `project` (see `lean_step_writer`): the next drift absorbs
+    Steps after which the state is not read may end without `project` (see `lean_step_writer`): the next drift absorbs
     what v has across the rows. The integrator sets `lean` to True before `declare` where its program has such steps.
 
     Copies and pickles of an integrator copy its parts. `check` is the place to refuse what breaks the rows, see
@@ -152,6 +152,10 @@ class Part(ABC):
     @abstractmethod
     def project(self, program: Program) -> None:
         """Make v tangent to the rows at x."""
+
+    def foresee(self, program: Program) -> str:
+        """Before a drift: what the part adds to where it leads, before it has looked there; '' for nothing."""
+        return ""
 
     def land_alone(self, program: Program, u: str, h: str) -> None:
         """For parts that may be `alone`: the whole drift with velocity u, after `remember`; v gets its impulse, too."""

@@ -189,9 +189,12 @@ class Program:
             yield
 
     @contextmanager
-    def when(self, condition: str, words: str) -> Iterator[None]:
-        """Do what is written inside if `condition` holds; without anything inside, there is no block."""
-        with self._block("when", condition, f"if {condition}:", words):
+    def when(self, condition: str, words: str, *, usual: bool = False) -> Iterator[None]:
+        """Do what is written inside if `condition` holds; without anything inside, there is no block.
+
+        `usual` tells those who count steps that it mostly does where this depends on positions.
+        """
+        with self._block("usual" if usual else "when", condition, f"if {condition}:", words):
             yield
 
     @contextmanager

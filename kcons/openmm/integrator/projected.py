@@ -21,6 +21,7 @@ from kcons.openmm.integrator.schemes import LEAPFROG, to_scheme
 from kcons.openmm.integrator.states.calls import Calls
 from kcons.openmm.integrator.states.copies import as_projected, remade, settings_of
 from kcons.openmm.integrator.states.hearing import listen
+from kcons.openmm.integrator.states.serialization import ensemble_in, note_in, note_of, note_of_ensemble, read_plain
 from kcons.openmm.integrator.states.settings import Settings, picoseconds
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 from kcons.openmm.integrator.step_counts import StepCounts, count_step
@@ -67,7 +68,7 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
 
     Notes
     -----
-    Within a CompoundIntegrator, OpenMM runs the program without the checks of `step`: call `check()` yourself.
+    A member of a CompoundIntegrator makes its steps with all its checks, as long as kcons is imported.
     """
 
     #: Steps between two checks, if nothing else is asked for, ...
@@ -366,21 +367,42 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
 
     @classmethod
     def from_xml(cls, xml: str, **arguments: Any) -> ProjectedIntegrator:
-        """The integrator that XmlSerializer wrote; OpenMM itself reads it as a plain CustomIntegrator.
+        """The integrator that XmlSerializer wrote, with its parts.
+
+        Without parts XmlSerializer.deserialize does the same.
 
         Parameters
         ----------
         xml : str
             The text of the file.
         **arguments
-            `parts`, `check_every` and `ensemble`, which the file does not contain.
+            `parts`, which the file does not contain; `check_every` and `ensemble` where they are to be others.
 
         Raises
         ------
         InputError
             The file has no program of this class with these parts.
         """
-        return as_projected(cls, openmm.XmlSerializer.deserialize(xml), **arguments)
+        return cls._of_note(read_plain(xml), note_in(xml) or {}, **arguments)
+
+    def _note(self) -> dict[str, Any]:
+        return note_of(self, ensemble=note_of_ensemble(self.ensemble), parts=len(self.parts))
+
+    @classmethod
+    def _of_note(cls, plain: openmm.CustomIntegrator, note: dict[str, Any], **arguments: Any) -> ProjectedIntegrator:
+        if not note:
+            return as_projected(cls, plain, **arguments)
+        if note["parts"] and not arguments.get("parts"):
+            raise InputError(
+                f"the integrator in the file holds {note['parts']} parts, which no file contains; read it by "
+                "ProjectedIntegrator.from_xml(text, parts=[...]) with the same parts as when it was made",
+                item="parts",
+            )
+        made = as_projected(
+            cls, plain, **{"check_every": note["check_every"], "ensemble": ensemble_in(note), **arguments}
+        )
+        made.asked_tolerance = note["tolerance"]
+        return made
 
     @classmethod
     def as_projected(cls, integrator: openmm.CustomIntegrator, **arguments: Any) -> ProjectedIntegrator:

@@ -20,6 +20,7 @@ from kcons.openmm.integrator.guard import Guard, velocities_of
 from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.states.copies import settings_of
+from kcons.openmm.integrator.states.serialization import note_of
 from kcons.openmm.integrator.states.states_on_constraints import StatesOnConstraints
 
 #: What one execution of the program of `Ends` does.
@@ -311,6 +312,15 @@ class RattleIntegrator(StatesOnConstraints, openmm.CompoundIntegrator):
     def _making(self) -> tuple[Any, ...]:
         every = None if self._ends.spare else self.check_every
         return self._dt, self._ends.asked_tolerance, every, settings_of(self._ends)
+
+    def _note(self) -> dict[str, Any]:
+        return {**note_of(self._ends), "class": "RattleIntegrator"}
+
+    @classmethod
+    def _of_note(cls, plain: openmm.CompoundIntegrator, note: dict[str, Any]) -> RattleIntegrator:
+        ends = plain.getIntegrator(0)
+        settings = {"groups": ends.getIntegrationForceGroups()}
+        return _remade(ends.getStepSize()._value, note["tolerance"], note["check_every"], settings)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _remade, self._making()

@@ -13,6 +13,7 @@ from kcons.openmm.integrator.program import Program
 _GROUP = re.compile(r"\b(f|energy)(\d*)\b")
 #: Sums that are 0 in a step where all goes well and nobody has moved x.
 _QUIET = ("moved", "unsolved")
+_BLOCKS = ("loop", "when", "usual")
 
 
 @dataclass
@@ -41,7 +42,7 @@ class StepCounts:
 
 
 def count_step(program: Program, *, iterations: int = 2, **values: float) -> StepCounts:
-    """Count one step, after another, in which all solves converge and nobody has changed the state.
+    """Count one step, after two others, in which all solves converge and nobody has changed the state.
 
     Parameters
     ----------
@@ -53,9 +54,9 @@ def count_step(program: Program, *, iterations: int = 2, **values: float) -> Ste
     """
     walk = _Walk(program, iterations, {"dt": 0.001, "dt_last": 0.001, "stale": 0.0, **values})
     walk.run(0, len(program.operations))
-    # What the step before leaves behind matters.
-    walk.counts = StepCounts()
-    walk.run(0, len(program.operations))
+    for _ in range(2):  # what the steps before leave behind matters
+        walk.counts = StepCounts()
+        walk.run(0, len(program.operations))
     return walk.counts
 
 
@@ -100,7 +101,7 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 class _Walk:
     def __init__(self, program: Program, iterations: int, values: Mapping[str, float]) -> None:
         self.program, self.iterations = program, iterations
-        self.values: dict[str, Any] = {**program.numbers, **values}
+        self.values: dict[str, Any] = {**program.numbers, **program.settings, **values}
         self.counts = StepCounts()
         #: Group of the last evaluation, and whether it gave forces as well.
         self.group: str | None = None
@@ -113,7 +114,7 @@ class _Walk:
         k = first
         while k < end:
             kind, variable, expression = self.program.operations[k]
-            if kind in ("loop", "when"):
+            if kind in _BLOCKS:
                 close = self._close(k)
                 for _ in range(self.iterations if kind == "loop" else 1):
                     holds = self._value(expression)
@@ -133,7 +134,7 @@ class _Walk:
         depth = 0
         for j in range(k, len(self.program.operations)):
             kind = self.program.operations[j][0]
-            depth += (kind in ("loop", "when")) - (kind == "end")
+            depth += (kind in _BLOCKS) - (kind == "end")
             if depth == 0:
                 return j
         raise ValueError("a block without end")

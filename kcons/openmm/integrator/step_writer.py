@@ -261,8 +261,13 @@ class StepWriter:
     def _land(self, u: str, h: str) -> None:
         """Fly freely for h with velocities u, and go from there back onto all constraints."""
         p = self.program
-        p.each("x", f"x+{h}*{u}", "move freely (drift)")
-        p.each("xu", "x", "where that leads")
+        foreseen = "+".join(filter(None, [part.foresee(p) for part in self.parts]))
+        if foreseen:
+            p.each("xu", f"x+{h}*{u}", "where free motion leads (drift)")
+            p.each("x", f"xu+{foreseen}", "there, with what is foreseen")
+        else:
+            p.each("x", f"x+{h}*{u}", "move freely (drift)")
+            p.each("xu", "x", "where that leads")
         for part in self.parts:
             if not part.meets_system:
                 part.land(p, h)

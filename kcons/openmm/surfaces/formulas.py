@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 import openmm
 from numpy.typing import ArrayLike
+from openmm import unit
 
 from kcons.constraints import ImplicitSurface
+from kcons.constraints.arguments import ANY, without_units
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import SURFACE_NAME
+from kcons.openmm.quantities import number
 from kcons.openmm.surfaces.compiled_quadrics import free_groups
 from kcons.openmm.surfaces.surface_rows import SurfaceRows
 
@@ -41,9 +44,9 @@ class ExpressionSurface:
         The particles, each on the surface by itself.
     expression : str
         As for `openmm.CustomExternalForce`: of x, y, z in nm, the parameters, and intermediate values after ';'.
-    parameters : mapping of str to float or array_like, shape (n,)
+    parameters : mapping of str to float, Quantity or array_like, shape (n,)
         One number for all particles, or one for each.
-    length : float
+    length : float or Quantity
         Length over which the surface bends, in nm; used for its curvature in constraint forces.
 
     Raises
@@ -62,14 +65,15 @@ class ExpressionSurface:
         expression: str,
         parameters: Mapping[str, ArrayLike] | None = None,
         *,
-        length: float = 1.0,
+        length: unit.Quantity | float = 1.0,
     ) -> None:
         self.atoms: IntArray = np.atleast_1d(np.asarray(atoms, dtype=np.int64))
         self.expression = expression
         self.parameters: dict[str, FloatArray] = {}
-        self.length = float(length)
+        self.length = number(length, unit.nanometer, "length")
         for name, value in (parameters or {}).items():
-            array = np.asarray(value, dtype=np.float64)
+            plain, _ = without_units(value, f"parameter {name!r}", ANY)
+            array = np.asarray(plain, dtype=np.float64)
             if array.shape not in ((), self.atoms.shape) or not np.all(np.isfinite(array)):
                 raise InputError(
                     f"parameter {name!r} of {expression!r} must be one finite number, or one for each of the "

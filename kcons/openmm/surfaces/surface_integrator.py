@@ -17,6 +17,7 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedErro
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.quantities import accepted, array
 from kcons.openmm.surfaces.compiled_quadrics import CompiledQuadricRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
 from kcons.openmm.surfaces.quadrics import QUADRICS, QuadricRows
@@ -41,7 +42,7 @@ def surface_parts(
     Parameters
     ----------
     surfaces : Sphere, Cylinder, Plane, Ellipsoid, Torus, ExpressionSurface, or several of them
-        Those of `kcons.constraints`, with lengths in nm.
+        Those of `kcons.constraints`: Quantities, or plain numbers of nm.
     system : openmm.System, optional
         Checked; formulas add their forces to it, so that it is needed for them before the Context is made.
     n_particles : int, optional
@@ -60,7 +61,7 @@ def surface_parts(
         Two surfaces for a particle; a particle without mass, or with a constraint of the System; a barostat;
         moving targets; other kinds of constraints.
     """
-    given = (surfaces,) if isinstance(surfaces, Constraint | ExpressionSurface) else tuple(surfaces)
+    given = tuple(accepted((surfaces,) if isinstance(surfaces, Constraint | ExpressionSurface) else surfaces))
     if not given:
         raise InputError("no surface was given", item="surfaces")
     if system is None and n_particles is None:
@@ -262,9 +263,7 @@ def _all_atoms(given: Sequence[AnySurface], n: int) -> IntArray:
 
 
 def _in_nm(positions: ArrayLike, n: int) -> FloatArray:
-    if unit.is_quantity(positions):
-        positions = positions.value_in_unit(unit.nanometer)  # type: ignore[union-attr]
-    x = np.asarray(positions, dtype=np.float64)
+    x = array(positions, unit.nanometer, "positions")
     if x.shape != (n, 3):
         raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
     return x

@@ -228,7 +228,7 @@ class SplittingStep(ArrayStep):
             check_finite(self.forces, "force", self.number)
 
     def refuse_overflow(self) -> None:
-        """Name overflow as what it is, where the engine met it first."""
+        """Report overflow as such where the engine met it first."""
         self.refuse_unsound()
         point = self.point
         for array, item in ((self.out, "position"), (point.v, "velocity"), (point.push, "velocity")):

@@ -249,6 +249,8 @@ COMPOSED = ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 @pytest.mark.parametrize("name", REFUSED)
 def test_quick_comparison(name):
     scene = test_systems.build(name, quick=True)
+    if name in ("bead-ellipse", "bead-torus"):
+        scene = scene.shortened(3)  # nothing is compiled on these surfaces
     steps = scene.time_steps[:2]
     result = measure.compare(replace(scene, time_steps=steps), budget=60)
     refused = {m.method: m.note for m in result.measurements if m.status == "not run" and m.setting == 0}

@@ -243,7 +243,7 @@ def test_steps_without_python():
     """What OpenMM makes of it where Python is not asked is RATTLE as well."""
     system, x, v = alanine()
     (ours, compiled), (theirs, program) = both(system, x, v)
-    openmm.CompoundIntegrator.step(compiled, 10)
+    openmm._openmm.CompoundIntegrator_step(compiled, 10)
     program.step(10)
     np.testing.assert_array_equal(state_of(ours), state_of(theirs))
 
@@ -363,19 +363,3 @@ def test_reporters():
     gas = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
     kinetic = np.array([row[2] for row in rows])
     np.testing.assert_allclose([row[4] for row in rows], 2 * kinetic / ((66 - 21 - 3) * gas), rtol=1e-10)
-
-
-def test_steps_of_others_in_a_compound():
-    """OpenMM keeps the forces of a CustomIntegrator while another integrator moves x; `step` sees that."""
-    system, x, v = alanine()
-    compound, ours, other = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3), openmm.VerletIntegrator(1e-3)
-    other.setConstraintTolerance(1e-10)
-    compound.addIntegrator(ours)
-    compound.addIntegrator(other)
-    context = started(system, compound, x, v)
-    ours.step(2)
-    other.step(5)
-    fresh = started(system, alone := ProjectedIntegrator(1e-3), *state_of(context))
-    ours.step(1)
-    alone.step(1)
-    np.testing.assert_allclose(state_of(context)[0], state_of(fresh)[0], rtol=0, atol=1e-8)

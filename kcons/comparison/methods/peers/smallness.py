@@ -1,4 +1,4 @@
-"""What solvers with dense matrices need: few rows at rest, the rows as plain arrays, and one thread for BLAS."""
+"""What solvers with dense matrices need: few rows with constant targets, plain arrays, one thread for BLAS."""
 
 from __future__ import annotations
 

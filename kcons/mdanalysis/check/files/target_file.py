@@ -121,7 +121,7 @@ class TargetFile:
 
     def _rule(self, kind: str, where: str, entry: Any, scale: float) -> Rule:
         if not isinstance(entry, dict) or not set(entry) <= _KEYS or "value" not in entry:
-            raise InputError(f"{where} needs value and atoms or elements, and knows residue besides", item="targets")
+            raise InputError(f"{where} needs value, and atoms or elements; residue is optional", item="targets")
         by = [key for key in ("atoms", "elements") if key in entry]
         if len(by) != 1:
             raise InputError(f"{where}: give either atoms or elements", item="targets")

@@ -29,7 +29,7 @@ from kcons.mdanalysis.check.frames.frame_kernels import (
 
 
 class LengthTable:
-    """Lengths of a set; rigid water first: three sides at once, for less than two. What is left goes one by one.
+    """Lengths of a set. Triangles, such as rigid water, are evaluated three sides at once, all others one by one.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class LengthTable:
         self._single_slack = filled(slack[self._single_rows])
 
     def fresh(self) -> LengthTable:
-        """One that shares what is held, and has seen nothing yet."""
+        """A copy that shares the rows and has empty statistics."""
         other = copy.copy(self)
         other._powers = np.zeros(self._n_atoms, dtype=np.float32)
         other._triangles = _begun(*self._triangle_places, self._triangle_slack)

@@ -84,11 +84,11 @@ class RowTable:
 
     @property
     def only_lengths(self) -> bool:
-        """Whether compiled code does all of it, so that whole blocks of a file can be looked at."""
+        """Whether compiled loops evaluate all rows, so that whole blocks of a file can be read at once."""
         return self._others is None
 
     def fresh(self) -> RowTable:
-        """One that shares all but what is changed while frames are looked at; each worker needs its own to look."""
+        """A copy for one worker: it shares the rows and has statistics and a cell of its own."""
         other = copy.copy(self)
         other._box, other._dimensions = np.zeros((2, 3, 3)), ()
         other._lengths = self._lengths.fresh()

@@ -1,8 +1,8 @@
-"""Calls of `step`: what is made as one, which steps nobody sees, and what becomes of failures.
+"""Calls of `step`: steps made as one, ends of steps that are put off, and failures.
 
-An `app.Simulation` asks for steps in tens, and looks at the Context where a reporter does. What the last steps of a
-call make only for those who look is put off there: the next call goes on as if it were the same, and whoever asks the
-Context for something has the rest made first, see `settle`. So steps in tens cost what they cost in one long call.
+An `app.Simulation` asks for steps in tens and reads the Context only where a reporter does. The operations at the end
+of a call that only a reader of the state needs are therefore put off. The next call continues as if it were the same
+call; reading the Context makes them first, see `settle`. So steps in tens cost what they cost in one long call.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Calls(Integrator):
         self._owe(owed)
 
     def _run_block(self, guard: Guard, steps: int, to_the_end: bool) -> int:
-        """Where the program can do less in steps whose end nobody looks at, let it; how many steps were made."""
+        """Make steps, with the shorter program for those after which the state is not read; how many were made."""
         unseen = steps - self._plan.observed if self._plan.lazy and not guard.in_parts else 0
         if self._plan.lean:
             self.program.write("lean", guard.undisturbed)

@@ -72,7 +72,7 @@ def as_projected(
         making = (integrator.getStepSize(), scheme, parts, integrator.getConstraintTolerance(), check_every, ensemble)
         made = kind(making[0], scheme, parts=parts, tolerance=making[3], check_every=check_every, ensemble=ensemble)
         if program_of(made) == wanted:
-            apply_settings(made, settings_of(integrator))
+            apply_settings(made, settings_of(integrator) | {"settings": {}})  # the ensemble is the one that is given
             return made
     raise InputError(
         f"this CustomIntegrator has no program of {kind.__name__} with "

@@ -1,4 +1,4 @@
-"""What a Context is told, its integrator must hear: OpenMM tells no integrator that is written in Python.
+"""Changes of a Context, passed on to its integrator: OpenMM does not notify integrators written in Python.
 
 On import, some methods of OpenMM's classes are wrapped. They look whether the Context belongs to an integrator of
 kcons, alone or within a CompoundIntegrator; for all others they do what they did, and nothing else.
@@ -42,8 +42,13 @@ _FOREIGN = ("IntegratorParameters", "global variable name", "per-DOF variable na
 
 
 def listen(integrator: Integrator) -> None:
-    """Let this integrator hear what its Context is told."""
+    """Notify this integrator of changes of its Context."""
     _LIVE[int(integrator.this)] = integrator
+
+
+def live(integrator: openmm.Integrator) -> Integrator | None:
+    """The integrator of kcons that OpenMM hands out as a plain one; None for others."""
+    return _LIVE.get(int(integrator.this))
 
 
 def listeners(context: openmm.Context) -> list[Integrator]:
@@ -54,8 +59,7 @@ def listeners(context: openmm.Context) -> list[Integrator]:
     heard = [integrator]
     if isinstance(integrator, openmm.CompoundIntegrator):
         heard = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
-    found = (_LIVE.get(int(one.this)) for one in heard)
-    return [one for one in found if one is not None]
+    return [found for one in heard if (found := live(one)) is not None]
 
 
 # -- states and checkpoints -------------------------------------------------------------------------
@@ -230,7 +234,9 @@ def _in_simulation(original: Callable[..., None], simulation: app.Simulation, *a
 # -- wrapping ---------------------------------------------------------------------------------------
 
 
-def _wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+def wrapped(original: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
+    """What calls `call` with the original method and its arguments."""
+
     @functools.wraps(original)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         return call(original, *args, **kwargs)
@@ -271,17 +277,17 @@ def _wrap_all() -> None:
         **dict.fromkeys(_MOVING, _moving),
     }
     for name, call in calls.items():
-        setattr(openmm.Context, name, _wrapped(getattr(openmm.Context, name), call))
+        setattr(openmm.Context, name, wrapped(getattr(openmm.Context, name), call))
     for name in (*calls, "getStepCount", "getTime", "setStepCount", "setParameter", "computeVirtualSites"):
         setattr(openmm.Context, name, _settled(getattr(openmm.Context, name)))
     for name in ("step", "runForClockTime"):
-        setattr(app.Simulation, name, _wrapped(getattr(app.Simulation, name), _in_simulation))
+        setattr(app.Simulation, name, wrapped(getattr(app.Simulation, name), _in_simulation))
     minimizer = openmm.LocalEnergyMinimizer
-    minimizer.minimize = staticmethod(_wrapped(minimizer.minimize, _minimize))
+    minimizer.minimize = staticmethod(wrapped(minimizer.minimize, _minimize))
     for kind in vars(openmm).values():
         if isinstance(kind, type) and issubclass(kind, openmm.Force) and "updateParametersInContext" in vars(kind):
             name = "updateParametersInContext"
-            setattr(kind, name, _wrapped(getattr(kind, name), _update_parameters))
+            setattr(kind, name, wrapped(getattr(kind, name), _update_parameters))
 
 
 _wrap_all()

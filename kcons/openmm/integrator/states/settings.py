@@ -1,4 +1,4 @@
-"""What an integrator was made with, what it was told since, and what it hears of its Context."""
+"""Settings of an integrator: those it was made with, later changes, and changes of its Context."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.integrator.states.states_on_constraints import value_in
+from kcons.openmm.quantities import number
 from kcons.steppers.splitting import Splitting
 
 #: Forces that differ by less, relative to the largest, are the same: platforms may add them in another order.
@@ -215,10 +215,10 @@ class Settings(Integrator):
 
 
 def picoseconds(timestep: Any) -> float:
-    dt = value_in(timestep, unit.picosecond)
+    dt = number(timestep, unit.picosecond, "timestep")
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(
-            f"the time step is {timestep}; give a positive one. To go back in time, turn the velocities round",
+            f"the time step is {timestep}; give a positive one; to go back in time, reverse the velocities",
             item="timestep",
         )
     return dt

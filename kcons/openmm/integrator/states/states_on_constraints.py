@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import openmm
 from openmm import unit
 
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.states.minimization import descend
+from kcons.openmm.quantities import number
 
 
 class StatesOnConstraints(openmm.Integrator):
@@ -34,6 +33,7 @@ class StatesOnConstraints(openmm.Integrator):
 
         Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
         """
+        temperature = number(temperature, unit.kelvin, "temperature")
         arguments = (temperature,) if seed is None else (temperature, int(seed))
         context.setVelocitiesToTemperature(*arguments)
         self.applyVelocityConstraints(context)
@@ -57,7 +57,7 @@ class StatesOnConstraints(openmm.Integrator):
             0 for no limit.
         """
         context = self._watch(context).context
-        tolerance = value_in(tolerance, unit.kilojoule_per_mole / unit.nanometer)
+        tolerance = number(tolerance, unit.kilojoule_per_mole / unit.nanometer, "tolerance")
         if self.parts:
             descend(self, context, tolerance, maxIterations)
         else:
@@ -74,8 +74,3 @@ class StatesOnConstraints(openmm.Integrator):
     def independent_momenta(self, context: openmm.Context | None = None) -> int:
         """Three for each particle with a mass, less the rank of all constraints, whatever happens to total momentum."""
         return self._watch(context).independent_momenta()
-
-
-def value_in(quantity: Any, of: unit.Unit) -> float:
-    """A quantity as a float in that unit; a float is in it already."""
-    return float(quantity.value_in_unit(of) if unit.is_quantity(quantity) else quantity)

@@ -1,0 +1,88 @@
+"""Quantities at the boundary to OpenMM: one way in for numbers, and one for constraints."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+from openmm import unit
+
+from kcons.constraints.arguments import ANY, Unitless, has_units, shown
+from kcons.constraints.constraint import Constraint
+from kcons.constraints.target import FloatArray, MovingTarget
+from kcons.errors import InputError
+
+
+def plain(value: Any, of: unit.Unit, item: str) -> Any:
+    """A Quantity, or nested lists of Quantities, as numbers in a unit; what has no unit is in it already.
+
+    Raises
+    ------
+    InputError
+        It is of another kind.
+    """
+    if isinstance(value, list | tuple) and has_units(value):
+        return [plain(part, of, item) for part in value]
+    if not has_units(value):
+        return value
+    if not unit.is_quantity(value) or not value.unit.is_compatible(of):
+        raise InputError(f"{item} is {shown(value)}; give it in {of.get_symbol()}", item=item)
+    return value.value_in_unit(of)
+
+
+def number(value: Any, of: unit.Unit, item: str) -> float:
+    """The same for one number.
+
+    Raises
+    ------
+    InputError
+        It is of another kind, or no number.
+    """
+    found = plain(value, of, item)
+    try:
+        return float(found)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{item} is {value!r:.60}; give a number of {of.get_symbol()}, or a Quantity", item=item
+        ) from None
+
+
+def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
+    """The same for an array, as a copy.
+
+    Raises
+    ------
+    InputError
+        They are of another kind, or no numbers.
+    """
+    found = plain(values, of, item)
+    try:
+        return np.array(found, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{item} are no array of numbers: {error}", item=item) from None
+
+
+T = TypeVar("T")
+
+
+def accepted(constraints: Iterable[T]) -> list[T]:
+    """Constraints in nm, ps, dalton, radian from here on, whose functions may return Quantities; other things as is."""
+    return [_accepted(item) if isinstance(item, Constraint) else item for item in constraints]
+
+
+def _accepted(item: Any) -> Any:
+    taken = copy.copy(item)
+    taken.units = None
+    target = item.target
+    if isinstance(target, MovingTarget):
+        what, held = f"{item.family}: target", item.held
+        rate = target.rate and Unitless(target.rate, what, held.per_time())
+        acceleration = target.acceleration and Unitless(target.acceleration, what, held.per_time(2))
+        taken.target = MovingTarget(Unitless(target.value, what, held), rate, acceleration, target.time_step)
+    for name in item.functions:
+        function = getattr(item, name)
+        if function is not None and not isinstance(function, Unitless):
+            setattr(taken, name, Unitless(function, f"{item.family}: {name}", ANY))
+    return taken

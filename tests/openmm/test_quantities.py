@@ -1,0 +1,226 @@
+"""Quantities wherever an OpenMM user writes them."""
+
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import unit
+from openmm_systems import context_of, dumbbell, started
+
+from kcons.constraints import (
+    Angle,
+    CustomVelocity,
+    Distance,
+    FixedAtoms,
+    ImplicitSurface,
+    KnifeEdge,
+    MovingTarget,
+    Sphere,
+    Torus,
+)
+from kcons.constraints.arguments import ANY, LENGTH, Unitless
+from kcons.errors import InputError
+from kcons.openmm import (
+    CarriedConstraints,
+    CollectiveRows,
+    ExpressionSurface,
+    Isokinetic,
+    Langevin,
+    NoseHoover,
+    ProjectedIntegrator,
+    RattleIntegrator,
+    Row,
+    constraints_of,
+    hold,
+    surface_parts,
+)
+from kcons.openmm.quantities import accepted, array, number
+
+nm, ps, angstrom, kelvin = unit.nanometer, unit.picosecond, unit.angstrom, unit.kelvin
+X = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.15, 0.1, 0], [0.3, 0.1, 0.2]])
+
+
+def atoms(n=4):
+    system = openmm.System()
+    for k in range(n):
+        system.addParticle(12.0 + k)
+    return system
+
+
+def sigma(constraints, time=0.0):
+    part = CarriedConstraints(atoms(), constraints, X * 10 * angstrom, time=time)
+    return part.motion.constraint_set
+
+
+def test_numbers_and_arrays():
+    assert number(3 * angstrom, nm, "x") == pytest.approx(0.3)
+    assert number(3, nm, "x") == 3.0
+    np.testing.assert_allclose(array([1 * nm, 5 * angstrom], nm, "x"), [1, 0.5])
+    np.testing.assert_allclose(array([openmm.Vec3(1, 2, 3) * angstrom], nm, "x"), [[0.1, 0.2, 0.3]])
+    for value in (3 * kelvin, "much", None):
+        with pytest.raises(InputError, match=r"length is .*give"):
+            number(value, nm, "length")
+    with pytest.raises(InputError, match="positions is 1 K; give it in nm"):
+        array([1 * kelvin], nm, "positions")
+
+
+def test_rows_are_held_at_what_was_written():
+    given = [
+        Distance([[0, 1]], 1.0 * angstrom),
+        Angle([[0, 1, 2]], [115.0] * unit.degrees),
+        Sphere([3], [0, 0, 0] * angstrom, radius=3.8 * angstrom),
+        KnifeEdge([0], [1], [0, 0, 1], target=0.001 * angstrom / unit.femtosecond),
+    ]
+    held = sigma(given)
+    np.testing.assert_allclose(held.target(), [0.1, np.radians(115), 0.38, 0.1])
+    assert all(item.units is None for item in held.constraints) and given[0].units is not None
+    np.testing.assert_allclose(sigma([FixedAtoms([0], X[:1] * 10 * angstrom)]).target(), X[0])
+
+
+def test_moving_targets_may_return_quantities():
+    plain = MovingTarget(lambda t: 0.1 + 0.2 * t, lambda t: 0.2, lambda t: 0.0)
+    written = MovingTarget(
+        lambda t: (1 + 2 * t) * angstrom, lambda t: 2 * angstrom / ps, lambda t: 0 * nm / ps**2, 20 * unit.femtosecond
+    )
+    for target in (written, lambda t: (0.1 + 0.2 * t) * nm):
+        one, other = (sigma([Distance([[0, 1]], each)]) for each in (plain, target))
+        for time in (0.0, 0.3):
+            np.testing.assert_allclose(one.target(time), other.target(time), rtol=1e-14)
+            np.testing.assert_allclose(one.velocity_target(X, time), other.velocity_target(X, time), rtol=1e-9)
+    with pytest.raises(InputError, match=r"Distance: target is .* K; give it in nm"):
+        sigma([Distance([[0, 1]], lambda t: 300 * kelvin)])
+    with pytest.raises(InputError, match="give it in nm/ps"):
+        sigma([Distance([[0, 1]], MovingTarget(lambda t: 0.1, lambda t: 1 * nm))]).velocity_target(X, 0.0)
+
+
+def test_a_moving_target_with_units_is_followed():
+    system, x, v = dumbbell()
+    system.addParticle(14.0)
+    x, v = np.vstack([x, x[:1] + np.array([0.2, 0.1, 0.0])]), np.vstack([v, [[0.1, 0, 0]]])
+    start = np.hypot(0.2, 0.1)
+    part = hold(system, [Distance([[0, 2]], lambda t: (start + 0.5 * t) * nm)], positions=x * nm, time=0 * ps)
+    integrator = ProjectedIntegrator(1 * unit.femtosecond, parts=[part])
+    context = started(system, integrator, x, v)
+    integrator.step(50)
+    r = context.getState(positions=True).getPositions(asNumpy=True)._value
+    assert abs(np.linalg.norm(r[2] - r[0]) - start - 0.5 * 0.05) < 1e-12
+
+
+def level(r):
+    return r[:, 2] * nm
+
+
+def slope(r):
+    return np.tile([0.0, 0.0, 1.0], (len(r), 1)) * unit.dimensionless
+
+
+def test_functions_may_return_quantities_and_can_be_pickled():
+    surface = ImplicitSurface([3], level, slope, target=2 * angstrom)
+    (item,) = pickle.loads(pickle.dumps(accepted([surface])))
+    np.testing.assert_allclose(item.measure(X[3:, None], 0.0), 0.2)
+    np.testing.assert_allclose(sigma([surface]).value(X), 0.0, atol=1e-15)
+    rows = CustomVelocity([[0]], lambda r: np.array([[0, 0, 1.0]]) * unit.dimensionless, target=1 * nm / ps)
+    np.testing.assert_allclose(sigma([rows]).jacobian(X).toarray()[0, :3], [0, 0, 1])
+    both = Unitless(lambda r: (1 * angstrom, 2 * nm), "both", ANY)
+    assert both(None) == (pytest.approx(0.1), 2)
+    assert Unitless(float, "x", LENGTH)("3") == 3.0
+
+
+def test_surfaces():
+    x = np.array([[0.5, 0, 0], [0.75, 0, 0]])
+    for make in (
+        lambda length: Sphere([0], [0, 0, 0] * nm, 5 * length),
+        lambda length: Torus([1], [0, 0, 0] * nm, [0, 0, 1], 5 * length, 2.5 * length),
+    ):
+        system = atoms(2)
+        (part,) = surface_parts(make(angstrom), system=system, positions=x * nm)
+        context = started(system, ProjectedIntegrator(1e-3, parts=[part]), x, 0 * x)
+        part.check(context)
+    with pytest.raises(InputError, match="Sphere: radius is 5 K; give it in nm"):
+        Sphere([0], [0, 0, 0], 5 * kelvin)
+    formula = ExpressionSurface([0, 1], "x-a", {"a": [5, 7.5] * angstrom}, length=3 * angstrom)
+    np.testing.assert_allclose(formula.parameters["a"], [0.5, 0.75])
+    assert formula.length == pytest.approx(0.3)
+    with pytest.raises(InputError, match="length is 3 K"):
+        ExpressionSurface([0], "x", length=3 * kelvin)
+
+
+def test_collective_variables_of_composite_units():
+    """A product of two distances, and a spring's energy times a length: OpenMM does not tell their units."""
+    system = atoms()
+    first, second = openmm.CustomBondForce("r"), openmm.CustomBondForce("50*r^2")
+    first.addBond(0, 1)
+    second.addBond(2, 3)
+    product = openmm.CustomCVForce("a*b")
+    product.addCollectiveVariable("a", first)
+    product.addCollectiveVariable("b", second)
+    e = unit.kilojoule_per_mole
+    rows = CollectiveRows(system, [Row(product, 2.0 * e * angstrom, rate=3 * e * angstrom / unit.nanosecond)])
+    assert rows._targets == [pytest.approx(0.2)] and rows._rates == [pytest.approx(3e-4)]
+    for wrong in (300 * kelvin, 3 * ps, 2 * nm / ps):
+        with pytest.raises(InputError, match="of another kind"):
+            CollectiveRows(atoms(), [Row(product, wrong)])
+
+
+def test_arguments_of_integrators_and_ensembles():
+    for make, words in (
+        (lambda: ProjectedIntegrator(1 * kelvin), "timestep is 1 K; give it in ps"),
+        (lambda: RattleIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
+        (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
+        (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in /ps"),
+        (lambda: Isokinetic(kinetic_energy=1 * nm), r"kinetic_energy is 1 nm; give it in kJ/mol"),
+        (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in /ps"),
+        (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
+        (lambda: Langevin([300], 1.0), "temperature is"),
+    ):
+        with pytest.raises(InputError, match=words):
+            make()
+    assert Isokinetic(kinetic_energy=1 * unit.kilocalorie_per_mole).kinetic_energy == pytest.approx(4.184)
+
+
+def test_arguments_of_methods():
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1))
+    context = started(system, integrator, x, v)
+    for call, words in (
+        (lambda: integrator.setStepSize(1 * nm), "timestep is 1 nm"),
+        (lambda: integrator.setTemperature(1 * nm), "temperature is 1 nm"),
+        (lambda: integrator.setFriction(1 * nm), "friction is 1 nm"),
+        (lambda: integrator.setVelocitiesToTemperature(context, 1 * nm), "temperature is 1 nm"),
+        (lambda: integrator.minimizeEnergy(context, tolerance=1 * nm), "tolerance is 1 nm"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+    integrator.setVelocitiesToTemperature(context, 300 * kelvin, 1)
+    integrator.minimizeEnergy(context, tolerance=1 * unit.kilocalorie_per_mole / angstrom, maxIterations=2)
+
+
+def test_positions_of_the_wrong_kind():
+    for call in (
+        lambda: hold(atoms(), [Distance([[0, 1]])], positions=X * kelvin),
+        lambda: surface_parts(Sphere([0], [1, 0, 0]), n_particles=4, positions=X * kelvin),
+        lambda: constraints_of(openmm.app.Topology(), X[:0] * kelvin),
+    ):
+        with pytest.raises(InputError, match=r"positions .*give it in nm"):
+            call()
+    with pytest.raises(InputError, match="time is 1 nm; give it in ps"):
+        hold(atoms(), [Distance([[0, 1]])], positions=X, time=1 * nm)
+
+
+def test_a_run_with_quantities_is_the_run_with_numbers():
+    ends = []
+    for lengths, angle in ((np.array([1.0, 1.2]) * angstrom, 100 * unit.degree), ([0.1, 0.12], np.radians(100))):
+        system = atoms()
+        spring = openmm.HarmonicBondForce()
+        spring.addBond(2, 3, 2 * angstrom, 1000)
+        system.addForce(spring)
+        part = hold(system, [Distance([[0, 1], [1, 2]], lengths), Angle([[0, 1, 2]], angle)], positions=X)
+        integrator = ProjectedIntegrator(2e-3, parts=[part])
+        context = context_of(system, integrator)
+        context.setPositions(X)
+        integrator.applyConstraints(context)
+        integrator.setVelocitiesToTemperature(context, 300 * kelvin, 3)
+        integrator.step(20)
+        ends.append(context.getState(positions=True).getPositions(asNumpy=True)._value)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)

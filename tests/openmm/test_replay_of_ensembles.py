@@ -1,0 +1,233 @@
+"""The assertions of OpenMM's own tests of integrators, on RattleIntegrator and the ensembles, at OpenMM's bounds.
+
+`test_replay` has those on the schemes at constant energy. Sources: TestVerletIntegrator.h, TestCustomIntegrator.h,
+TestLangevinMiddleIntegrator.h, TestNoseHooverIntegrator.h and TestSettle.h among the tests of OpenMM.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from openmm import unit
+from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
+
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+
+GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+T = 300.0
+MADE = {
+    "RattleIntegrator": RattleIntegrator,
+    "rattle": ProjectedIntegrator,
+    "Langevin": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Langevin(T, 2.0), **given),
+    "Isokinetic": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Isokinetic(T, momentum="free"), **given),
+    "NoseHoover": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHoover(T, 10.0), **given),
+}
+AT_CONSTANT_ENERGY = ("RattleIntegrator", "rattle")
+made = pytest.mark.parametrize("name", MADE)
+#: On GPUs in mixed precision, which is what they are used in.
+ON_GPUS = [p for p in GPUS if "mixed" in p.id or "none" in p.id]
+platforms = pytest.mark.parametrize("platform", [*PLATFORMS, *ON_GPUS])
+
+
+def every_shape(coupled=True):
+    """Pairs, an angle, a cluster, a chain and two rigid waters in one System, with charges; and their positions.
+
+    Not `coupled` are pairs, a star and rigid waters: of a processor (pocl), OpenMM's solver for coupled bonds leaves
+    6e-7 at a tolerance of 1e-8, with VerletIntegrator as well.
+    """
+    system, force = openmm.System(), openmm.NonbondedForce()
+    x, rows = [], []
+
+    def add(masses, places, pairs):
+        first = system.getNumParticles()
+        for k, (m, place) in enumerate(zip(masses, places, strict=True)):
+            system.addParticle(m)
+            force.addParticle(0.2 if k % 2 == 0 else -0.2, 0.3, 1.0)
+            x.append(place)
+        for i, j in pairs:
+            rows.append((first + i, first + j))
+
+    shift = np.array([0.0, 0.0, 2.0])
+    stairs = np.array([[k // 2, (k + 1) // 2, 0.0] for k in range(8)])
+    add([5.0, 10.0] * 4, stairs, [*([(0, 1), (1, 2), (2, 3)] if coupled else []), (4, 5), (6, 7)])
+    cluster = np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1, 1, 0]], dtype=float)
+    around = [*([(0, 1), (1, 5), (1, 6)] if coupled else []), (0, 2), (0, 3), (0, 4)]
+    add([10.0] * 2 + [1.0] * 5, cluster + shift, around)
+    add([1.0] * 8, stairs + 2 * shift, [(k, k + 1) for k in range(0, 7, 1 if coupled else 2)])
+    for k in range(2):
+        water = np.array([[0, 0, 0], [1.0, 0, 0], [0.25, np.sqrt(15) / 4, 0]])  # sides 1, 1 and sqrt(1.5)
+        add([16.0, 1.0, 1.0], water + 3 * shift + [2.0 * k, 0, 0], [(0, 1), (0, 2), (1, 2)])
+    x = np.array(x)
+    for i, j in rows:
+        system.addConstraint(i, j, float(np.linalg.norm(x[i] - x[j])))
+        force.addException(i, j, 0, 1, 0)
+    system.addForce(force)
+    return system, x
+
+
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
+@made
+@platforms
+def test_constraints_of_every_shape(name, platform):
+    """Distances to 2e-5, velocities along them to 2e-5, the total energy to 1 %, at each step."""
+    system, x = every_shape(coupled=platform in PLATFORMS)
+    integrator = MADE[name](0.002)
+    context = started(system, integrator, x, None, platform)
+    integrator.setVelocitiesToTemperature(context, T, 3)
+    v, masses = state_of(context)[1], masses_of(system)
+    context.setVelocities(v - masses @ v / masses.sum())  # thermostats that scale velocities keep total momentum
+    pairs, lengths = rows_of(system)
+    energies = []
+    for step in range(200):
+        integrator.step(1)
+        x, v = state_of(context)
+        r, u = (a[pairs[:, 0]] - a[pairs[:, 1]] for a in (x, v))
+        assert np.abs(np.linalg.norm(r, axis=1) / lengths - 1).max() < 2e-5
+        assert np.abs(np.einsum("ij,ij->i", r, u)).max() < 2e-5
+        if step % 20 == 0:
+            energies.append(total_energy(context))
+    if name in AT_CONSTANT_ENERGY:
+        assert np.ptp(energies) < 0.01 * abs(energies[0])
+    integrator.check()
+    assert context.getState().getTime()._value == pytest.approx(0.4, rel=1e-9)
+
+
+@made
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_temperature(name, platform):
+    """<K> = g kT/2 of a constrained chain in a field, to 6/sqrt(n); constant where it is to be."""
+    if name in AT_CONSTANT_ENERGY:
+        pytest.skip("has no temperature to keep")
+    system = openmm.System()
+    field = openmm.CustomExternalForce("50*(x^2+1.3*y^2+0.7*z^2)+20*x^4")
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.normal(size=(8, 3)) * 0.1, axis=0)
+    for i in range(8):
+        field.addParticle(system.addParticle(2.0 + i), [])
+        if i % 3:
+            system.addConstraint(i - 1, i, float(np.linalg.norm(x[i] - x[i - 1])))
+    system.addForce(field)
+    integrator = MADE[name](0.004, tolerance=1e-7)
+    context = started(system, integrator, x, None, platform)
+    integrator.setRandomNumberSeed(1)
+    integrator.setVelocitiesToTemperature(context, T, 3)
+    integrator.step(1000)
+    n = 3000
+    kinetic = []
+    for _ in range(n // 2):
+        integrator.step(2)
+        kinetic.append(integrator.kinetic_energy()._value)
+    freedom = integrator.degrees_of_freedom()
+    assert freedom == 24 - 5
+    wanted = 0.5 * (freedom - (name == "Isokinetic")) * GAS * T
+    assert np.mean(kinetic) == pytest.approx(wanted, rel=6 / np.sqrt(n))
+    if name == "Isokinetic":
+        np.testing.assert_allclose(kinetic, wanted, rtol=1e-6)
+    else:
+        assert np.std(kinetic) > 0.1 * wanted
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_random_seed(platform):
+    """The same seed, the same run; another, another."""
+    system, x = every_shape()
+    ends = []
+    for seed in (5, 5, 10, 10):
+        integrator = MADE["Langevin"](0.002)
+        integrator.setRandomNumberSeed(seed)
+        context = started(system, integrator, x, 0 * x, platform)
+        integrator.step(10)
+        ends.append(state_of(context)[0])
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[2], ends[3])
+    assert np.abs(ends[0] - ends[2]).max() > 1e-4
+
+
+@made
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_initial_temperature(name, platform):
+    """Velocities that are drawn have the temperature on average, to 2 %; no particle alone."""
+    system = openmm.System()
+    n = 3000
+    for k in range(n):
+        system.addParticle(10.0)
+        if k % 2:
+            system.addConstraint(k - 1, k, 1.0)
+    x = np.random.default_rng(0).random((n, 3)) * 10
+    x[1::2] = x[::2]
+    x[1::2, 0] += 1.0
+    integrator = MADE[name](0.001)
+    context = started(system, integrator, x, None, platform)
+    kinetic = []
+    for seed in range(1, 11):
+        integrator.setVelocitiesToTemperature(context, T, seed)
+        kinetic.append(integrator.kinetic_energy()._value)
+    assert np.mean(kinetic) == pytest.approx(0.5 * (3 * n - n // 2) * GAS * T, rel=0.02)  # four standard errors
+    assert integrator.degrees_of_freedom() == 3 * n - n // 2
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+@made
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_massless_particles(name, platform):
+    """Particles without mass stay where they are; a constraint between one and another with a mass is refused."""
+    system, force = openmm.System(), openmm.NonbondedForce()
+    for m in (0.0, 1.0, 1.0, 0.0):
+        system.addParticle(m)
+        force.addParticle(0.1, 0.2, 0.5)
+    system.addForce(force)
+    system.addConstraint(1, 2, 1.0)
+    x = np.array([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0.5, 0]])
+    integrator = MADE[name](0.001)
+    context = started(system, integrator, x, None, platform)
+    integrator.setVelocitiesToTemperature(context, T, 1)
+    integrator.step(10)
+    now, v = state_of(context)
+    np.testing.assert_array_equal(now[[0, 3]], x[[0, 3]])
+    assert (v[[0, 3]] == 0).all()
+    assert np.abs(now[1] - x[1]).max() > 1e-5
+    system.addConstraint(0, 1, 1.0)
+    with pytest.raises(openmm.OpenMMException, match="massless"):
+        context_of(system, MADE[name](0.001), platform)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+@made
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_force_groups(name, platform):
+    system = openmm.System()
+    system.addParticle(1.0)
+    system.addParticle(1.0)
+    for group, energy in ((1, "100*x"), (2, "100*y")):
+        force = openmm.CustomExternalForce(energy)
+        force.addParticle(0)
+        force.setForceGroup(group)
+        system.addForce(force)
+    integrator = ProjectedIntegrator(0.01, ensemble=Langevin(0, 0)) if name == "Langevin" else MADE[name](0.01)
+    integrator.setIntegrationForceGroups({1})
+    context = started(system, integrator, np.zeros((2, 3)), [[0, 0, 0.0], [1.0, 0, 0]], platform)
+    integrator.step(5)
+    x = state_of(context)[0]
+    assert x[0, 0] < -1e-3
+    assert x[0, 1] == x[0, 2] == 0
+
+
+@pytest.mark.parametrize("name", AT_CONSTANT_ENERGY)
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_momenta_are_conserved(name, platform):
+    """To OpenMM's 1e-4, and to rounding."""
+    system, x = every_shape()
+    integrator = MADE[name](0.001, tolerance=1e-12)
+    context = started(system, integrator, x, None, platform)
+    integrator.setVelocitiesToTemperature(context, T, 2)
+    masses = masses_of(system)[:, None]
+
+    def momenta():
+        x, v = state_of(context)
+        return np.array([(masses * v).sum(axis=0), np.cross(x, masses * v).sum(axis=0)])
+
+    before = momenta()
+    integrator.step(200)
+    # The CPU platform has forces in single precision.
+    assert np.abs(momenta() - before).max() < (1e-7 if platform == "Reference" else 1e-3)
