@@ -34,6 +34,7 @@ class StatesOnConstraints(openmm.Integrator):
         Context.setVelocitiesToTemperature does it for the System's own constraints, to 1e-5 only.
         """
         temperature = number(temperature, unit.kelvin, "temperature")
+        self._watch(context)  # refuses before velocities are changed
         arguments = (temperature,) if seed is None else (temperature, int(seed))
         context.setVelocitiesToTemperature(*arguments)
         self.applyVelocityConstraints(context)

@@ -1,0 +1,61 @@
+"""Drude particles are refused by everything that kicks, before anything moves."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app
+from openmm_systems import started, state_of
+
+from kcons.errors import UnsupportedError
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.integrator.schemes import SCHEMES
+
+
+@cache
+def drude():
+    """Two molecules of SWM4-NDP water: a Drude particle and a virtual site each."""
+    field = app.ForceField("swm4ndp.xml")
+    box = app.Modeller(app.Topology(), [])
+    box.addSolvent(field, model="swm4ndp", boxSize=openmm.Vec3(1.9, 1.9, 1.9))
+    box.delete(list(box.topology.residues())[2:])
+    return field.createSystem(box.topology, removeCMMotion=False), box.positions
+
+
+def refused(integrator, step, platform="Reference"):
+    system, positions = drude()
+    context = started(system, integrator, positions)
+    before = state_of(context)
+    with pytest.raises(UnsupportedError, match=r"DrudeForce.*DrudeLangevinIntegrator.*DrudeSCFIntegrator"):
+        step(context)
+    np.testing.assert_array_equal(state_of(context), before)
+    assert context.getStepCount() == 0
+
+
+@pytest.mark.parametrize("scheme", [*SCHEMES, "leapfrog"])
+def test_drude_particles_are_refused_by_all_schemes(scheme):
+    integrator = ProjectedIntegrator(0.0005, scheme)
+    refused(integrator, lambda context: integrator.step(1))
+
+
+@pytest.mark.parametrize(
+    "ensemble", [Langevin(300, 1), Isokinetic(300), NoseHoover(300, 10)], ids=["Langevin", "Isokinetic", "NoseHoover"]
+)
+def test_drude_particles_are_refused_by_thermostats(ensemble):
+    integrator = ProjectedIntegrator(0.0005, ensemble=ensemble)
+    refused(integrator, lambda context: integrator.step(1))
+
+
+def test_drude_particles_are_refused_by_the_compiled_integrator():
+    integrator = RattleIntegrator(0.0005)
+    refused(integrator, lambda context: integrator.step(1))
+    refused(other := RattleIntegrator(0.0005), lambda context: other.setVelocitiesToTemperature(context, 300))
+
+
+def test_drude_particles_are_refused_in_compound_integrators():
+    compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(0.0005)
+    compound.addIntegrator(ours)
+    refused(compound, lambda context: ours.check(context))
