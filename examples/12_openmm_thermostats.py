@@ -6,7 +6,8 @@
 
 Times are medians, one thread, of runs that take turns; only their ratios mean something. The mean potential energy of
 alanine dipeptide (bonds with hydrogen held) in rigid water is compared with that of 1 fs; errors are standard errors
-from blocks.
+from blocks. Kinetic energies of rigid water are compared with what the degrees of freedom say: their mean is g kT/2,
+and their variance g (kT)^2/2.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from openmm import app, unit
 from rich.console import Console
 
 from kcons.comparison import json_files, measure, scripts
-from kcons.openmm import Isokinetic, Langevin, ProjectedIntegrator
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator
 
 DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
 TOLERANCE = 1e-8
-TEMPERATURE, FRICTION = 300.0, 1.0
+TEMPERATURE, FRICTION, FREQUENCY = 300.0, 1.0, 20.0
 Make = Callable[[float], openmm.Integrator]
 
 
@@ -45,6 +46,10 @@ def middle(dt: float) -> openmm.Integrator:
 def isokinetic(dt: float) -> openmm.Integrator:
     # Charges on a mesh conserve momentum roughly only; the CMMotionRemover of the System keeps it at zero.
     return ProjectedIntegrator(dt, ensemble=Isokinetic(TEMPERATURE))
+
+
+def nose_hoover(dt: float) -> ProjectedIntegrator:
+    return ProjectedIntegrator(dt, ensemble=NoseHoover(TEMPERATURE, FREQUENCY))
 
 
 # -- systems ----------------------------------------------------------------------------------------
@@ -97,6 +102,7 @@ def speed(full: bool) -> dict[str, Any]:
         "kcons Isokinetic": isokinetic(0.002),
         "kcons Isokinetic, leapfrog": ProjectedIntegrator(0.002, "leapfrog", ensemble=Isokinetic(TEMPERATURE)),
         "kcons Langevin": langevin(0.002),
+        "kcons NoseHoover": nose_hoover(0.002),
     }
     contexts = {name: started(system, positions, integrator) for name, integrator in integrators.items()}
     first = next(iter(contexts.values()))
@@ -169,6 +175,32 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
     return result
 
 
+def kinetic(full: bool) -> dict[str, Any]:
+    """Twice the kinetic energy of rigid water in kT: mean and variance, beside g and 2 g."""
+    system, positions = water(1.0)
+    picoseconds = 100.0 if full else 2.0
+    rows = {}
+    for dt in (0.001, 0.002):
+        integrator = nose_hoover(dt)
+        context = started(system, positions, integrator)
+        integrator.minimizeEnergy(context, maxIterations=100)
+        integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
+        integrator.step(round(min(20.0, picoseconds) / dt))
+        every = round(0.02 / dt)
+        values = []
+        for _ in range(round(picoseconds / 0.02)):
+            integrator.step(every)
+            values.append(2 * integrator.kinetic_energy() / (unit.MOLAR_GAS_CONSTANT_R * TEMPERATURE * unit.kelvin))
+        found, g = np.array(values), integrator.ensemble.count(integrator)  # type: ignore[attr-defined]
+        row: dict[str, float] = {"g": g}
+        for name, what in (("mean", found), ("variance", (found - g) ** 2)):
+            blocks = np.array([part.mean() for part in np.array_split(what, 20)])
+            row[name], row[f"{name} error"] = float(what.mean()), float(blocks.std(ddof=1) / np.sqrt(20))
+        rows[f"kcons NoseHoover, {1e3 * dt:g} fs"] = row
+    title = f"Kinetic energy of rigid water, {system.getNumParticles()} atoms, {picoseconds:g} ps"
+    return {"title": title, "rows": rows, "machine": measure.environment()}
+
+
 # -- output -----------------------------------------------------------------------------------------
 
 
@@ -190,8 +222,21 @@ def show(result: dict[str, Any], console: Console) -> None:
                 off = "" if row["fs"] == 1.0 else f"{row['mean'] - zero['mean']:+.1f} ± {error:.1f}"
                 table.add_row(name, f"{row['fs']:g}", mean, off)
         console.print(table)
-    machine = result["machine"]
-    console.print(
+    if fast or sampled:
+        console.print(_made_on(result["machine"]))
+    energies = result["measurements"].get("kinetic")
+    if energies:
+        columns = ("integrator", "g", "mean 2K/kT", "variance", "2 g")
+        table = scripts.table(energies["title"], columns, {"integrator"})
+        for name, row in energies["rows"].items():
+            mean, variance = (f"{row[what]:.1f} ± {row[f'{what} error']:.1f}" for what in ("mean", "variance"))
+            table.add_row(name, f"{row['g']:g}", mean, variance, f"{2 * row['g']:g}")
+        console.print(table)
+        console.print(_made_on(energies["machine"]))
+
+
+def _made_on(machine: dict[str, Any]) -> str:
+    return (
         f"{machine['cpu']}, one thread; OpenMM {machine['versions']['openmm']}; "
         f"commit {machine['commit']}, {machine['date']}"
     )
@@ -199,7 +244,9 @@ def show(result: dict[str, Any], console: Console) -> None:
 
 def main() -> None:
     parser = scripts.options(__doc__, full="the sizes of the committed results")
-    parser.add_argument("--only", choices=["speed", "sampling"], help="one measurement; others in --out are kept")
+    parser.add_argument(
+        "--only", choices=["speed", "sampling", "kinetic"], help="one measurement; others in --out are kept"
+    )
     options = parser.parse_args()
     console = Console(width=120)
     if options.show:
@@ -207,16 +254,21 @@ def main() -> None:
         return
     result: dict[str, Any] = {"machine": measure.environment(), "full": options.full, "measurements": {}}
     if options.out and options.only and options.out.exists():
-        result["measurements"] = json_files.read(options.out)["measurements"]
+        before = json_files.read(options.out)
+        result["measurements"] = before["measurements"]
+        if options.only == "kinetic":  # which says itself where it was made
+            result["machine"], result["full"] = before["machine"], before["full"]
 
     def keep(name: str, measured: dict[str, Any]) -> None:
         result["measurements"][name] = measured
         if options.out:
             json_files.write(options.out, result)
 
-    if options.only != "sampling":
+    if options.only in (None, "speed"):
         keep("speed", speed(options.full))
-    if options.only != "speed":
+    if options.only in (None, "kinetic"):
+        keep("kinetic", kinetic(options.full))
+    if options.only in (None, "sampling"):
         sampling(options.full, lambda measured: keep("sampling", measured))
     show(result, console)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 
-from committed_pages import FOLDER, page, printed
+import pytest
+from committed_pages import FOLDER, ROOT, page, printed
 
 RESULTS = FOLDER / "openmm_thermostats.json"
 
@@ -37,3 +39,23 @@ def test_a_long_step_of_langevin_is_no_worse_than_a_short_one_of_openmm():
     theirs, other = off("LangevinMiddleIntegrator", 2.0)
     assert ours - theirs <= math.hypot(error, other)
     assert ours <= 3 * error
+
+
+def _within_three_errors(rows: dict[str, dict[str, float]]) -> None:
+    assert {"kcons NoseHoover, 1 fs", "kcons NoseHoover, 2 fs"} == set(rows)
+    for row in rows.values():
+        assert abs(row["mean"] - row["g"]) <= 3 * row["mean error"] <= 0.01 * row["g"]
+        assert abs(row["variance"] - 2 * row["g"]) <= 3 * row["variance error"] <= 0.1 * 2 * row["g"]
+
+
+def test_kinetic_energies_under_a_chain_are_those_of_the_degrees_of_freedom():
+    kinetic = json.loads(RESULTS.read_text(encoding="utf-8"))["measurements"]["kinetic"]
+    assert kinetic["machine"]["commit"]
+    _within_three_errors(kinetic["rows"])
+
+
+@pytest.mark.validation
+def test_kinetic_energies_anew():
+    """The committed runs once more, three minutes."""
+    example = runpy.run_path(str(ROOT / "examples" / "12_openmm_thermostats.py"))
+    _within_three_errors(example["kinetic"](True)["rows"])
