@@ -24,6 +24,7 @@ from kcons.openmm.ensembles.conserved_momenta import (
 from kcons.openmm.integrator.ensemble import Value
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import operations_of
 from kcons.openmm.integrator.system_checks import SystemRows, removes_centre_of_mass_motion
@@ -34,8 +35,9 @@ from kcons.steppers.runge_kutta_nystrom import RungeKuttaNystrom
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import atom_numbers, positive
 
-#: Relative difference from the kinetic energy wanted at the start that is taken for rounding.
-ROUNDING = 1e-12
+#: Relative difference from the kinetic energy wanted at the start that is taken for rounding, by precision: a run that
+#: is continued stays as it is, bit for bit.
+ROUNDING = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 #: Where velocities run against a strong force, s' is a small difference; below this, digits are lost.
 _CANCELS = 1e-4
 #: Boltzmann's constant times Avogadro's number, kJ/mol/K.
@@ -248,7 +250,7 @@ class Isokinetic(Value):
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
             integrator.setPerDofVariableByName("share", share.tolist())
         integrator.program.write("two_k", twice)
-        if abs(found / twice - 1) > ROUNDING:
+        if abs(found / twice - 1) > ROUNDING[Precision.of(context).name]:
             v = np.where(masses[:, None] > 0, v * math.sqrt(twice / found), v)
             context.setVelocities(v)
 
