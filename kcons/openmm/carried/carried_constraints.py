@@ -82,6 +82,7 @@ class CarriedConstraints(Part):
     """
 
     evaluates = True
+    lands_last = True
     _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
@@ -220,12 +221,12 @@ class CarriedConstraints(Part):
             self._guard(program, "remember", words)
 
     def land(self, program: Program, h: str) -> None:
-        # Where a computation changes x by a force, OpenMM does not take force and energy from one evaluation: the
-        # second call gets what the first has found. Or failures wait for the next call of the other phases.
-        if self._early:
-            self._guard(program, "land", "carried rows: try to solve for positions")
         change = f"f{self._groups['land']}"
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: solve for positions")
+        if self._early:
+            self._guard(program, "land", "carried rows: solve for positions")
+            force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
+            program.each(change, force, "from the evaluation that tells of failures")
+        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: onto them")
 
     def land_alone(self, program: Program, u: str, h: str) -> None:
         """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""

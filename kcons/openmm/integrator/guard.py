@@ -20,6 +20,7 @@ from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.step_counts import refuse_old_positions
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
     check_system,
@@ -91,13 +92,13 @@ class Guard:
         refuse_forgotten_parts(self.system, integrator.row_groups)
         self.precision = Precision.of(context)
         integrator.take_precision(self.precision)
+        refuse_old_positions(integrator, self.system, self.precision)
         self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
         #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
         self.undisturbed = not any(isinstance(force, openmm.AndersenThermostat) for force in forces_of(self.system))
-        #: Whether the set-up was checked.
-        self.started = False
+        self.started = False  # whether the set-up was checked
         #: Whether others may have moved x or v since: the next step looks where they are.
         self.disturbed = True
         #: g of the thermostat, once it is known.

@@ -102,6 +102,8 @@ class Part(ABC):
     meets_system : bool
         Whether the rows may touch atoms that the System constrains. Such a part calls `program.hold_positions`
         within its own `land`; at most one part of an integrator may.
+    lands_last : bool
+        Whether it adds to x of its own particles only, so that it comes after the constraints of the System.
     solves_alone : bool
         Whether the program also brings a state onto the rows outside of steps. Where a part does not, all parts are
         asked to do so by `apply_positions` and `apply_velocities`.
@@ -119,6 +121,7 @@ class Part(ABC):
     code: int = 0
     evaluates: bool = False
     meets_system: bool = False
+    lands_last: bool = False
     solves_alone: bool = False
     groups: frozenset[int] = frozenset()
     lean: bool = False

@@ -8,6 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import openmm
+
+from kcons.errors import UnsupportedError
+from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
 
 _GROUP = re.compile(r"\b(f|energy)(\d*)\b")
@@ -58,6 +63,35 @@ def count_step(program: Program, *, iterations: int = 2, **values: float) -> Ste
         walk.counts = StepCounts()
         walk.run(0, len(program.operations))
     return walk.counts
+
+
+def forces_at_old_positions(program: Program) -> bool:
+    """Whether GPUs compute forces at old positions where the System has constraints.
+
+    They keep what a computation makes of x as a difference, which forces do not see, until the next constraints are
+    applied to positions; where no such line follows anywhere below, x is changed at once.
+    """
+    holds = [k for k, operation in enumerate(program.operations) if operation[:2] == ("hold", "x")]
+    kept = False
+    for k, (kind, variable, expression) in enumerate(program.operations):
+        if kept and _GROUP.search(expression):
+            return True
+        if kind == "hold" and variable == "x":
+            kept = False
+        elif kind == "each" and variable == "x":
+            kept = bool(holds) and k < holds[-1]
+    return False
+
+
+def refuse_old_positions(integrator: Integrator, system: openmm.System, precision: Precision) -> None:
+    """Raise where rows would be computed at old positions."""
+    concerned = integrator.parts and precision.rounds_lengths and system.getNumConstraints()
+    if concerned and forces_at_old_positions(integrator.program):
+        raise UnsupportedError(
+            f"{precision} computes these rows at old positions where the System has constraints as well; give "
+            "CollectiveRows meets_system=True; with constraint objects take scheme 'rattle' at constant energy or let "
+            "kcons hold all constraints (hold(system, ..., take='all', keep_water=False)); or run on the CPU platform"
+        )
 
 
 class _Unknown:

@@ -269,13 +269,17 @@ class StepWriter:
             p.each("x", f"x+{h}*{u}", "move freely (drift)")
             p.each("xu", "x", "where that leads")
         for part in self.parts:
-            if not part.meets_system:
+            if not (part.meets_system or part.lands_last):
                 part.land(p, h)
         together = [part for part in self.parts if part.meets_system]
         if together:
             together[0].land(p, h)
         else:
             p.hold_positions("back onto the constraints of the System")
+        # Until then GPUs keep x as a difference, and forces do not see it.
+        for part in self.parts:
+            if part.lands_last:
+                part.land(p, h)
 
     def _project(self) -> None:
         p = self.program

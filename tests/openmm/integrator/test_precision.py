@@ -395,3 +395,52 @@ def test_some_particles_or_all_are_the_same_motion(monkeypatch):
         integrator.step(20)
         ends.append(np.concatenate(state_of(context)))
     np.testing.assert_array_equal(*ends)
+
+
+def beside_water(kind):
+    """Three atoms in the box of rigid water, two of them held; a triangle of the water itself."""
+    system, x, v = water()
+    field = system.getForce(0)
+    for _ in range(3):
+        field.addParticle(0.0, 0.1, 0.0)
+        system.addParticle(12.0)
+    x = np.vstack([x, [[0.4, 0.4, 0.4], [0.5, 0.45, 0.4], [0.6, 0.4, 0.4]]])
+    v = np.vstack([v, np.random.default_rng(4).normal(size=(3, 3))])
+    if kind == "carried":
+        return system, x, v, hold(system, [Angle([[0, 1, 2]]), Distance([[81, 82]])], x)
+    force = openmm.CustomBondForce("r")
+    force.addBond(81, 82, [])
+    return system, x, v, CollectiveRows(system, [Row(force)], positions=x, meets_system=kind == "meeting" or None)
+
+
+@more_than_single
+@pytest.mark.parametrize(
+    "kind, options",
+    [
+        ("carried", {"scheme": "rattle"}),
+        ("carried", {"scheme": "leapfrog"}),
+        ("meeting", {"scheme": "rattle"}),
+        ("meeting", {"scheme": "leapfrog"}),
+        ("meeting", {"ensemble": Langevin(300, 1)}),
+    ],
+)
+def test_rows_beside_constraints_of_the_system(kind, options, platform):
+    """On GPUs forces see what moves x only when constraints have been applied: those of the System come first."""
+    system, x, v, part = beside_water(kind)
+    integrator = ProjectedIntegrator(1e-3, parts=[part], check_every=5, **options)
+    context = started(system, integrator, x, v, platform)
+    integrator.applyVelocityConstraints(context)
+    integrator.step(20)
+    integrator.check()
+    assert part.worst_miss(context, velocities=False) is None
+
+
+@mixed
+@pytest.mark.parametrize("kind, ensemble", [("carried", Langevin(300, 1)), ("free", None), ("free", Langevin(300, 1))])
+def test_rows_that_would_see_old_positions_are_refused(kind, ensemble, platform):
+    system, x, v, part = beside_water(kind)
+    integrator = ProjectedIntegrator(1e-3, parts=[part], ensemble=ensemble)
+    context = started(system, integrator, x, v, platform)
+    with pytest.raises(UnsupportedError, match="old positions where the System has constraints"):
+        integrator.step(1)
+    del context

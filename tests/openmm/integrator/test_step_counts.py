@@ -16,7 +16,7 @@ from kcons.openmm.carried.callbacks import Engine
 from kcons.openmm.carried.hold import hold
 from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.schemes import SCHEMES
-from kcons.openmm.integrator.step_counts import count_step
+from kcons.openmm.integrator.step_counts import count_step, forces_at_old_positions
 from tests.openmm.collective.test_collective_rows import bond
 
 
@@ -101,7 +101,7 @@ def test_calls_of_a_carrier(monkeypatch):
 
 
 def test_calls_of_a_carrier_beside_bonds(monkeypatch):
-    """There x is moved by the force whose energy tells of failures: a second call gets what the first has found."""
+    """Force and energy come from one evaluation there, too."""
     system, x, v = loose_alanine()
     part = hold(system, Plane([0], [0, 0, 1]), x)
     calls = []
@@ -112,8 +112,8 @@ def test_calls_of_a_carrier_beside_bonds(monkeypatch):
     integrator.step(3)
     calls.clear()
     integrator.step(30)
-    assert calls.count("land") == 60
-    assert integrator.counts(seen=False).row_evaluations == 2
+    assert calls.count("land") == 30
+    assert integrator.counts(seen=False).row_evaluations == 1
     del context
 
 
@@ -161,3 +161,23 @@ def test_waits_of_rows_on_a_gpu(count, waits):
     assert counts.synchronisations == waits
     assert counts.row_evaluations == 2 * count
     assert counts.passes == 6 + count
+
+
+def test_forces_at_old_positions():
+    """x is kept as a difference until the next constraints, where any follow below."""
+
+    def old(*lines):
+        integrator = openmm.CustomIntegrator(0.001)
+        p = Program(integrator)
+        for line in lines:
+            if line == "hold":
+                p.hold_positions("")
+            else:
+                p.each(line[0], line[2:], "")
+        return forces_at_old_positions(p)
+
+    assert not old("x=x+v", "v=v+f/m")
+    assert not old("x=x+v", "hold", "v=v+f/m")
+    assert not old("x=x+v", "hold", "x=x+f3", "v=v+f/m")
+    assert old("x=x+v", "v=v+f3", "hold")
+    assert old("x=x+v", "hold", "x=x+f3", "v=f", "x=x+v", "hold")
