@@ -28,7 +28,9 @@ def plain(value: Any, of: unit.Unit, item: str) -> Any:
     if not has_units(value):
         return value
     if not unit.is_quantity(value) or not value.unit.is_compatible(of):
-        raise InputError(f"{item} is {shown(value)}; give it in {of.get_symbol()}", item=item)
+        symbol = of.get_symbol()
+        symbol = f"1{symbol}" if symbol.startswith("/") else symbol
+        raise InputError(f"{item} is {shown(value)}; give it in {symbol}", item=item)
     return value.value_in_unit(of)
 
 

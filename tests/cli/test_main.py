@@ -163,7 +163,7 @@ def test_interrupt(monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(main, "_scene", stop)
+    monkeypatch.setattr(main, "_test_system", stop)
     assert run("plan", "chain") == 130
     assert capsys.readouterr().err == "kcons: interrupted\n"
 

@@ -168,9 +168,9 @@ def test_arguments_of_integrators_and_ensembles():
         (lambda: ProjectedIntegrator(1 * kelvin), "timestep is 1 K; give it in ps"),
         (lambda: RattleIntegrator(1 * nm), "timestep is 1 nm; give it in ps"),
         (lambda: Langevin(1 * nm, 1.0), "temperature is 1 nm; give it in K"),
-        (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in /ps"),
+        (lambda: Langevin(300, 1 * nm), "friction is 1 nm; give it in 1/ps"),
         (lambda: Isokinetic(kinetic_energy=1 * nm), r"kinetic_energy is 1 nm; give it in kJ/mol"),
-        (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in /ps"),
+        (lambda: NoseHoover(300, 1 * nm), "frequency is 1 nm; give it in 1/ps"),
         (lambda: ProjectedIntegrator("soon"), "timestep is 'soon'; give a number of ps, or a Quantity"),
         (lambda: Langevin([300], 1.0), "temperature is"),
     ):

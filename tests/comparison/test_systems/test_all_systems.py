@@ -426,7 +426,7 @@ def test_atoms_carry_the_scene(name):
         ("butane", 3, {}, "one molecule"),
         ("bead-torus", 2, {}, "one bead"),
         ("bead-ellipse", 1, {"on": "cone"}, "no curve 'cone'"),
-        ("dumbbells", 3, {}, "use 2, or at least 8"),
+        ("dumbbells", 3, {}, "or at least 8"),
         ("slab", 0, {}, "at least one molecule"),
         ("ethanol", 1, {"forces": "x"}, "no forces 'x' for ethanol"),
     ],

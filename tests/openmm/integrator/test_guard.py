@@ -72,16 +72,16 @@ def test_compound_integrator():
     assert context.getStepCount() == 14
 
 
-def test_compound_integrator_tells_of_failures_when_asked():
+def test_compound_integrator_tells_of_failures():
     system, x, v = loose_alanine()
+    v[0, 2] = 0.0  # tangent: nothing is put right at the start
     compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(1e-3, parts=[holding(steepest=-1.0)])
     compound.addIntegrator(ours)
     context = started(system, compound, x, v)
     before = state_of(context)
-    compound.step(5)
-    np.testing.assert_array_equal(state_of(context), before)
     with pytest.raises(ConvergenceError, match="too steep"):
-        ours.check()
+        compound.step(5)
+    np.testing.assert_array_equal(state_of(context), before)
 
 
 # -- the start --------------------------------------------------------------------------------------
