@@ -1,0 +1,106 @@
+"""AMOEBA: polarisable multipoles are forces like any others, and steps on constraints are what they are elsewhere."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app
+from openmm_systems import started, state_of, total_energy
+
+from kcons.constraints import Angle, Distance
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm.carried.hold import hold
+
+#: A Context with AMOEBA takes OpenMM 13 s here.
+pytestmark = pytest.mark.validation
+
+BOND, ANGLE = 0.09572, np.radians(104.52)
+polarization = pytest.mark.parametrize("kind", ["direct", "mutual"])
+verlets = pytest.mark.parametrize("make", [ProjectedIntegrator, RattleIntegrator])
+
+
+@cache
+def waters(kind, rigid=True):
+    """Four molecules of AMOEBA water, minimised, and velocities of 200 K."""
+    topology, x = app.Topology(), []
+    chain = topology.addChain()
+    for k in range(4):
+        residue = topology.addResidue("HOH", chain)
+        oxygen = topology.addAtom("O", app.element.oxygen, residue)
+        for name in ("H1", "H2"):
+            topology.addBond(oxygen, topology.addAtom(name, app.element.hydrogen, residue))
+        turn, _ = np.linalg.qr(np.random.default_rng(k).normal(size=(3, 3)))
+        arms = BOND * np.array([[0, 0, 0], [1, 0, 0], [np.cos(ANGLE), np.sin(ANGLE), 0]])
+        x.append(np.array([0.3 * (k % 2), 0.3 * (k // 2), 0.02 * k]) + arms @ turn.T)
+    system = app.ForceField("amoeba2018.xml").createSystem(
+        topology,
+        nonbondedMethod=app.NoCutoff,
+        rigidWater=rigid,
+        polarization=kind,
+        mutualInducedTargetEpsilon=1e-6,
+    )
+    context = started(system, openmm.VerletIntegrator(1e-3), np.concatenate(x))
+    context.applyConstraints(1e-10)
+    openmm.LocalEnergyMinimizer.minimize(context, 10, 20)
+    context.applyConstraints(1e-10)
+    context.setVelocitiesToTemperature(200, 3)
+    context.applyVelocityConstraints(1e-10)
+    return system, *state_of(context)
+
+
+@polarization
+@verlets
+def test_energy_is_conserved_to_second_order_and_as_by_verlet(kind, make):
+    """Verlet takes the first velocities for those of half a step before: another motion of the same energy."""
+    system, x, v = waters(kind)
+    spread = {}
+    for integrate in (openmm.VerletIntegrator, make):
+        for dt in (1e-3, 5e-4):
+            integrator = integrate(dt)
+            integrator.setConstraintTolerance(1e-10)
+            context = started(system, integrator, x, v)
+            energies = []
+            for _ in range(round(0.1 / (10 * dt))):
+                integrator.step(10)
+                energies.append(total_energy(context))
+            spread[integrate, dt] = np.std(energies)
+    assert 1.7 < np.log2(spread[make, 1e-3] / spread[make, 5e-4]) < 2.3
+    for dt in (1e-3, 5e-4):
+        assert spread[make, dt] == pytest.approx(spread[openmm.VerletIntegrator, dt], rel=0.05)
+
+
+@pytest.mark.filterwarnings("ignore:the forces exert no torque")
+@pytest.mark.parametrize("ensemble", [Langevin(300, 1), Isokinetic(300), NoseHoover(300, 5)])
+def test_ensembles_run(ensemble):
+    system, x, v = waters("mutual")
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    context = started(system, integrator, x, v)
+    integrator.setVelocitiesToTemperature(context, 300)
+    integrator.step(50)
+    integrator.check()
+
+
+def test_bonds_and_angles_are_carried():
+    """Of flexible molecules, by kcons; the energy is then conserved as with OpenMM's SETTLE."""
+    flexible, x, v = waters("mutual", rigid=False)
+    oxygen = 3 * np.arange(4)
+    bonds = np.stack([oxygen, oxygen + 1, oxygen, oxygen + 2], axis=1).reshape(-1, 2)
+    rows = [Distance(bonds), Angle(np.stack([oxygen + 1, oxygen, oxygen + 2], axis=1))]
+    spread = []
+    for dt in (1e-3, 5e-4):
+        system = copy.deepcopy(flexible)
+        part = hold(system, rows, x)
+        integrator = ProjectedIntegrator(dt, parts=[part])
+        context = started(system, integrator, x, v)
+        integrator.applyVelocityConstraints(context)
+        energies = []
+        for _ in range(round(0.1 / (10 * dt))):
+            integrator.step(10)
+            energies.append(total_energy(context))
+        assert part.worst_miss(context) is None
+        spread.append(np.std(energies))
+    assert 1.7 < np.log2(spread[0] / spread[1]) < 2.3
