@@ -8,6 +8,7 @@ call; reading the Context makes them first, see `settle`. So steps in tens cost 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import openmm
 from openmm import unit
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
     from kcons.openmm.integrator.lean_step_writer import LeanStepWriter
 
 #: Integrators that have put something off, by the addresses of their Contexts.
-_OWING: dict[int, Calls] = {}
+_OWING: WeakValueDictionary[int, Calls] = WeakValueDictionary()
 
 
 def settle(context: openmm.Context) -> None:
     """Make what the integrator of a Context has put off."""
     if _OWING and (owing := _OWING.get(int(context.this))) is not None:
-        owing.settle()
+        if owing.bereft:
+            del _OWING[int(context.this)]  # of a Context that is gone and had the same address
+        else:
+            owing.settle()
 
 
 class Calls(Integrator):
@@ -49,6 +53,11 @@ class Calls(Integrator):
 
     # -- what is put off ------------------------------------------------------------------------
 
+    @property
+    def bereft(self) -> bool:
+        """Whether the Context is gone."""
+        return self._guard is None or self._guard.alive is None
+
     def _owe(self, steps: int) -> None:
         self._owed = steps
         if steps:
@@ -58,9 +67,9 @@ class Calls(Integrator):
     def _take_owed(self) -> int:
         """The steps that were put off: who takes them makes them."""
         owed, self._owed = self._owed, 0
-        if owed:
-            assert self._guard is not None
-            del _OWING[int(self._guard.context.this)]
+        if not owed or self._guard is None or self.bereft:
+            return 0
+        _OWING.pop(int(self._guard.context.this), None)
         return owed
 
     def settle(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import Counter
 
 import numpy as np
@@ -272,3 +273,33 @@ def test_others_are_left_alone():
     simulation.step(25)
     assert simulation.currentStep == 25
     assert app.Simulation.step.__doc__.startswith("Advance the simulation")
+
+
+def test_a_context_at_the_address_of_one_that_is_gone_owes_nothing():
+    """An integrator may outlive its Context, whose address the next one may get."""
+    system, x, v = alanine("HBonds")
+    integrator = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1))
+    context = started(system, integrator, x, v)
+    integrator.unseen = True
+    integrator.step(10)
+    assert calls._OWING[int(context.this)] is integrator
+    other = started(system, ProjectedIntegrator(1e-3), x, v)
+    calls._OWING[int(other.this)] = integrator
+    del context
+    gc.collect()
+    assert integrator.bereft
+    np.testing.assert_array_equal(state_of(other)[0], x)
+    assert int(other.this) not in calls._OWING
+
+
+def test_what_is_put_off_keeps_no_integrator():
+    system, x, v = alanine("HBonds")
+    integrator = ProjectedIntegrator(1e-3, ensemble=Langevin(300, 1))
+    context = started(system, integrator, x, v)
+    integrator.unseen = True
+    integrator.step(10)
+    address = int(context.this)
+    assert address in calls._OWING
+    del context, integrator
+    gc.collect()
+    assert address not in calls._OWING
