@@ -16,10 +16,12 @@ from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, 
 
 GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0
+#: 1/ps. <K> of 12 ps then has a standard deviation of 1.8 % over seeds.
+FRICTION = 20.0
 MADE = {
     "RattleIntegrator": RattleIntegrator,
     "rattle": ProjectedIntegrator,
-    "Langevin": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Langevin(T, 2.0), **given),
+    "Langevin": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Langevin(T, FRICTION), **given),
     "Isokinetic": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Isokinetic(T, momentum="free"), **given),
     "NoseHoover": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHoover(T, 10.0), **given),
 }
@@ -109,8 +111,8 @@ def test_temperature(name, platform):
             system.addConstraint(i - 1, i, float(np.linalg.norm(x[i] - x[i - 1])))
     system.addForce(field)
     integrator = MADE[name](0.004, tolerance=1e-7)
+    integrator.setRandomNumberSeed(1)  # before the Context, which reads it
     context = started(system, integrator, x, None, platform)
-    integrator.setRandomNumberSeed(1)
     integrator.setVelocitiesToTemperature(context, T, 3)
     integrator.step(1000)
     n = 3000

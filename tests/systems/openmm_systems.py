@@ -147,9 +147,14 @@ def water_box(n=27, spacing=0.31, exact=False):
     return system, np.array(x)
 
 
-@cache
 def alanine(held="AllBonds"):
-    """Alanine dipeptide in vacuum, equilibrated at 300 K with all bonds held: system, x, v."""
+    """Alanine dipeptide in vacuum, equilibrated at 300 K with all bonds held: system, x, v, the test's own copies."""
+    system, x, v = _equilibrated_alanine(held)
+    return copy.deepcopy(system), x.copy(), v.copy()
+
+
+@cache
+def _equilibrated_alanine(held):
     from kcons.openmm import ProjectedIntegrator
 
     pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
@@ -165,7 +170,7 @@ def alanine(held="AllBonds"):
 
 def loose_alanine():
     """The same with a flexible bond to its first atom, a hydrogen, and nothing that removes momentum."""
-    system = copy.deepcopy(alanine()[0])
+    system, x, v = alanine()
     # What is held in space does not go together with a CMMotionRemover.
     kinds = [type(force) for force in system.getForces()]
     system.removeForce(kinds.index(openmm.CMMotionRemover))
@@ -176,7 +181,7 @@ def loose_alanine():
             bond = openmm.HarmonicBondForce()
             bond.addBond(i, j, d, 2e5)
             system.addForce(bond)
-    return system, *alanine()[1:]
+    return system, x, v
 
 
 def holding(**arguments):

@@ -361,7 +361,7 @@ def test_frequency_or_relaxation_time():
     for arguments, match in (
         ((0.0, 1.0), "temperature"),
         ((300.0, 0.0), "frequency"),
-        ((300.0, 1.0 * unit.nanometer), "frequency is 1.0 nm; give it in /ps"),
+        ((300.0, 1.0 * unit.nanometer), "frequency is 1.0 nm; give it in 1/ps"),
         ((1.0 * unit.nanometer, 1.0), "give it in K"),
     ):
         with pytest.raises(InputError, match=match):
