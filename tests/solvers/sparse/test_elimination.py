@@ -1,6 +1,5 @@
 """Order and pattern of the sparse elimination, and its sweeps against dense algebra."""
 
-
 import numpy as np
 import pytest
 
