@@ -27,9 +27,9 @@ import numba as nb
 import numpy as np
 import scipy.sparse as sp
 
-from kcons.compilation import plain_if_small
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
-from kcons.constraints.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
+from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import ImageError, InputError
 

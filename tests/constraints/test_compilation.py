@@ -17,15 +17,15 @@ import pytest
 from numba.core import event
 
 import kcons
-from kcons import compilation
-from kcons.compilation import SMALL, Announcer, plain_if_small
+from kcons.constraints import compilation
+from kcons.constraints.compilation import SMALL, Announcer, plain_if_small
 
 #: Compiles one small kernel; says how many kernels came from the folder, and how many were compiled.
 ONE_KERNEL = """
 import numpy as np
-from kcons import compilation
+from kcons.constraints import compilation
 compilation.PATIENCE = 0.0
-from kcons.constraints.one_piece import follow_parents
+from kcons.constraints.periodic.one_piece import follow_parents
 y = np.array([[0.1, 0, 0], [2.9, 0, 0]])
 follow_parents(y, np.array([1]), np.array([0]), np.array([3 * np.eye(3), np.eye(3) / 3]))
 assert np.allclose(y[1], [-0.1, 0, 0]), y
