@@ -4,7 +4,8 @@
 - `constraint`: the contract of a family
 - `internal`: distances, angles, dihedrals
 - `linear`: fixed atoms, linear relations
-- `surface`, `collective`, `custom`: surfaces, groups, functions of one's own
+- `surface`, `collective`: surfaces, groups
+- `functions`: functions of one's own
 - `velocity`: rows linear in the velocities
 - `contradictions`: targets that exclude each other
 - `one_piece`, `images`, `in_cell`: which periodic images rows mean, and the cell
@@ -18,7 +19,8 @@ from typing import Any
 
 from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfGyration
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.custom import Custom, ImplicitSurface
+from kcons.constraints.functions.custom import Custom, ImplicitSurface
+from kcons.constraints.functions.formula import Formula
 from kcons.constraints.internal import Angle, Dihedral, Distance
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
 from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
@@ -38,6 +40,7 @@ __all__ = [
     "Distance",
     "Ellipsoid",
     "FixedAtoms",
+    "Formula",
     "ImplicitSurface",
     "KnifeEdge",
     "Line",
