@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from kcons.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -219,7 +220,7 @@ def _small_shapes(
 
 def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:
     """Order the rows and atoms of open chains from one end to the other."""
-    order, atoms, starts = _walk(pairs, n_atoms, clusters)
+    order, atoms, starts = plain_if_small(_walk, len(pairs))(pairs, n_atoms, clusters)
     return Shape("chain", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
 
 

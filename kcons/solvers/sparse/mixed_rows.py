@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -83,7 +84,9 @@ class SparseRows:
         widths = np.diff(start)[order]
         slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
-        self._atoms, atom_start, slot_atoms = _number_atoms(flat, slots, pattern.clusters, len(inverse_masses))
+        self._atoms, atom_start, slot_atoms = plain_if_small(_number_atoms, len(flat))(
+            flat, slots, pattern.clusters, len(inverse_masses)
+        )
         w = inverse_masses[self._atoms]
         triple, sides, masses = make_triples(pattern.start, pattern.columns, slots, slot_atoms, w)
         # Row by row: its first entry, its first target, its first slot, its first parameter.

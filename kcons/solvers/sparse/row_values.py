@@ -24,8 +24,8 @@ ANGLE = int(RowKind.ANGLE)
 DIHEDRAL = int(RowKind.DIHEDRAL)
 LINEAR = int(RowKind.LINEAR)
 
-#: Which of the two gradients in a slot's line.
-NOW, REFERENCE = 0, 1
+#: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
+NOW, REFERENCE = np.int64(0), np.int64(1)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
