@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 
 from kcons.errors import InputError, UnsupportedError
@@ -226,8 +227,12 @@ def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...
 
 def _folder() -> Path:
     """Where code is kept: with Numba's own files, or where caches of the user are, or until the process ends."""
-    given = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    for folder in (Path(given) / "kcons-formulas", _passing):
+    given = (
+        os.environ.get("NUMBA_CACHE_DIR")
+        or str(getattr(numba.config, "CACHE_DIR", ""))
+        or os.environ.get("XDG_CACHE_HOME")
+    )
+    for folder in (Path(given or os.path.expanduser("~/.cache")) / "kcons-formulas", _passing):
         path = Path(folder() if callable(folder) else folder)
         try:
             path.mkdir(parents=True, exist_ok=True)
