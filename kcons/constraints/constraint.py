@@ -37,9 +37,8 @@ class RowKind(IntEnum):
     DISTANCE = 1  # no parameters
     ANGLE = 2  # atoms i, j, k with vertex j; no parameters; coordinate theta
     DIHEDRAL = 3  # atoms i, j, k, l; no parameters; coordinate phi, smooth through +-180 degrees
-    LINEAR = 4  # sum_a c_a . r_a; parameters c, 3 numbers an atom, at most 4 atoms
-    SPHERE = 5  # |r - c|; parameters c
-    CYLINDER = 6  # distance from the axis; parameters c, unit axis
+    LINEAR = 4  # sum_a c_a . r_a; parameters c, 3 numbers an atom
+    FUNCTION = 5  # a function that the kernels call; see `kcons.solvers.sparse.row_functions`
 
 
 class Constraint(ABC):

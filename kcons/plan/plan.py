@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -226,11 +226,17 @@ def make_plan(
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
-        clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
+            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
+        if shape.kind == "single" and rank < shape.rows.size:
+            shape = replace(shape, kind="mixed")
+        alone = shape.independent or shape.kind == "single"
+        clusters = [] if alone else _by_cluster(shape.rows.ravel(), labels)
         if clusters and shape.kind in ("sparse", "mixed") and small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
             rank = ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
+            if seen < rank and shape.kind == "mixed":
+                # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
+                solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
         if rank < shape.rows.size:
             plan.dependent += clusters
             if shape.kind in ("water", "lanes"):

@@ -13,6 +13,7 @@ from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent, rank
+from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
@@ -81,7 +82,9 @@ def rank_of_shape(
     time: float,
 ) -> int:
     """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, (SparseRows, SparseDistances)):
+    if isinstance(solver, (SparseRows, SingleRows)):
+        return solver.rank(positions, lattice, time)
+    if isinstance(solver, SparseDistances):
         return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
         return rank_of_small(shape, inverse_masses, positions, lattice)
