@@ -6,11 +6,16 @@ import gc
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 # There is a worker of pytest-xdist for each core: a BLAS with threads of its own waits for them in every small matrix.
 # Set before NumPy is loaded; processes that tests start have it as well.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# No test is timed: machines differ. The same examples in every run; `--hypothesis-profile default` tries others.
+hypothesis.settings.register_profile("kcons", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("kcons")
 
 HERE = Path(__file__).parent
 #: Modules of the package and of its tests, as they are called when they are imported.

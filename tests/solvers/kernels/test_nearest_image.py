@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from kcons.constraints.one_piece import lattice_of
+from kcons.constraints.periodic.one_piece import lattice_of
 from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
 
 
