@@ -113,12 +113,8 @@ def drift(integrator: openmm.Integrator, context: openmm.Context, picoseconds: f
         energies.append(total_energy(context))
     t = np.arange(samples) * every * STEP * 1e-3
     y = np.array(energies) / (0.00831446261815324 * TEMPERATURE * freedom)
-    slope, level = np.polyfit(t, y, 1)
-    # Blocks of what is left, for noise that is correlated in time.
-    left = np.array([block.mean() for block in np.array_split(y - slope * t - level, 10)])
-    middle = np.array([block.mean() for block in np.array_split(t, 10)])
-    error = left.std(ddof=2) / np.sqrt(np.sum((middle - middle.mean()) ** 2))
-    return {"slope": float(slope), "error": float(error), "picoseconds": samples * every * STEP}
+    slope, error = scripts.slope(t, y)
+    return {"slope": slope, "error": error, "picoseconds": samples * every * STEP}
 
 
 def on_platform(title: str, system: openmm.System, positions: Any, place: str, full: bool) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import locale
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 # There is a worker of pytest-xdist for each core: a library with threads of its own waits for them, OpenBLAS in every
@@ -14,6 +15,10 @@ import pytest
 # start has it as well.
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENMM_CPU_THREADS"):
     os.environ.setdefault(threads, "1")
+
+# No test is timed: machines differ. The same examples in every run; `--hypothesis-profile default` tries others.
+hypothesis.settings.register_profile("kcons", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("kcons")
 
 HERE = Path(__file__).parent
 LOCALE = locale.setlocale(locale.LC_ALL)

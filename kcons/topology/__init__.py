@@ -4,6 +4,7 @@
 - `whole_molecules`: groups and molecules made whole across the faces of the cell
 - `guessed_bonds`: bonds for systems that come without
 - `rigid_groups`: rigid groups of atoms as rows
+- `ring_systems`, `angle_rows`: rows that hold all angles, none too many
 - `holding`: the options for what is held, the same for every MD engine
 - `rows_by_name`: rows by name: bonds with hydrogens, all bonds, angles, rigid water
 - `virtual_sites`: massless sites that are placed by three atoms
@@ -12,6 +13,6 @@
 
 from kcons.topology.holding import Holding
 from kcons.topology.rows_by_name import HeldRows, held_rows
-from kcons.topology.topology import Snapshot, Topology
+from kcons.topology.topology import Snapshot, Topology, bond_angles
 
-__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "held_rows"]
+__all__ = ["HeldRows", "Holding", "Snapshot", "Topology", "bond_angles", "held_rows"]

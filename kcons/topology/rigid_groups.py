@@ -429,7 +429,7 @@ def _refuse_coincident(snapshot: Snapshot, atoms: IntArray, s: FloatArray) -> No
         )
 
 
-def inside_bodies(n_atoms: int, pairs: IntArray, groups: Sequence[IntArray]) -> IntArray:
+def inside_bodies(n_atoms: int, pairs: IntArray, groups: Sequence[IntArray]) -> BoolArray:
     """Which of the pairs lie within one body, a mask of shape (n_pairs,)."""
     inside = np.zeros(len(pairs), dtype=bool)
     for atoms in groups:

@@ -14,11 +14,12 @@ from typing import Any, Literal, Unpack
 
 import numpy as np
 
-from kcons.constraints import Angle, Constraint, Distance, LinearRelation
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.errors import InputError
+from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.guessed_bonds import guess_bonds
 from kcons.topology.holding import CONSTRAIN, GroupOptions, Holding, RowMaker
 from kcons.topology.rigid_groups import (
@@ -33,8 +34,6 @@ from kcons.topology.rigid_groups import (
 from kcons.topology.topology import BoolArray, Snapshot, Topology, bond_angles, sorted_pairs
 from kcons.topology.virtual_sites import VirtualSites
 
-#: Beyond this an angle is held by a linear row, in degrees.
-STRAIGHT = 179.0
 #: No bond is that long, in angstrom.
 TORN = 10.0
 
@@ -286,15 +285,21 @@ def _internal(
     rows: list[Constraint] = [Distance(held)]
     if kind in ("hbonds", "allbonds"):
         return rows
-    triples = bond_angles(bonds, topology.n_atoms)
+    quads = np.zeros((0, 4), np.int64)
     if kind == "hangles":
+        triples = bond_angles(bonds, topology.n_atoms)
         ends = hydrogen[triples[:, 0]].astype(int) + hydrogen[triples[:, 2]]
         triples = triples[(ends == 2) | ((ends == 1) & (topology.elements[triples[:, 1]] == "O"))]
-    if selected is not None:
-        triples = triples[selected[triples].all(axis=1)]
+        if selected is not None:
+            triples = triples[selected[triples].all(axis=1)]
+    else:
+        if selected is not None:
+            bonds = bonds[selected[bonds].all(axis=1)]
+        triples, quads = angle_rows(snapshot, bonds, rigid)
+        quads = quads[~inside_bodies(topology.n_atoms, quads, rigid)]
     triples = triples[~inside_bodies(topology.n_atoms, triples, rigid)]
     if angles == "distances":
-        return [*rows, Distance(np.sort(triples[:, [0, 2]], axis=1))]
+        return [*rows, Distance(np.sort(triples[:, [0, 2]], axis=1)), Dihedral(quads)]
     u = minimum_image(snapshot.positions[triples[:, 0]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
     w = minimum_image(snapshot.positions[triples[:, 2]] - snapshot.positions[triples[:, 1]], snapshot.lattice)
     value = np.arctan2(np.linalg.norm(np.cross(u, w), axis=1), np.sum(u * w, axis=1))
@@ -306,7 +311,7 @@ def _internal(
         weights = np.stack([lw, lu], axis=1) / (lu + lw)[:, None]
         i, j, k = triples[straight].T
         rows.append(LinearRelation(j, np.stack([i, k], axis=1), weights))
-    return rows
+    return [*rows, Dihedral(quads)]
 
 
 def _closing(bonds: IntArray, hydrogen: BoolArray) -> BoolArray:

@@ -87,11 +87,11 @@ def test_few_clusters_of_many_kinds_share_the_sparse_solver() -> None:
     ("rows", "expected"),
     [
         ([held.Distance([0, 1]), held.Angle([0, 1, 2])], ("mixed", 1, 2, 2)),
-        ([held.Sphere([0, 1, 2], [9.0, 0, 0])], ("mixed", 3, 3, 3)),
+        ([held.Sphere([0, 1, 2], [9.0, 0, 0])], ("single", 3, 3, 3)),
         ([held.Distance([0, 1]), held.Plane([0, 1], [0, 0, 1.0])], ("mixed", 1, 3, 3)),
         ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
-        ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("general", 1, 4, 4)),
-        ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("general", 1, 2, 1)),
+        ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("mixed", 1, 4, 4)),
+        ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
         ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("general", 1, 1, 1)),
     ],
 )

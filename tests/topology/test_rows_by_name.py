@@ -49,7 +49,8 @@ def counts(rows):
         ("allbonds", {"Distance": 8 + 3}),
         # H-C-H: 3 of the methyl, 1 of the methylene; H-O-C.
         ("hangles", {"Distance": 8 + 3, "Angle": 5}),
-        ("allangles", {"Distance": 8 + 3, "Angle": 6 + 6 + 1}),
+        # Five of the six angles of each carbon, C-O-H.
+        ("allangles", {"Distance": 8 + 3, "Angle": 5 + 5 + 1}),
     ],
 )
 def test_what_is_held_by_name(kind, expected):

@@ -88,6 +88,7 @@ class Isokinetic(Value):
 
     stays_tangent = True
     adds_up = True
+    forceless = True
     temperature: float | None
     kinetic_energy: float | None
     convention: Literal["exact", "notes"]
@@ -174,7 +175,7 @@ class Isokinetic(Value):
 
     def kick(
         self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
-    ) -> None:
+    ) -> str:
         """v = (v + s F)/s' of the closed form, everything divided by exp(z); see `kcons.thermostats.isokinetic.kick`.
 
         F = M_par^+ f only enters as q = h F, which is of the size of velocities.
@@ -203,12 +204,9 @@ class Isokinetic(Value):
         # Drifts change the length of velocities at their order; sqrt(two_k/ww) brings it back.
         p.let("keep", f"select({h}, sqrt(two_k/ww), 1)*decay/scale", "share of the velocities")
         p.let("push", "(aim*z*coshc+sinhc)/scale", "share of the kick")
-        after = "keep*w+push*v"
-        if self.atoms is not None:
-            after = f"select(share, {after}, w+v)"
-        p.each("v", after, "kick")
+        return "keep*w+push*v" if self.atoms is None else "select(share, keep*w+push*v, w+v)"
 
-    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
         raise NotImplementedError
 
     # -- a run ----------------------------------------------------------------------------------

@@ -80,12 +80,12 @@ class Langevin(ConstantEnergy):
         program.number("kept_share", "what friction leaves of v in a step")
         program.number("spread", "size of the noise")
 
-    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
         p = program
         p.let("kept_share", "exp(-friction*dt)", "friction")
         # 1 - exp(-2y) = 2 exp(-y) sinh(y) loses no digits for small y.
         p.let("spread", "sqrt(2*kT*kept_share*sinh(friction*dt))", "noise")
-        p.each("v", f"kept_share*(v+{impulse})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
+        p.each("v", f"kept_share*({u})+spread*gaussian/sqrt(m)", "constraint forces, friction and noise act")
         project()
 
     def settings(self) -> dict[str, float]:

@@ -28,12 +28,15 @@ class Ensemble(Protocol):
     adds_up : bool
         Whether two kicks at the same place, which are one of the sum of their times, are made as one. How steps are
         divided into calls then changes the rounding of the motion.
+    forceless : bool
+        Whether what `kick` returns has no forces in it: then it holds after a drift as well, and v need not be written.
     owes : bool
         Whether the end of a step may be left to the next step if the state is not read between; see `open`.
     """
 
     stays_tangent: bool
     adds_up: bool
+    forceless: bool
     owes: bool
 
     def check(self, scheme: Splitting | None) -> None:
@@ -68,10 +71,10 @@ class Ensemble(Protocol):
 
     def kick(
         self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
-    ) -> None:
+    ) -> str:
         """Let the applied forces act for a time.
 
-        For h = 0 it must do nothing but add the impulse: so the constraints are applied alone.
+        For h = 0 nothing but the impulse may be added: so the constraints are applied alone.
 
         Parameters
         ----------
@@ -86,11 +89,16 @@ class Ensemble(Protocol):
             Writes the computations that make v tangent to all constraints at x.
         tangent : bool
             Whether v is tangent before, without the impulse.
+
+        Returns
+        -------
+        str
+            Expression of the velocities afterwards, which are not yet in v.
         """
         ...
 
-    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
-        """Between two halves of the drift; adds the impulse of the first, and leaves v tangent."""
+    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
+        """Between two halves of the drift: from velocities u, an expression, to v, made tangent by `project`."""
         ...
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:
@@ -127,6 +135,7 @@ class Ensemble(Protocol):
 class Value:
     """An object whose attributes never change; two are equal if their attributes are."""
 
+    forceless = False
     owes = False
 
     def open(self, program: Program) -> None:
@@ -174,13 +183,10 @@ class ConstantEnergy(Value):
 
     def kick(
         self, program: Program, h: str, force: str, impulse: str, project: Callable[[], None], tangent: bool
-    ) -> None:
-        if impulse:
-            program.each("v", f"v+{impulse}+{h}*{force}/m", "the constraint forces act, then the applied ones (kick)")
-        else:
-            program.each("v", f"v+{h}*{force}/m", "the applied forces act (kick)")
+    ) -> str:
+        return "+".join(filter(None, ["v", impulse, f"{h}*{force}/m"]))
 
-    def middle(self, program: Program, impulse: str, project: Callable[[], None]) -> None:
+    def middle(self, program: Program, u: str, project: Callable[[], None]) -> None:
         raise NotImplementedError
 
     def begin(self, integrator: Integrator, context: openmm.Context) -> None:

@@ -83,11 +83,15 @@ class LeanStepWriter(StepWriter):
         with p.when("phase != 2", "up to the new positions"):
             p.let_others_act()
             p.let("kick", "0.5+0.5*behind", "with the half kick that is missing")
-            self._kick("kick*dt", tangent=True)
-            h = "(0.5*dt)" if self.halves else "dt"
+            u, h = "v", "(0.5*dt)" if self.halves else "dt"
+            if ensemble.forceless:
+                u = self._kicked("kick*dt", tangent=True)
+            else:
+                self._kick("kick*dt", tangent=True)
             if self.halves:
-                ensemble.middle(p, self._drift(h), self._project)
-            p.each("v", f"v+{self._drift(h)}", "the constraint forces act on v as well")
+                ensemble.middle(p, f"{u}+{self._drift(h, u)}", lambda: None)  # the second half absorbs what is across
+                u = "v"
+            p.each("v", f"{u}+{self._drift(h, u)}", "the constraint forces act on v as well")
             if ensemble.stays_tangent:
                 self._project()
         with p.when("between+delta(phase-1) = 0", "somebody looks at the velocities"):
@@ -99,16 +103,17 @@ class LeanStepWriter(StepWriter):
 
     # -- impulses without rounding --------------------------------------------------------------
 
-    def _drift(self, h: str) -> str:
+    def _drift(self, h: str, u: str = "v") -> str:
         """As there. What a drift does to v lies along the gradients where it began: the rest of (x-xu)/h is rounding.
 
         (x-xu)/h has the rounding errors of x, divided by h. The projector where the drift began tells what of it is
         along the constraints.
         """
         if not self.filtered:
-            return super()._drift(h)
+            return super()._drift(h, u)
         p = self.program
         use(p, "x_start", "v_next")
+        # u is v: only velocity Verlet begins with another, and its drift is long.
         p.each("x_start", "x", "where the drift begins")
         p.each("x", f"x+{h}*v", "move freely (drift)")
         p.each("xu", "x", "where that leads")

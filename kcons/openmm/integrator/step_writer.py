@@ -82,7 +82,7 @@ class StepWriter:
             if kicks[0]:
                 self._kick(_of_dt(kicks[0]), tangent=True)
             if self.halves:
-                self.ensemble.middle(p, self._drift(h), self._project)
+                self.ensemble.middle(p, f"v+{self._drift(h)}", lambda: None)  # the second half absorbs what is across
             impulse = self._drift(h)
         with p.when("phase != 1", "with the forces there"):
             if kicks[-1]:
@@ -161,7 +161,8 @@ class StepWriter:
             if self.halves:
                 with p.when("first_stage = 0", "a step"):
                     p.let("h", "dt*drift_share(0)", "length of the first drift")
-                    self.ensemble.middle(p, self._drift("h"), self._project)
+                    # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
+                    self.ensemble.middle(p, f"v+{self._drift('h')}", self._project)
                     p.let("stage", "1", "what follows")
             if self._last_drift_apart:
                 self._write_single()
@@ -244,15 +245,21 @@ class StepWriter:
         self._kick("dt*kick_share(stage)", impulse)
 
     def _kick(self, h: str, impulse: str = "", tangent: bool = False) -> None:
-        # The leapfrog's velocities belong to half a step before.
-        self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent and self.scheme is not None)
+        words = "constraint forces act, then the applied ones" if impulse else "applied forces act"
+        self.program.each("v", self._kicked(h, impulse, tangent), f"the {words} (kick)")
 
-    def _drift(self, h: str) -> str:
-        """Fly h along all constraints; returns the impulse that keeps x on them, to be added to v."""
+    def _kicked(self, h: str, impulse: str = "", tangent: bool = False) -> str:
+        """The velocities after a kick, which a drift may begin with."""
+        # The leapfrog's velocities belong to half a step before.
+        tangent = tangent and self.scheme is not None
+        return self.ensemble.kick(self.program, h, self.force, impulse, self._project, tangent)
+
+    def _drift(self, h: str, u: str = "v") -> str:
+        """Fly h along all constraints with velocities u; returns the impulse that keeps x on them, to be added to u."""
         p = self.program
         for part in self.parts:
             part.remember(p)
-        self._land("v", h)
+        self._land(u, h)
         if self.scheme is None:
             p.each("impulse", f"(x-xu)/{h}", "what the constraint forces do to v")
             return "impulse"
@@ -261,6 +268,7 @@ class StepWriter:
     def _land(self, u: str, h: str) -> None:
         """Fly freely for h with velocities u, and go from there back onto all constraints."""
         p = self.program
+        u = u if u.isidentifier() else f"({u})"
         foreseen = "+".join(filter(None, [part.foresee(p) for part in self.parts]))
         if foreseen:
             p.each("xu", f"x+{h}*{u}", "where free motion leads (drift)")

@@ -7,6 +7,7 @@ from io import StringIO
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -69,3 +70,16 @@ def test_measurements_are_continued(tmp_path: Path, there: bool) -> None:
     kept = json.loads(out.read_text())
     assert kept["parts"] == [1, 2] and "cpu" in kept["environment"]
     assert scripts.continued(None, lambda **given: {"none": given["earlier"]}, quick=True) == {"none": None}
+
+
+def test_slope_has_the_error_of_correlated_noise() -> None:
+    """Of 400 runs, the standard deviation of the slopes is what their errors say."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 2.0, 500)
+    white = rng.normal(size=(400, 540))
+    noise = np.stack([np.convolve(row, np.full(10, 0.1), mode="valid")[:500] for row in white])
+    found = np.array([scripts.slope(t, 3.0 * t + 1.0 + row) for row in noise])
+    assert found[:, 0].mean() == pytest.approx(3.0, abs=4 * found[:, 0].std() / 20)
+    # Eight degrees of freedom: the root mean square of the errors is known to 1.8 %, the deviation to 3.5 %.
+    assert np.sqrt(np.mean(found[:, 1] ** 2)) == pytest.approx(found[:, 0].std(), rel=0.16)
+    assert scripts.slope(t, 2.0 - t) == pytest.approx((-1.0, 0.0), abs=1e-12)

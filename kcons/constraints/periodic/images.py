@@ -27,8 +27,9 @@ import numba as nb
 import numpy as np
 import scipy.sparse as sp
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray, RowKind
-from kcons.constraints.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
+from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import ImageError, InputError
 
@@ -101,7 +102,7 @@ class Images:
 
     def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
         """`needed` and the atoms by which they are made whole."""
-        return self.atoms[_with_ancestors(self.atoms, self.parents, needed, n_atoms)]
+        return self.atoms[plain_if_small(_with_ancestors, len(self.atoms))(self.atoms, self.parents, needed, n_atoms)]
 
 
 def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError:

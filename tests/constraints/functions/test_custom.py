@@ -101,7 +101,7 @@ def test_a_gradient_that_vanishes_is_refused():
     ("make", "message"),
     [
         (lambda: Custom([0, 1], 3.0, gap_gradient), "function must be a function"),
-        (lambda: Custom([0, 1], gap, None), "gradient must be a function"),
+        (lambda: Custom([0, 1], gap, 3.0), "gradient must be a function"),
         (lambda: Custom([0, 1], gap, gap_gradient, length=0.0), "length must be positive"),
         (lambda: Custom([0, 1], gap, gap_gradient, time_step=np.nan), "time_step must be positive"),
     ],

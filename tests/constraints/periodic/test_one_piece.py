@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraints.one_piece import (
+from kcons.constraints.periodic.one_piece import (
     follow_parents,
     lattice_of,
     lined_up,

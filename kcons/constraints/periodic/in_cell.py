@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.images import Images, image_error
-from kcons.constraints.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
+from kcons.constraints.periodic.images import Images, image_error
+from kcons.constraints.periodic.one_piece import lattice_of, lined_up, make_whole, minimum_image, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -27,7 +27,7 @@ class InCell:
     lattice : ndarray, shape (2, 3, 3), or None
         Cell vectors as rows, and the inverse with zeros for directions without periodicity.
     images : Images or None
-        The tree along which atoms of whole rows are made whole; see `kcons.constraints.images`.
+        The tree along which atoms of whole rows are made whole; see `kcons.constraints.periodic.images`.
     """
 
     constraints: tuple[Constraint, ...]
@@ -227,7 +227,7 @@ class InCell:
         return joined([function(c) for c in self.constraints])
 
     def whole(self, x: FloatArray) -> FloatArray:
-        """Positions in which atoms of whole rows stand in the images that these rows mean; see `constraints.images`.
+        """Positions in which atoms of whole rows stand in the images that these rows mean; see `periodic.images`.
 
         `x` itself where all rows are plain.
         """

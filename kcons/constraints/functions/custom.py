@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANY, lent, numbers
-from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
 from kcons.errors import InputError
 
+_FLOAT = np.dtype(np.float64)
 #: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
 _WRONG = 1e-3
 
@@ -21,19 +22,23 @@ _WRONG = 1e-3
 class FunctionRows(Constraint):
     """Rows whose coordinate and gradient are Python functions.
 
-    What is not given is taken by central differences: the curvature from four gradients along v, order
-    four, at steps of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`);
-    time derivatives by eighth-order formulas with step `time_step`.
+    What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
+    of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`); the curvature from four
+    gradients along v in the same way, or without these from eight values along v, order eight, at steps of `length`/50
+    (about ten digits); time derivatives by eighth-order formulas with step `time_step`.
     """
 
     held = ANY
+    kind = RowKind.FUNCTION
+    #: Whether the functions take one row at a time.
+    by_row: ClassVar[bool] = True
     functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
 
     def __init__(
         self,
         atoms: ArrayLike,
         function: Callable[..., Any],
-        gradient: Callable[..., Any],
+        gradient: Callable[..., Any] | None,
         hessian_vector: Callable[..., Any] | None,
         target: Target,
         time_dependent: bool,
@@ -43,7 +48,7 @@ class FunctionRows(Constraint):
     ) -> None:
         super().__init__(atoms, target)
         for name, given in (("function", function), ("gradient", gradient)):
-            if not callable(given):
+            if not callable(given) and (given is not None or name == "function"):
                 raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
         for name, size in (("length", length), ("time_step", time_step)):
             if size is not None and not (np.isfinite(size) and size > 0):
@@ -71,7 +76,48 @@ class FunctionRows(Constraint):
         return self._call(self.function, "function", (), r, *self._time(time))
 
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        if self.gradient_function is None:
+            return self._differenced_gradient(r, time)
         return self._call(self.gradient_function, "gradient", (self.width, 3), r, *self._time(time))
+
+    def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
+        step, slope = 1e-3 * self._length(r), np.empty(r.shape)
+        for a, i in np.ndindex(self.width, 3):
+            along = np.zeros((self.width, 3))
+            along[a, i] = 1.0
+            slope[:, a, i] = self._slope(r, along, step, time)
+        return slope
+
+    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
+        """Differenced change of the value along a direction of unit length."""
+        return first_derivative_4(
+            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+        )
+
+    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
+        """Value and gradient of row `k` alone at `r`, shape (width, 3); for kernels."""
+        here = lent(r)
+        args = (here, time) if self.time_dependent else (here,)
+        value = self._checked(self.function(*args), k, "function", ())
+        if self.gradient_function is None:
+            only = self if self.n_rows == 1 else self.select([k])
+            return float(value), only.gradient(r[None], time)[0]
+        return float(value), self._checked(self.gradient_function(*args), k, "gradient", r.shape)
+
+    def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
+        """What a function returned for row `k`, as float64 of that shape."""
+        if type(found) is float and not shape:
+            return found
+        if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
+            found = numbers(found, f"{self.row_name(k)}: {name}")
+        if found.shape != shape:
+            raise InputError(
+                f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
+                f"{shape if shape else 'one number'}",
+                item=name,
+                atoms=self.atoms[k].tolist(),
+            )
+        return found
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         if self.hessian_vector is None:
@@ -82,6 +128,12 @@ class FunctionRows(Constraint):
     def _differenced_curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         speed = np.sqrt(_contract(v, v))
         along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
+        if self.gradient_function is None:
+            step = 0.02 * self._length(r)
+            bend = second_derivative(
+                lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+            )
+            return bend * speed**2
         slope = first_derivative_4(
             lambda s: _contract(self.gradient(r + s[:, None, None] * along, time), along),
             np.zeros(self.n_rows),
@@ -131,10 +183,9 @@ class FunctionRows(Constraint):
         along = np.random.default_rng(0).normal(size=r.shape)
         along /= np.sqrt(_contract(along, along))[:, None, None]
         length = self._length(r)
-        difference = first_derivative_4(
-            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), 1e-3 * length
-        )
-        self._compare("gradient", _contract(slope, along), difference, size, first_row)
+        if self.gradient_function is not None:
+            difference = self._slope(r, along, 1e-3 * length, time)
+            self._compare("gradient", _contract(slope, along), difference, size, first_row, (r, slope, time))
         if self.hessian_vector is not None:
             curvature = self._differenced_curvature(r, along, time)
             self._compare(
@@ -145,16 +196,31 @@ class FunctionRows(Constraint):
                 first_row,
             )
 
-    def _compare(self, name: str, given: FloatArray, found: FloatArray, size: FloatArray, first_row: int) -> None:
-        self.refuse_input(
-            ~(np.abs(given - found) <= _WRONG * size),
-            first_row,
-            lambda k: (
-                f"{name} gives {given[k]:.6g} along a test direction, but differences of the function give "
-                f"{found[k]:.6g}; correct it, or give the length over which the function varies (length=...)"
-            ),
-            name,
-        )
+    def _compare(
+        self,
+        name: str,
+        given: FloatArray,
+        found: FloatArray,
+        size: FloatArray,
+        first_row: int,
+        components: tuple[FloatArray, FloatArray, float] | None = None,
+    ) -> None:
+        """Refuse what differences contradict; of a gradient, with `components`, the worst of these is named."""
+
+        def said(k: int) -> str:
+            one, other, where = given[k], found[k], "along a test direction"
+            if components is not None:
+                r, slope, time = components
+                differenced = self._differenced_gradient(r, time)[k]
+                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - differenced))), slope[k].shape)
+                one, other = slope[k, a, i], differenced[a, i]
+                where = f"for {'xyz'[i]} of its atom {self.atoms[k, a]}"
+            return (
+                f"{name} gives {one:.6g} {where}, but differences of the function give {other:.6g}; correct it, or "
+                "give the length over which the function varies (length=...)"
+            )
+
+        self.refuse_input(~(np.abs(given - found) <= _WRONG * size), first_row, said, name)
 
 
 class ImplicitSurface(FunctionRows):
@@ -166,8 +232,9 @@ class ImplicitSurface(FunctionRows):
         The atoms; each is one row.
     function : callable
         ``function(r) -> (n_rows,)`` for positions of shape (n_rows, 3); with `time_dependent`, ``(r, t)``.
-    gradient : callable
-        ``gradient(r) -> (n_rows, 3)``; with `time_dependent`, ``(r, t)``.
+    gradient : callable, optional
+        ``gradient(r) -> (n_rows, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced: see
+        `length`.
     hessian_vector : callable, optional
         ``hessian_vector(r, v) -> (n_rows, 3)``, the Hessian of q times v; with `time_dependent`,
         ``(r, v, t)``. Without it the gradient is differenced along v: see `length`.
@@ -208,12 +275,13 @@ class ImplicitSurface(FunctionRows):
 
     family = "ImplicitSurface"
     row_width = 1
+    by_row = False
 
     def __init__(
         self,
         atoms: ArrayLike,
         function: Callable[..., Any],
-        gradient: Callable[..., Any],
+        gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
         target: Target = 0.0,
         *,
@@ -226,6 +294,15 @@ class ImplicitSurface(FunctionRows):
         super().__init__(
             column, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
         )
+
+    @property
+    def kind(self) -> RowKind:  # type: ignore[override]
+        """Kernels take rows one by one, and only what knows a single row can be asked for one."""
+        return RowKind.FUNCTION if self.n_rows == 1 else RowKind.INTERPRETED
+
+    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
+        here = r[None]
+        return float(self.measure(here, time)[0]), self.gradient(here, time)[0]
 
     def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
         flat = [lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments]
@@ -252,11 +329,13 @@ class Custom(FunctionRows):
         Atoms of each row.
     function : callable
         ``function(r) -> float`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``.
-    gradient : callable
-        ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``.
+    gradient : callable, optional
+        ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced, order
+        four, at steps of 1e-3 `length`: about eleven digits. Where Numba has compiled it and the function, kernels call
+        both without Python.
     hessian_vector : callable, optional
         ``hessian_vector(r, v) -> (width, 3)``; with `time_dependent`, ``(r, v, t)``. Without it the
-        gradient is differenced along v, order four, at steps of 1e-3 `length`: about eleven digits.
+        gradient is differenced along v, as above.
     target : float, array_like, callable of time, MovingTarget or None
         Value held; None takes the initial one.
     time_dependent : bool
@@ -287,7 +366,7 @@ class Custom(FunctionRows):
         self,
         atoms: ArrayLike,
         function: Callable[..., Any],
-        gradient: Callable[..., Any],
+        gradient: Callable[..., Any] | None = None,
         hessian_vector: Callable[..., Any] | None = None,
         target: Target = None,
         time_derivatives: Callable[..., Any] | None = None,
@@ -308,15 +387,7 @@ class Custom(FunctionRows):
         out = np.empty((self.n_rows, *shape))
         for k in range(self.n_rows):
             found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
-            result = numbers(found, f"{self.row_name(k)}: {name}")
-            if result.shape != shape:
-                raise InputError(
-                    f"Custom: {name} returned shape {result.shape} for row {k}; it must return "
-                    f"{shape if shape else 'one number'}",
-                    item=name,
-                    atoms=self.atoms[k].tolist(),
-                )
-            out[k] = result
+            out[k] = self._checked(found, k, name, shape)
         return out
 
 

@@ -1,6 +1,6 @@
 """Periodic cells: shortest images, and what hangs together moved into one piece.
 
-The one place in which atoms are moved by whole cells: for rows (`kcons.constraints.images`), for molecules of files
+The one place in which atoms are moved by whole cells: for rows (`images`), for molecules of files
 (`kcons.topology.whole_molecules`) and for molecules that are restored (`kcons.motion.restoring`).
 """
 

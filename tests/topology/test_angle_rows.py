@@ -1,0 +1,221 @@
+"""All angles: the rows are independent, well-conditioned, and hold every angle, also those that are no rows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from ase.build import molecule
+from host_systems import VILLIN
+from openmm import app
+from snapshots import snapshot
+
+import kcons.openmm
+from kcons.constraints import Angle, Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.motion import Motion
+from kcons.topology.angle_rows import FLAT_CENTRE, angle_rows
+from kcons.topology.guessed_bonds import guess_bonds
+from kcons.topology.rows_by_name import held_rows
+from kcons.topology.topology import bond_angles, sorted_pairs
+
+
+def singular_values(whole, x):
+    """Of rows of length 1, weighted with the masses."""
+    rows = whole.jacobian(x).toarray() / np.sqrt(np.repeat(whole.masses, 3))
+    return np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True), compute_uv=False)
+
+
+def condition(whole, x):
+    """Of the independent rows, and how many these are."""
+    s = singular_values(whole, x)
+    rank = int((s > 1e-9 * s[0]).sum())
+    return s[0] / s[rank - 1], rank
+
+
+def every_angle(made):
+    bonds = made.topology.bonds
+    items = [Distance(bonds), Angle(bond_angles(bonds, len(made.positions)))]
+    return ConstraintSet(items, made.positions, made.topology.masses)
+
+
+def of_ase(name):
+    atoms = molecule(name)
+    made = snapshot(atoms.get_chemical_symbols(), atoms.positions, masses=atoms.get_masses())
+    return replace(made, topology=made.topology.with_bonds(guess_bonds(made)))
+
+
+def star(directions, elements=None):
+    """An atom with neighbours in these directions."""
+    e = np.array(directions, dtype=float)
+    e = e / np.linalg.norm(e, axis=1, keepdims=True)
+    n = len(e)
+    return snapshot(elements or ["C"] * (n + 1), np.vstack([np.zeros(3), 1.2 * e]), [(0, k + 1) for k in range(n)])
+
+
+def pyramid(improper):
+    """Three neighbours at equal angles, with this improper dihedral in degrees."""
+    # Unit vectors of elevation h below the plane; the dihedral of two about the third.
+    heights = np.linspace(0.0, 1.5, 20_001)
+    a, b, c = (
+        np.stack([np.cos(t) * np.cos(heights), np.sin(t) * np.cos(heights), -np.sin(heights)], axis=1)
+        for t in np.radians([0, 120, 240])
+    )
+    p, q = np.cross(a, b), np.cross(a, c)
+    found = np.degrees(np.arccos(np.einsum("ij,ij->i", p, q) / np.linalg.norm(p, axis=1) / np.linalg.norm(q, axis=1)))
+    k = int(np.argmin(np.abs(found - improper)))
+    return star([a[k], b[k], c[k]])
+
+
+#: Torsions of bonds: all that is left beside bonds and angles.
+TORSIONS = {
+    "C6H6": 0, "C5H5N": 0, "C4H4O": 0, "C4H4NH": 0, "C3H6_D3h": 0, "C3H4_C2v": 0, "cyclobutane": 0, "cyclobutene": 0,
+    "bicyclobutane": 0, "C5H8": 0, "CH4": 0, "NH3": 0, "BF3": 0, "CH3CONH2": 2, "C2H4": 1, "CH3CH2NH2": 2,
+    "trans-butane": 3, "isobutene": 3, "CH3CH2OCH3": 3, "CH3NO2": 1, "HCOOH": 1, "SiH4": 0, "butadiene": 3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TORSIONS)
+def test_rows_are_independent_and_leave_the_torsions(name):
+    made = of_ase(name)
+    rows = held_rows(made, "allangles")
+    s = singular_values(rows.constraint_set, made.positions)
+    assert len(s) == 3 * len(made.positions) - 6 - TORSIONS[name]
+    assert s[-1] > 0.02 * s[0]
+
+
+@pytest.mark.parametrize("name", ["C6H6", "CH3CONH2", "C5H5N", "bicyclobutane", "trans-butane", "NH3"])
+def test_every_angle_stays_also_those_that_are_no_rows(name):
+    """Moved away and put back onto the rows, the molecule has the angles that it had."""
+    made = of_ase(name)
+    rows = held_rows(made, "allangles")
+    motion = Motion(rows.constraint_set, made.positions)
+    assert motion.rank == rows.constraint_set.n_rows
+    every = every_angle(made)
+    for seed in range(3):
+        off = made.positions + 0.03 * np.random.default_rng(seed).normal(size=made.positions.shape)
+        on = motion.restore_positions(off)
+        assert np.abs(every.value(off)).max() > 0.01
+        # At 360 degrees in all, an angle feels the square of what is left out of the plane, not more.
+        assert np.abs(every.value(on)).max() < 1e-12
+
+
+def test_a_piece_of_villin_with_its_rings_is_well_conditioned():
+    """NLPLWKQ: proline, tryptophan, amides; before, three angles at each flat centre and all six elsewhere."""
+    pdb = app.PDBFile(str(VILLIN))
+    some = [atom.index for atom in pdb.topology.atoms() if 18 <= atom.residue.index <= 24]
+    rows = kcons.openmm.constraints_of(pdb.topology, pdb.positions, "allangles", select=some, rigid_water=False)
+    assert {atom.residue.name for atom in pdb.topology.atoms() if atom.index in some} >= {"PRO", "TRP"}
+    whole, x = rows.constraint_set, rows.snapshot.positions
+    now, rank = condition(whole, x)
+    bonds = rows[0].atoms
+    plain = ConstraintSet([Distance(bonds), Angle(bond_angles(bonds, len(x)))], x, whole.masses)
+    before, all_ranks = condition(plain, x)
+    assert rank == whole.n_rows == all_ranks < plain.n_rows
+    assert now < 100
+    assert before > 5000
+
+
+def test_a_flat_centre_has_an_improper_dihedral():
+    made = star([[1, 0, 0], [-0.5, 0.9, 0.01], [-0.5, -0.8, 0]])
+    rows = held_rows(made, "allangles")
+    assert [item.family for item in rows] == ["Distance", "Angle", "Dihedral"]
+    assert condition(rows.constraint_set, made.positions)[0] < 4
+    assert condition(every_angle(made), made.positions)[0] > 100
+
+
+@pytest.mark.parametrize(("away", "dihedrals"), [(-1.0, 1), (+1.0, 0)])
+def test_flat_is_an_improper_of_150_degrees(away, dihedrals):
+    triples, quads = angle_rows(made := pyramid(180 - FLAT_CENTRE - away), made.topology.bonds, [])
+    assert (len(triples), len(quads)) == (3 - dihedrals, dihedrals)
+    # 353 degrees, as the documentation has it.
+    x = made.positions / 1.2
+    around = sum(np.degrees(np.arccos(x[i] @ x[j])) for i, j in combinations(range(1, 4), 2))
+    assert around == pytest.approx(353, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("directions", "rows"),
+    [
+        ([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], 5),
+        ([[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0.1, 1], [0.1, 0, -1]], 7),
+        # Four in a plane at no right angle: two impropers.
+        ([[1, 0, 0], [0.2, 1, 0], [-1, 0.3, 0], [0, -1, 0]], 5),
+    ],
+)
+def test_centres_of_four_and_five_have_two_n_minus_three_rows(directions, rows):
+    made = star(directions)
+    found = held_rows(made, "allangles")
+    assert found.constraint_set.n_rows == len(directions) + rows
+    assert condition(found.constraint_set, made.positions)[1] == found.constraint_set.n_rows
+    assert condition(found.constraint_set, made.positions)[0] < 15
+
+
+@pytest.mark.parametrize(
+    "directions",
+    [
+        [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]],
+        [[1, 0, 0], [0, 1, 0], [-1, 0, 0]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    ],
+)
+def test_straight_angles_hold_an_end_by_a_linear_row(directions):
+    """T-shaped, square and octahedral: rigid; the linear rows hold bonds once more, and are counted."""
+    made = star(directions)
+    rows = held_rows(made, "allangles")
+    assert condition(rows.constraint_set, made.positions)[1] == 3 * len(directions) - 3
+    assert Motion(rows.constraint_set, made.positions).degrees_of_freedom == 6
+
+
+def test_of_six_angles_the_one_between_the_lightest_is_none_of_the_rows():
+    methylene = star([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], ["C", "H", "C", "H", "C"])
+    triples, quads = angle_rows(methylene, methylene.topology.bonds, [])
+    assert len(quads) == 0
+    left = {(i, k) for i, k in combinations(range(1, 5), 2)} - {(i, k) for i, _, k in triples.tolist()}
+    assert left == {(1, 3)}
+    best = condition(held_rows(methylene, "allangles").constraint_set, methylene.positions)[0]
+    for other in combinations(range(1, 5), 2):
+        pairs = [(i, 0, k) for i, k in combinations(range(1, 5), 2) if (i, k) != other]
+        whole = ConstraintSet(
+            [Distance(methylene.topology.bonds), Angle(pairs)], methylene.positions, methylene.topology.masses
+        )
+        assert condition(whole, methylene.positions)[0] >= best - 1e-9
+
+
+def test_beside_a_rigid_body_only_what_it_leaves_is_held():
+    made = of_ase("C6H6")
+    carbons = np.flatnonzero(made.topology.elements == "C")
+    rows = held_rows(made, "allangles", rigid_bodies=[carbons])
+    s = singular_values(rows.constraint_set, made.positions)
+    assert len(s) == 3 * 12 - 6
+    assert s[-1] > 0.02 * s[0]
+    # A body of two bonds of a carbon: the first of the others has two rows, as the second.
+    made = of_ase("CH4")
+    rows = held_rows(made, "allangles", rigid_bodies=[[0, 3, 4]])
+    assert condition(rows.constraint_set, made.positions)[1] == rows.constraint_set.n_rows == 9
+    # Two bodies that share an atom: three rows turn one against the other.
+    rows = held_rows(made, "allangles", rigid_bodies=[[0, 1, 2], [0, 3, 4]])
+    assert condition(rows.constraint_set, made.positions)[1] == rows.constraint_set.n_rows == 9
+
+
+def test_selected_atoms_and_distances():
+    made = of_ase("CH3CONH2")
+    some = np.ones(len(made.positions), dtype=bool)
+    some[-1] = False
+    rows = held_rows(made, "allangles", selected=some)
+    assert condition(rows.constraint_set, made.positions)[1] == rows.constraint_set.n_rows
+    assert not any((item.atoms == len(some) - 1).any() for item in rows)
+    apart = held_rows(made, "allangles", angles="distances")
+    assert {item.family for item in apart} == {"Distance", "Dihedral"}
+    assert condition(apart.constraint_set, made.positions)[1] == 3 * len(made.positions) - 6 - 2
+    assert condition(apart.constraint_set, made.positions)[0] < 50
+
+
+def test_the_order_of_the_bonds_does_not_matter():
+    made = of_ase("C5H5N")
+    turned = sorted_pairs(made.topology.bonds[::-1, ::-1])
+    for one, two in zip(angle_rows(made, made.topology.bonds, []), angle_rows(made, turned, []), strict=True):
+        np.testing.assert_array_equal(one, two)
+        assert len(np.unique(one, axis=0)) == len(one)
