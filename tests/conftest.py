@@ -10,9 +10,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# There is a worker of pytest-xdist for each core: a library with threads of its own waits for them, OpenBLAS in every
-# small matrix, tblite (OpenMP) in every step of nine atoms, OpenMM in every force. Set before they are loaded; what tests
-# start has it as well.
+# There is a worker of pytest-xdist for each core. A library with threads of its own waits for them: OpenBLAS in every
+# small matrix, tblite (OpenMP) in every step of nine atoms, OpenMM in every force. Set before they are loaded;
+# processes that tests start have it as well.
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENMM_CPU_THREADS"):
     os.environ.setdefault(threads, "1")
 
