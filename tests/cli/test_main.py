@@ -72,7 +72,7 @@ def test_plan_of_a_fluid(capsys):
     assert "27 rigid TIP3P waters" in text and "rank 81" in text
 
 
-def test_default_folder_is_named_after_the_scene(tmp_path, monkeypatch, capsys):
+def test_default_folder_is_named_after_the_system(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
     assert (tmp_path / "compare-sphere" / "compare.json").exists()

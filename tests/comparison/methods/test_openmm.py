@@ -33,7 +33,7 @@ def build(name):
 
 
 @pytest.fixture(scope="module", params=HOSTED)
-def scene(request):
+def hosted(request):
     return build(request.param)
 
 
@@ -42,8 +42,8 @@ def rotor():
     return test_systems.build("rotor").shortened(4)
 
 
-def errors(scene, *names, **options):
-    found = measure.compare(scene, methods=names, **options)
+def errors(hosted, *names, **options):
+    found = measure.compare(hosted, methods=names, **options)
     assert {m.status for m in found.measurements} <= {"ok", "thermostat"}, [m.note for m in found.measurements]
     return found, [[m.error for m in found.of(name)] for name in names]
 
@@ -51,38 +51,38 @@ def errors(scene, *names, **options):
 # -- the same system --------------------------------------------------------------------------------
 
 
-def test_forces_masses_and_distances_are_those_of_the_scene(scene):
-    host = scene.openmm
+def test_forces_masses_and_distances_are_those_of_the_system(hosted):
+    host = hosted.openmm
     place = openmm.Platform.getPlatformByName(host.platform)
     context = openmm.Context(host.copy(), openmm.VerletIntegrator(0.001), place)
     rng = np.random.default_rng(0)
-    x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
+    x = hosted.positions + 0.01 * rng.standard_normal(hosted.positions.shape)
     context.setPositions(x * host.length)
     state = context.getState(forces=True, energy=True)
     forces = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
     energy = state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole) / host.speed**2
-    wanted = scene.potential.forces(x)
+    wanted = hosted.potential.forces(x)
     # Internal units of ASE and OpenMM agree to the digits that constants of nature are given with.
     np.testing.assert_allclose(forces * host.length / host.speed**2, wanted, rtol=0, atol=1e-9 * abs(wanted).max())
-    assert energy == pytest.approx(scene.potential.energy(x), rel=1e-8, abs=1e-12)
+    assert energy == pytest.approx(hosted.potential.energy(x), rel=1e-8, abs=1e-12)
     system = host.system
     masses = [system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(system.getNumParticles())]
-    np.testing.assert_array_equal(masses, scene.masses)
+    np.testing.assert_array_equal(masses, hosted.masses)
     rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    if scene.bonds is not None:
-        assert [(i, j) for i, j, _ in rows] == [tuple(pair) for pair in scene.bonds.tolist()]
-        lengths = np.linalg.norm(np.diff(scene.positions[scene.bonds], axis=1)[:, 0], axis=1)
+    if hosted.bonds is not None:
+        assert [(i, j) for i, j, _ in rows] == [tuple(pair) for pair in hosted.bonds.tolist()]
+        lengths = np.linalg.norm(np.diff(hosted.positions[hosted.bonds], axis=1)[:, 0], axis=1)
         np.testing.assert_allclose([d._value for *_, d in rows], lengths * host.length, rtol=1e-13)
     assert host.copy(constraints=False).getNumConstraints() == 0
 
 
 def test_water_has_the_same_forces_in_single_precision():
-    scene = test_systems.build("water", 8)
-    host = scene.openmm
+    hosted = test_systems.build("water", 8)
+    host = hosted.openmm
     assert host.platform == "CPU"
-    x = scene.positions
+    x = hosted.positions
     forces = host.potential().forces(x)
-    wanted = scene.potential.forces(x)
+    wanted = hosted.potential.forces(x)
     np.testing.assert_allclose(forces, wanted, rtol=0, atol=1e-5 * abs(wanted).max())
     assert host.system.getNumConstraints() == 24
 
@@ -94,15 +94,15 @@ def test_water_cut_off_by_ase_has_no_system():
 # -- the same trajectories --------------------------------------------------------------------------
 
 
-def test_same_errors_as_on_arrays(scene):
-    scene = replace(scene, time_steps=scene.time_steps[1:3])
-    surfaces = bool(scene.openmm.surfaces)
+def test_same_errors_as_on_arrays(hosted):
+    hosted = replace(hosted, time_steps=hosted.time_steps[1:3])
+    surfaces = bool(hosted.openmm.surfaces)
     own = ("openmm-surface-rattle",) if surfaces else ("openmm-verlet-1e-12", "openmm-kcons-rattle")
-    found, (core, *others) = errors(scene, "rattle", *own, "openmm-held-rattle")
+    found, (core, *others) = errors(hosted, "rattle", *own, "openmm-held-rattle")
     for other in others:
         assert other == pytest.approx(core, rel=1e-6)
-    # The energy is that of OpenMM, in units of the scene.
-    if "pendulum" in scene.name or scene.name == "alanine":
+    # The energy is that of OpenMM, in units of the test system.
+    if "pendulum" in hosted.name or hosted.name == "alanine":
         core_slope, held_slope = (found.of(name)[-1].energy_slope for name in ("rattle", "openmm-held-rattle"))
         assert np.sign(core_slope) == np.sign(held_slope)
     for m in found.measurements:
@@ -117,9 +117,9 @@ def test_same_errors_as_on_arrays(scene):
     [("rotor", "blanes-moan6"), ("alanine", "blanes-moan4"), ("alanine", "kahan-li6"), ("dumbbells", "suzuki4")],
 )
 def test_higher_orders_are_the_same_scheme(name, scheme):
-    scene = build(name)
-    scene = replace(scene, time_steps=scene.time_steps[-2:])
-    _, (core, hosted) = errors(scene, scheme, f"openmm-kcons-{scheme}")
+    hosted = build(name)
+    hosted = replace(hosted, time_steps=hosted.time_steps[-2:])
+    _, (core, hosted) = errors(hosted, scheme, f"openmm-kcons-{scheme}")
     # Velocities in OpenMM take up the rounding of the positions divided by a substep.
     assert hosted == pytest.approx(core, rel=1e-3, abs=3e-11)
     assert hosted[1] < 0.1 * hosted[0]
@@ -127,17 +127,17 @@ def test_higher_orders_are_the_same_scheme(name, scheme):
 
 @pytest.mark.parametrize("scheme", ["geodesic", "suzuki4", "blanes-moan6"])
 def test_schemes_on_spheres(scheme):
-    scene = test_systems.build("sphere-pendulum", 2)
-    scene = replace(scene, time_steps=scene.time_steps[-2:])
-    _, (core, hosted) = errors(scene, scheme, f"openmm-surface-{scheme}")
+    hosted = test_systems.build("sphere-pendulum", 2)
+    hosted = replace(hosted, time_steps=hosted.time_steps[-2:])
+    _, (core, hosted) = errors(hosted, scheme, f"openmm-surface-{scheme}")
     assert hosted == pytest.approx(core, rel=1e-3)
 
 
 def test_built_in_integrators_without_a_bath_are_the_same_leapfrog():
-    scene = build("alanine")
-    scene = replace(scene, time_steps=scene.time_steps[:2])
+    hosted = build("alanine")
+    hosted = replace(hosted, time_steps=hosted.time_steps[:2])
     names = ("openmm-verlet-1e-10", "openmm-middle-1e-10", "openmm-nose-hoover-1e-10", "openmm-kcons-leapfrog")
-    found, (verlet, *others) = errors(scene, *names)
+    found, (verlet, *others) = errors(hosted, *names)
     for other in others:
         assert other == pytest.approx(verlet, rel=1e-6)
     # Velocities half a step off the positions are not tangent to them.
@@ -157,10 +157,10 @@ def test_tolerance_decides_about_the_residual(rotor):
 
 
 def test_thermostats_state_no_error():
-    scene = build("alanine")
-    scene = replace(scene, time_steps=scene.time_steps[:1])
+    hosted = build("alanine")
+    hosted = replace(hosted, time_steps=hosted.time_steps[:1])
     names = ("openmm-middle-bath", "openmm-nose-hoover-bath")
-    found, _ = errors(scene, *names)
+    found, _ = errors(hosted, *names)
     for m in found.measurements:
         assert (m.status, m.error, m.energy_slope) == ("thermostat", None, None)
         assert m.constraint_residual < 1e-4
@@ -202,8 +202,8 @@ def counted():
     ],
 )
 def test_force_evaluations_are_counted_right(counted, name):
-    scene, calls = counted
-    run = methods.METHODS[name].start(scene, 0.1)
+    hosted, calls = counted
+    run = methods.METHODS[name].start(hosted, 0.1)
     made = steps = 0
     while not run.finished:
         # What an onlooker asks for costs the run nothing, and saves it nothing.
@@ -264,9 +264,9 @@ def test_set_up_beyond_the_budget_is_refused_from_then_on(rotor):
 
 
 def test_failure_is_told(rotor):
-    scene = build("alanine")
-    scene = replace(scene, time_steps=(scene.horizon / 4,))
-    found = measure.compare(scene, methods=["openmm-kcons-rattle"])
+    hosted = build("alanine")
+    hosted = replace(hosted, time_steps=(hosted.horizon / 4,))
+    found = measure.compare(hosted, methods=["openmm-kcons-rattle"])
     (m,) = found.measurements
     assert m.status == "failed"
     assert "Error" in m.note
@@ -275,15 +275,15 @@ def test_failure_is_told(rotor):
 # -- which methods run ------------------------------------------------------------------------------
 
 
-def test_usual_methods_of_a_scene_at_home_in_openmm():
-    scene = build("alanine")
-    picked = methods.chosen(None, scene)
+def test_usual_methods_of_a_system_at_home_in_openmm():
+    hosted = build("alanine")
+    picked = methods.chosen(None, hosted)
     assert {m.host for m in picked} == {"openmm"}
     names = [m.name for m in picked]
     assert "openmm-verlet-1e-12" in names
     assert "openmm-held-rattle" in names
     assert not any("surface" in name for name in names)
-    assert names == [m.name for m in methods.chosen(["openmm"], scene)]
+    assert names == [m.name for m in methods.chosen(["openmm"], hosted)]
 
 
 def test_guests_on_other_test_systems(rotor):
