@@ -1,6 +1,6 @@
 """kcons holds things fixed in molecular dynamics, exactly and cheaply.
 
-- `errors`, `compilation`: what is raised; compiled kernels, and where they are kept
+- `errors`: what is raised
 - `constraints`, `projection`: what can be held; the theory, dense and literal
 - `topology`: what files say of a system
 - `solvers`, `plan`: constraint solvers, and which one holds what
@@ -17,7 +17,6 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-from kcons import compilation as compilation  # before any kernel is declared
 from kcons import constraints, errors
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion.motion import Motion

@@ -81,7 +81,7 @@ class Constraint(ABC):
     #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
     masses: FloatArray | None = None
     #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
-    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.images`.
+    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.periodic.images`.
     whole: NDArray[np.bool_] | None = None
     windings: IntArray | None = None
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
@@ -63,7 +63,7 @@ class Plan:
     late : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
-        For each solver, whether it takes positions that were made whole, without a cell (see `constraints.images`).
+        For each solver, whether it takes positions that were made whole, without a cell (see `periodic.images`).
     """
 
     constraint_set: ConstraintSet

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.chains.open_chains import Chains

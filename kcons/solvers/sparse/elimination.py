@@ -23,7 +23,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from kcons.compilation import plain_if_small
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.errors import UnsupportedError
 
