@@ -168,7 +168,7 @@ def test_interrupt(monkeypatch, capsys):
     assert capsys.readouterr().err == "kcons: interrupted\n"
 
 
-def test_importing_the_command_imports_no_host():
+def test_importing_the_command_imports_no_md_engine():
     code = (
         "import sys, kcons.cli.main; "
         "print([m for m in ('ase', 'openmm', 'matplotlib', 'rich', 'tblite') if m in sys.modules])"

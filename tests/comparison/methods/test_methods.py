@@ -163,7 +163,7 @@ def test_usual_methods_and_all(monkeypatch):
         methods.chosen(["all", "rattle"])
 
 
-def test_hosts_fix_the_atoms_of_the_slab():
+def test_md_engines_fix_the_atoms_of_the_slab():
     system = test_systems.build("slab")
     for name in ("ase-bonds", "ase-internals", "ase-kcons"):
         run = methods.METHODS[name].start(system, system.time_steps[0])
@@ -190,5 +190,5 @@ def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name
 
 def test_what_has_kernels_loads_them_before_the_clock_starts():
     for method in methods.METHODS.values():
-        if method.host == "kcons" and method.marches:
+        if method.md_engine == "kcons" and method.marches:
             assert type(method).warm_up is not Method.warm_up, method.name

@@ -128,7 +128,7 @@ def test_forces_that_do_not_fit(ethanol, alanine):
     with pytest.raises(InputError, match="residue"):
         quietly(test_systems.from_file, ethanol)  # no template
     with pytest.raises(UnsupportedError, match="holds distances only"):
-        any_file._openmm_host(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
+        any_file._openmm_engine(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
 
 
 def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):

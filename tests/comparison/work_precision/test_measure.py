@@ -45,9 +45,9 @@ def test_error_falls_with_the_square_of_the_step(result, method):
 
 
 def test_rattle_is_the_same_in_the_core_and_in_ase(result):
-    for core, hosted in zip(result.of("rattle"), result.of("ase-kcons"), strict=True):
-        assert hosted.error == pytest.approx(core.error, rel=1e-6)
-        assert hosted.evaluations_per_time == pytest.approx(core.evaluations_per_time)
+    for core, in_openmm in zip(result.of("rattle"), result.of("ase-kcons"), strict=True):
+        assert in_openmm.error == pytest.approx(core.error, rel=1e-6)
+        assert in_openmm.evaluations_per_time == pytest.approx(core.evaluations_per_time)
 
 
 def test_error_is_the_distance_from_the_reference(chain, result):
@@ -269,8 +269,8 @@ def test_quick_comparison(name):
         assert m.constraint_residual < 1e-12
         assert m.velocity_residual < 1e-12
         assert m.evaluations_per_time == pytest.approx(system.units.long_time_unit / system.units.time_unit / m.setting)
-    for core, hosted in zip(plain, result.of("ase-kcons"), strict="ase-kcons" not in refused):
-        assert hosted.error == pytest.approx(core.error, rel=1e-5)
+    for core, in_openmm in zip(plain, result.of("ase-kcons"), strict="ase-kcons" not in refused):
+        assert in_openmm.error == pytest.approx(core.error, rel=1e-5)
     # The projected equation, at its tightest tolerance, is closer than RATTLE.
     assert result.of("dop853")[-1].error < 0.1 * plain[-1].error
     assert result.reference["error"] < 1e-3 * plain[-1].error

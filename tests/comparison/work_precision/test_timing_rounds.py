@@ -41,7 +41,7 @@ def spheres():
 
 
 MARCHING = ("rattle", "suzuki4", "blanes-moan6", "geodesic", "projected-rk4", "baumgarte", "verlet")
-HOSTED = ("ase-kcons", "ase-bonds", "ase-internals", "ase-verlet", "shake-1e-4", "shake-1e-8", "mici", "mici-tight")
+IN_OPENMM = ("ase-kcons", "ase-bonds", "ase-internals", "ase-verlet", "shake-1e-4", "shake-1e-8", "mici", "mici-tight")
 
 
 def started(system, name):
@@ -55,7 +55,7 @@ def started(system, name):
 # -- steps that nobody looks at ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*MARCHING, *HOSTED])
+@pytest.mark.parametrize("name", [*MARCHING, *IN_OPENMM])
 def test_marching_is_advancing(chain, name):
     looked_at, alone = started(chain, name), started(chain, name)
     for _ in range(7):
@@ -78,7 +78,7 @@ def test_marching_is_advancing_with_friction(name):
     np.testing.assert_array_equal(alone.positions, looked_at.positions)
 
 
-@pytest.mark.parametrize("name", [*MARCHING, *HOSTED])
+@pytest.mark.parametrize("name", [*MARCHING, *IN_OPENMM])
 def test_back_at_the_start_everything_is_as_it_was(chain, name):
     run = started(chain, name)
     evaluations = chain.potential.evaluations

