@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import gc
+import locale
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 
-# There is a worker of pytest-xdist for each core: a BLAS with threads of its own waits for them in every small matrix.
-# Set before NumPy is loaded; processes that tests start have it as well.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# There is a worker of pytest-xdist for each core. A library with threads of its own waits for them: OpenBLAS in every
+# small matrix, tblite (OpenMP) in every step of nine atoms, OpenMM in every force. Set before they are loaded;
+# processes that tests start have it as well.
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENMM_CPU_THREADS"):
+    os.environ.setdefault(threads, "1")
+
+# No test is timed: machines differ. The same examples in every run; `--hypothesis-profile default` tries others.
+hypothesis.settings.register_profile("kcons", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("kcons")
 
 HERE = Path(__file__).parent
+LOCALE = locale.setlocale(locale.LC_ALL)
 #: Modules of the package and of its tests, as they are called when they are imported.
 FILES = list(HERE.rglob("*.py"))
 OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
@@ -29,3 +38,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """What was collected stays to the end: no search through all objects has to see it."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_runtest_setup() -> None:
+    """The Fourier transforms of OpenMM's OpenCL (VkFFT) leave the process in the C locale, in which texts are ASCII."""
+    locale.setlocale(locale.LC_ALL, LOCALE)

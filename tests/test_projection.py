@@ -50,7 +50,7 @@ def problems(decades: float = 0.5) -> st.SearchStrategy[Problem]:
     )
 
 
-PROPERTY = settings(max_examples=60, deadline=None)
+PROPERTY = settings(max_examples=60)
 LITERAL = [
     pytest.param(np.zeros((0, 6)), 0, id="no rows"),
     pytest.param(np.zeros((2, 3)), 0, id="rows of zeros"),

@@ -1,13 +1,15 @@
 """What can be held: one kind of constraint a module.
 
+- `compilation`: compiled kernels, and where they are kept
 - `arguments`, `target`, `vectors`: arrays and Quantities from outside, targets and their derivatives, arithmetic
 - `constraint`: the contract of a family
 - `internal`: distances, angles, dihedrals
 - `linear`: fixed atoms, linear relations
-- `surface`, `collective`, `custom`: surfaces, groups, functions of one's own
+- `surface`, `collective`: surfaces, groups
+- `functions`: functions of one's own
 - `velocity`: rows linear in the velocities
 - `contradictions`: targets that exclude each other
-- `one_piece`, `images`, `in_cell`: which periodic images rows mean, and the cell
+- `periodic`: which images rows mean, and the cell
 - `constraint_set`: many constraints as one sigma, A and b
 """
 
@@ -16,9 +18,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from kcons.constraints import compilation as compilation  # before any kernel is declared
 from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfGyration
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.custom import Custom, ImplicitSurface
+from kcons.constraints.functions.custom import Custom, ImplicitSurface
+from kcons.constraints.functions.formula import Formula
 from kcons.constraints.internal import Angle, Dihedral, Distance
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
 from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
@@ -38,6 +42,7 @@ __all__ = [
     "Distance",
     "Ellipsoid",
     "FixedAtoms",
+    "Formula",
     "ImplicitSurface",
     "KnifeEdge",
     "Line",

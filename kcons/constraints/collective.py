@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.linear import COMPILED_WIDTH
 from kcons.constraints.target import FloatArray, Target
 from kcons.constraints.vectors import dot, norm
 from kcons.errors import InputError
@@ -61,6 +60,7 @@ class CenterOfMass(MassWeighted):
     """
 
     family = "CenterOfMass"
+    kind = RowKind.LINEAR
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"directions": (3,)}
     directions: FloatArray
 
@@ -76,10 +76,6 @@ class CenterOfMass(MassWeighted):
             ) from None
         super().__init__(np.repeat(table, len(chosen), axis=0), target)
         self._keep(directions=np.tile(np.eye(3)[list(chosen)], (self.n_rows // len(chosen), 1)))
-        self._settle()
-
-    def _settle(self) -> None:
-        self.kind = RowKind.LINEAR if self.width <= COMPILED_WIDTH else RowKind.INTERPRETED
 
     def _weights(self) -> FloatArray:
         m = self._mass_table()
@@ -121,6 +117,7 @@ class CenterDistance(MassWeighted):
     """
 
     family = "CenterDistance"
+    kind = RowKind.FUNCTION
     singular_where = ("the two centres", "move the groups apart")
     translation_invariant = True
     shared = ("split",)
@@ -165,6 +162,9 @@ class CenterDistance(MassWeighted):
         across = np.cross(d / q[:, None], w)
         return dot(across, across) / q
 
+    def parameters(self) -> FloatArray:
+        return np.hstack([np.full((self.n_rows, 1), float(self.width)), self._signed_weights()])
+
 
 class RadiusOfGyration(MassWeighted):
     """Radius of gyration of a group about its centre C, q = sqrt(sum_i w_i |r_i - C|^2), sum w_i = 1.
@@ -187,6 +187,7 @@ class RadiusOfGyration(MassWeighted):
     """
 
     family = "RadiusOfGyration"
+    kind = RowKind.FUNCTION
     singular_where = ("all atoms", "move them apart")
     translation_invariant = True
     shared = ("mass_weighted",)
@@ -216,6 +217,9 @@ class RadiusOfGyration(MassWeighted):
         q = np.sqrt(np.einsum("ka,kai,kai->k", w, s, s))
         rate = np.einsum("ka,kai,kai->k", w, s, u) / q
         return np.asarray((np.einsum("ka,kai,kai->k", w, u, u) - rate**2) / q)
+
+    def parameters(self) -> FloatArray:
+        return np.hstack([np.full((self.n_rows, 1), float(self.width)), self._weights()])
 
 
 def _about_center(w: FloatArray, r: FloatArray) -> FloatArray:

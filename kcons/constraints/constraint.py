@@ -37,9 +37,8 @@ class RowKind(IntEnum):
     DISTANCE = 1  # no parameters
     ANGLE = 2  # atoms i, j, k with vertex j; no parameters; coordinate theta
     DIHEDRAL = 3  # atoms i, j, k, l; no parameters; coordinate phi, smooth through +-180 degrees
-    LINEAR = 4  # sum_a c_a . r_a; parameters c, 3 numbers an atom, at most 4 atoms
-    SPHERE = 5  # |r - c|; parameters c
-    CYLINDER = 6  # distance from the axis; parameters c, unit axis
+    LINEAR = 4  # sum_a c_a . r_a; parameters c, 3 numbers an atom
+    FUNCTION = 5  # a function that the kernels call; see `kcons.solvers.sparse.row_functions`
 
 
 class Constraint(ABC):
@@ -82,7 +81,7 @@ class Constraint(ABC):
     #: Masses of the atoms, shape (n_rows, width), once `with_masses` was called and if they are used.
     masses: FloatArray | None = None
     #: Rows that take their atoms in the images of the set's tree, and how many cells their atoms lie from these,
-    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.images`.
+    #: shape (n_rows, width, 3); None for no rows and for no cells. Set by `kcons.constraints.periodic.images`.
     whole: NDArray[np.bool_] | None = None
     windings: IntArray | None = None
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
-from kcons.constraints.images import find_images
-from kcons.constraints.in_cell import InCell, contiguous, joined, whole_bodies
+from kcons.constraints.periodic.images import find_images
+from kcons.constraints.periodic.in_cell import InCell, contiguous, joined, whole_bodies
 from kcons.constraints.target import FloatArray, MovingTarget
 from kcons.errors import InputError
 

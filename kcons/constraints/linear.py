@@ -13,9 +13,6 @@ from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target
 from kcons.errors import InputError
 
-#: Atoms up to which the compiled solvers evaluate a linear row themselves.
-COMPILED_WIDTH = 4
-
 
 class LinearRows(Constraint):
     """Rows q = sum_a c_a . r_a with constant coefficients, shape (n_rows, width, 3).
@@ -25,11 +22,11 @@ class LinearRows(Constraint):
     """
 
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
+    kind = RowKind.LINEAR
     coefficients: FloatArray
 
     def _settle(self) -> None:
         c = self.coefficients
-        self.kind = RowKind.LINEAR if self.width <= COMPILED_WIDTH else RowKind.INTERPRETED
         self.translation_invariant = bool(
             self.width > 1 and np.all(np.abs(c.sum(axis=1)) <= 1e-12 * np.abs(c).sum(axis=1).max(initial=0.0))
         )

@@ -75,7 +75,7 @@ class Sphere(Surface):
     """
 
     family = "Sphere"
-    kind = RowKind.SPHERE
+    kind = RowKind.FUNCTION
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR}
     singular_at = "at the centre of the sphere"
     center: FloatArray
@@ -117,7 +117,7 @@ class Cylinder(Surface):
     """
 
     family = "Cylinder"
-    kind = RowKind.CYLINDER
+    kind = RowKind.FUNCTION
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"point": _VECTOR, "axis": _VECTOR}
     singular_at = "on the axis of the cylinder"
     point: FloatArray
@@ -167,6 +167,7 @@ class Torus(Surface):
     """
 
     family = "Torus"
+    kind = RowKind.FUNCTION
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"center": _VECTOR, "axis": _VECTOR, "major_radius": ()}
     singular_at = "on the axis or on the core circle of the torus"
     center: FloatArray
@@ -217,6 +218,9 @@ class Torus(Surface):
         twist = (h * up - z * radial) / q
         return (twist**2 + h * around**2 / rho) / q
 
+    def parameters(self) -> FloatArray:
+        return np.hstack([self.center, self.axis, self.major_radius[:, None]])
+
 
 class Ellipsoid(Constraint):
     """Level of an ellipsoid, q = s (|y| - 1), y_i = (e_i . (r - c))/a_i; the surface is q = 0.
@@ -240,6 +244,7 @@ class Ellipsoid(Constraint):
 
     family = "Ellipsoid"
     row_width = 1
+    kind = RowKind.FUNCTION
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {
         "center": _VECTOR,
         "inverse_axes": _VECTOR,
@@ -299,6 +304,10 @@ class Ellipsoid(Constraint):
         length = norm(y)
         across = np.cross(y / length[:, None], w)
         return self._size * dot(across, across) / length
+
+    def parameters(self) -> FloatArray:
+        matrix = self.rotation.transpose(0, 2, 1) * self.inverse_axes[:, :, None]
+        return np.hstack([self._size[:, None], self.center, matrix.reshape(self.n_rows, 9)])
 
     def scale(self, time: float = 0.0) -> FloatArray:
         return self._size

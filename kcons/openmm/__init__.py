@@ -14,7 +14,6 @@ collective variables, surfaces and the constraint objects of kcons.
 
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import hold, take_constraints
-from kcons.openmm.carried.requirements import masses_of
 from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
@@ -25,6 +24,7 @@ from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.projected import ProjectedIntegrator
 from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
 from kcons.openmm.integrator.schemes import SCHEMES
+from kcons.openmm.quantities import masses_of
 from kcons.openmm.surfaces.formulas import ExpressionSurface
 from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
 from kcons.openmm.topology import constraints_of

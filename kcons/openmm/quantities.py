@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
+import openmm
+from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints.arguments import ANY, Unitless, has_units, shown
@@ -64,6 +66,25 @@ def array(values: Any, of: unit.Unit, item: str) -> FloatArray:
         return np.array(found, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{item} are no array of numbers: {error}", item=item) from None
+
+
+def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
+    """Positions as an array of shape (n, 3), nm.
+
+    Raises
+    ------
+    InputError
+        They are of another kind or shape.
+    """
+    x = array(positions, unit.nanometer, "positions")
+    if x.shape != (n, 3):
+        raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
+    return x
+
+
+def masses_of(system: openmm.System) -> FloatArray:
+    """Masses in dalton, shape (n_particles,)."""
+    return np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
 
 
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from openmm import unit
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
-from kcons.openmm.quantities import array
+from kcons.openmm.quantities import array, masses_of
 from kcons.topology.holding import Holding, Options, with_options
 from kcons.topology.rows_by_name import HeldRows, rows_of
 from kcons.topology.topology import Snapshot, Topology, require_standard_form, selected_numbers, sorted_pairs
@@ -94,7 +94,7 @@ def snapshot_of(
             raise InputError(
                 f"the Topology has {n} atoms, the System {system.getNumParticles()} particles", item="system"
             )
-        masses = np.array([system.getParticleMass(k)._value for k in range(n)])
+        masses = masses_of(system)
         charges = _charges(system)
     described = Topology(
         names=np.array([a.name for a in atoms] or [""])[:n],

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -19,10 +20,8 @@ from kcons.constraints.target import FloatArray
 LANES_ROWS = 6
 #: Fewer clusters alike than this are left to the sparse solver, which takes all shapes in one call.
 LANES_CLUSTERS = 8
-#: Widest row, in atoms, that the compiled sparse solver takes.
-COMPILED_WIDTH = 4
 
-ShapeKind = Literal["water", "lanes", "chain", "sparse", "mixed", "general"]
+ShapeKind = Literal["water", "lanes", "chain", "sparse", "single", "mixed", "general"]
 _NONE = np.zeros(0, np.int64)
 
 
@@ -130,10 +129,18 @@ def classify(constraint_set: ConstraintSet, labels: IntArray, inverse_masses: Fl
         if chosen.any():
             rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
             yield Shape("sparse", rows, int(chosen.sum()), independent, pairs=pairs[rows])
-    for kind, chosen in (("mixed", compiled & ~distances_only), ("general", ~compiled)):
+    single = np.zeros(n_clusters, dtype=bool)
+    single[labels[inside & (kinds == RowKind.FUNCTION)]] = True
+    single &= n_rows == 1
+    others: tuple[tuple[ShapeKind, NDArray[np.bool_]], ...] = (
+        ("single", single),
+        ("mixed", compiled & ~distances_only & ~single),
+        ("general", ~compiled),
+    )
+    for kind, chosen in others:
         if chosen.any():
             rows = np.flatnonzero(inside & chosen[np.maximum(labels, 0)])
-            yield Shape("mixed" if kind == "mixed" else "general", rows, int(chosen.sum()), False)
+            yield Shape(kind, rows, int(chosen.sum()), False)
 
 
 def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntArray]:
@@ -142,7 +149,7 @@ def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntAr
     pairs = np.full((constraint_set.n_rows, 2), -1, dtype=np.int64)
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
         rows = slice(start, start + item.n_rows)
-        if item.holonomic and item.width <= COMPILED_WIDTH:
+        if item.holonomic:
             kinds[rows] = item.kind
             if item.windings is not None:  # whole cells between the atoms of a row: for no compiled solver
                 kinds[start + np.flatnonzero(item.windings.any(axis=(1, 2)))] = RowKind.INTERPRETED
@@ -213,7 +220,7 @@ def _small_shapes(
 
 def _paths(rows: IntArray, pairs: IntArray, n_atoms: int, clusters: int) -> Shape:
     """Order the rows and atoms of open chains from one end to the other."""
-    order, atoms, starts = _walk(pairs, n_atoms, clusters)
+    order, atoms, starts = plain_if_small(_walk, len(pairs))(pairs, n_atoms, clusters)
     return Shape("chain", rows[order], clusters, True, atoms=atoms, starts=starts, pairs=pairs[order])
 
 

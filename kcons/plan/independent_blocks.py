@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 
@@ -73,9 +74,9 @@ def row_blocks(
     u, v, row, closing = u[proper], v[proper], row[proper], closing[proper]
     vertices, index = np.unique(np.concatenate([u, v]), return_inverse=True)
     u, v = index[: len(u)], index[len(u) :]
-    if _is_forest(u[~closing], v[~closing], len(vertices)):
+    if plain_if_small(_is_forest, len(u))(u[~closing], v[~closing], len(vertices)):
         return nothing
-    block = _edge_blocks(u, v, len(vertices))
+    block = plain_if_small(_edge_blocks, len(u))(u, v, len(vertices))
     # A wide row has several edges, all in one block.
     keys = np.unique(block * constraint_set.n_rows + row)
     block, row = np.divmod(keys, constraint_set.n_rows)

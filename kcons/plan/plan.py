@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ContradictionError, UnsupportedError
 from kcons.plan.clusters import Shape, classify, cluster_labels
@@ -63,7 +63,7 @@ class Plan:
     late : ndarray of bool, shape (n_rows,)
         Rows that depend on others of their cluster, eliminated after these.
     whole : list of bool
-        For each solver, whether it takes positions that were made whole, without a cell (see `constraints.images`).
+        For each solver, whether it takes positions that were made whole, without a cell (see `periodic.images`).
     """
 
     constraint_set: ConstraintSet
@@ -226,11 +226,17 @@ def make_plan(
             rank = shape.rows.size
         else:
             lattice = None if whole else constraint_set.lattice
-            rank = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
-        clusters = [] if shape.independent else _by_cluster(shape.rows.ravel(), labels)
+            rank = seen = rank_of_shape(shape, inverse_masses, whole_positions, lattice, solver, time)
+        if shape.kind == "single" and rank < shape.rows.size:
+            shape = replace(shape, kind="mixed")
+        alone = shape.independent or shape.kind == "single"
+        clusters = [] if alone else _by_cluster(shape.rows.ravel(), labels)
         if clusters and shape.kind in ("sparse", "mixed") and small_enough(clusters):
             # The pivots of an order that knows nothing of dependence say less.
             rank = ranked(constraint_set, clusters, inverse_masses, positions, time, plan.late)
+            if seen < rank and shape.kind == "mixed":
+                # Rows so nearly parallel that elimination, which sees squares, takes them for dependent.
+                solver = GeneralClusters(constraint_set, shape.rows, labels[shape.rows], inverse_masses)
         if rank < shape.rows.size:
             plan.dependent += clusters
             if shape.kind in ("water", "lanes"):

@@ -6,13 +6,14 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import BoolArray, minimum_image
+from kcons.constraints.periodic.one_piece import BoolArray, minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rank_revealing import independent, rank
+from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
 
@@ -81,7 +82,9 @@ def rank_of_shape(
     time: float,
 ) -> int:
     """Independent rows of a shape whose graph does not tell."""
-    if isinstance(solver, (SparseRows, SparseDistances)):
+    if isinstance(solver, (SparseRows, SingleRows)):
+        return solver.rank(positions, lattice, time)
+    if isinstance(solver, SparseDistances):
         return solver.rank(positions, lattice)
     if isinstance(solver, DistanceClusters):
         return rank_of_small(shape, inverse_masses, positions, lattice)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import BoolArray
+from kcons.constraints.periodic.one_piece import BoolArray
 from kcons.constraints.target import FloatArray
 from kcons.plan.clusters import Shape
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.small_clusters import SmallClusters
 from kcons.solvers.sparse.distances import SparseDistances
 from kcons.solvers.sparse.mixed_rows import SparseRows
@@ -28,6 +29,8 @@ def solver_of(
     rows = shape.rows
     if shape.kind == "general":
         return GeneralClusters(constraint_set, rows, labels[rows], inverse_masses)
+    if shape.kind == "single":
+        return SingleRows(constraint_set, rows, inverse_masses)
     if shape.kind == "mixed":
         return SparseRows(constraint_set, rows, inverse_masses, None if late is None else late[rows])
     targets = constraint_set.target(time)[rows]

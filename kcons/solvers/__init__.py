@@ -4,6 +4,7 @@
 - `cluster_solver`: the contract of a solver: what it is asked, and what it reports
 - `distance_clusters`: what the solvers of held distances share
 - `rigid_triangles`, `small_clusters`, `chains`, `sparse`: held distances by shape, and rows of mixed kinds
+- `single_rows`: functions that share no atom
 - `rank_revealing`: which rows are independent
 - `general_clusters`: any rows whatever
 - `fused_distances`: distances of every shape in one call

@@ -84,7 +84,7 @@ def packed(
     """
     pieces: list[NDArray[Any]]
     if len(pairs):
-        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses, late, small=True)
+        solver = SparseDistances(np.arange(len(pairs)), pairs, lengths, inverse_masses, late)
         tables, rooms = solver.tables()
         pieces = [solver.lengths, pairs[solver.rows].astype(np.uint32).ravel(), *tables, *rooms]
     else:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.one_piece import minimum_image, neighbour_lists
+from kcons.constraints.periodic.one_piece import minimum_image, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross, dot, norm
 from kcons.topology.rigid_groups import inside_bodies

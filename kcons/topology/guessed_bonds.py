@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.topology.topology import BoolArray, Snapshot, bond_angles, connected, sorted_pairs

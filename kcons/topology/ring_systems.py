@@ -14,7 +14,7 @@ import numpy as np
 
 from kcons.constraints import Angle, Dihedral, Distance
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.one_piece import lined_up, neighbour_lists
+from kcons.constraints.periodic.one_piece import lined_up, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.topology.topology import BoolArray, Snapshot, connected
 

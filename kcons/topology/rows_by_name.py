@@ -17,7 +17,7 @@ import numpy as np
 from kcons.constraints import Angle, Constraint, Dihedral, Distance, LinearRelation
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.errors import InputError
 from kcons.topology.angle_rows import STRAIGHT, angle_rows
 from kcons.topology.guessed_bonds import guess_bonds

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.one_piece import BoolArray, lattice_of, neighbour_lists
+from kcons.constraints.periodic.one_piece import BoolArray, lattice_of, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.one_piece import lined_up, make_whole, spanning_tree
+from kcons.constraints.periodic.one_piece import lined_up, make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.topology.topology import Snapshot
 

@@ -67,6 +67,9 @@ MADE = {
         **{"time_derivatives": None, "time_dependent": False, "translation_invariant": False, "period": 2.0},
         **{"length": 0.5, "time_step": 0.1},
     },
+    "Formula": {
+        **{"formula": "z1 - a*x1", "atoms": [0], "parameters": {"a": 2.0}, "target": 0.3, "period": 2.0},
+    },
     "LinearVelocity": {"atoms": [[0]], "coefficients": [[0, 0, 1.0]], "target": 0.1},
     "KnifeEdge": {"back": [0], "front": [1], "normal": [0, 1.0, 1.0], "contact": [0.5], "target": 0.1},
     "Rolling": {
@@ -82,6 +85,7 @@ MADE = {
 OTHERS = {
     *("self", "pairs", "triples", "quads", "atoms", "bases", "groups", "axes", "group_a", "group_b", "back", "front"),
     *("hub", "rim", "function", "gradient", "hessian_vector", "time_derivatives", "derivative"),
+    *("formula", "parameters"),
     *("mass_weighted", "time_dependent", "translation_invariant"),
 }
 #: How a number of each kind is written with a unit: what it is multiplied with, and the unit.

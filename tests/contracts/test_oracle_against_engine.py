@@ -29,7 +29,7 @@ from kcons import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
-PROPERTY = settings(max_examples=40, deadline=None)
+PROPERTY = settings(max_examples=40)
 SETS = st.builds(
     random_set,
     seed=st.integers(0, 2**32 - 1),

@@ -165,23 +165,26 @@ def test_anchored_clusters_are_sparse(pairs, fixed, independent) -> None:
 
 def test_mixed_and_general_rows() -> None:
     rows = [
-        held.Distance([[0, 1], [4, 5], [8, 9]]),
+        held.Distance([[0, 1], [4, 5], [8, 9], [12, 13]]),
         held.Angle([[0, 1, 2]]),  # compiled: mixed
-        held.RadiusOfGyration([[4, 5, 6]]),  # interpreted: general
+        held.RadiusOfGyration([[4, 5, 6, 7, 8]]),  # a function: mixed
         held.LinearVelocity([[10, 11]], [[1.0, 0, 0], [0, 1.0, 0]]),  # velocity rows: general
+        held.Sphere([3], [9.0, 0, 0]),  # a function alone
     ]
-    shapes = {s.kind: s for s in shapes_of(rows, places(12))}
-    assert set(shapes) == {"lanes", "mixed", "general"}
-    assert shapes["mixed"].rows.tolist() == [0, 3]
-    assert shapes["general"].rows.tolist() == [1, 4, 5] and shapes["general"].clusters == 2
-    assert shapes["lanes"].rows.tolist() == [[2]]
+    shapes = {s.kind: s for s in shapes_of(rows, places(14))}
+    assert set(shapes) == {"lanes", "single", "mixed", "general"}
+    assert shapes["mixed"].rows.tolist() == [0, 1, 2, 4, 5] and shapes["mixed"].clusters == 2
+    assert shapes["single"].rows.tolist() == [7] and shapes["single"].clusters == 1
+    assert shapes["general"].rows.tolist() == [6] and shapes["general"].clusters == 1
+    assert shapes["lanes"].rows.tolist() == [[3]]
 
 
-def test_rows_too_wide_for_the_compiled_solver_are_general() -> None:
-    wide = held.LinearCombination(np.arange(5), np.ones((5, 3)))
-    narrow = held.LinearCombination(np.arange(4), np.ones((4, 3)))
-    assert [s.kind for s in shapes_of(wide, places(5))] == ["general"]
-    assert [s.kind for s in shapes_of(narrow, places(5))] == ["mixed"]
+def test_functions_that_know_all_rows_at_once_are_called_for_all() -> None:
+    def surface(atoms):
+        return held.ImplicitSurface(atoms, lambda r: r[:, 2], lambda r: np.tile([0, 0, 1.0], (len(r), 1)), target=None)
+
+    assert [s.kind for s in shapes_of(surface([0, 1]), places(2))] == ["general"]
+    assert [s.kind for s in shapes_of(surface([0]), places(2))] == ["single"]
 
 
 @pytest.mark.parametrize("seed", range(5))

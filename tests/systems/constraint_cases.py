@@ -108,6 +108,11 @@ def spread(atoms: object, exact: bool) -> kc.Custom:
     )
 
 
+def bare(atoms: object) -> kc.Custom:
+    whole = spread(atoms, exact=False)
+    return kc.Custom(atoms, whole.function, time_dependent=True, translation_invariant=True)
+
+
 def swirl(atoms: object, exact: bool) -> kc.CustomVelocity:
     """(r_1 + (t, 0, 0)) x r_0 . v_0 + |r_0|^2 e_z . v_1."""
 
@@ -143,6 +148,12 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "RadiusOfGyration equal weights": lambda: kc.RadiusOfGyration([0, 1, 2, 3, 5], mass_weighted=False),
     "Custom": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=True),
     "Custom differenced": lambda: spread([[0, 1, 2], [5, 3, 4]], exact=False),
+    "Custom without a gradient": lambda: bare([[0, 1, 2], [5, 3, 4]]),
+    "Formula": lambda: kc.Formula("z1*exp(x1/4) - a*sin(b*y1)", [0, 3], {"a": 0.4, "b": [1.0, 2.0]}, target=None),
+    "Formula of differences": lambda: kc.Formula(
+        "atan2(x1 - x2, y2 - y3) + abs(z1 - z3 + 9)**1.5 - sqrt((x1 - x3)**2 + (z2 - z1)**2)/3", [[0, 1, 2], [5, 3, 4]]
+    ),
+    "Formula moving": lambda: kc.Formula("(x1 - x2)**2 + sin(z1)*cos(w*t)/(2 + x1**2) - t**3", [0, 1], {"w": 0.8}),
     "LinearCombination": lambda: kc.LinearCombination([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]]),
     "LinearRelation": lambda: kc.LinearRelation([0, 3], [1, 2], [0.3, 0.7]),
     "FixedAtoms": lambda: kc.FixedAtoms([6, 1]),

@@ -1,7 +1,12 @@
 """Runs of an ensemble in OpenMM."""
 
 import numpy as np
-from openmm_systems import masses_of, started
+import openmm
+import pytest
+from openmm_systems import alanine, context_of, masses_of, started, state_of
+
+from kcons.constraints import Angle, Sphere
+from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold, surface_parts
 
 
 def twice_kinetic(system, v):
@@ -12,3 +17,66 @@ def run(system, integrator, x, v, steps, platform="Reference"):
     context = started(system, integrator, x, v, platform)
     integrator.step(steps)
     return context
+
+
+def warm(system, integrator, x, seed):
+    """A Context on the constraints, with velocities of 300 K."""
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.applyConstraints(context)
+    integrator.setVelocitiesToTemperature(context, 300, seed)
+    return context
+
+
+def in_calls_of_any_length(ensemble):
+    """Check that one motion is made whether steps are called for at once or singly; an integrator that made it."""
+    system, x, v = alanine()
+    ends = []
+    for blocks in ([60], [1] * 60, [7, 30, 23]):
+        bath = ensemble()
+        integrator = ProjectedIntegrator(1e-3, tolerance=1e-13, ensemble=bath)
+        context = started(system, integrator, x, v)
+        for steps in blocks:
+            integrator.step(steps)
+        ends.append((*state_of(context), bath.conserved_energy(integrator)))
+    for other in ends[1:]:
+        assert np.abs(other[0] - ends[0][0]).max() <= 1e-12
+        assert np.abs(other[1] - ends[0][1]).max() <= 1e-10
+        assert other[2] == pytest.approx(ends[0][2], rel=1e-10)
+    return integrator
+
+
+def tied(masses, spring, x):
+    """Particles, each tied to all others."""
+    system, springs = openmm.System(), openmm.CustomBondForce(spring)
+    for i, mass in enumerate(masses):
+        system.addParticle(mass)
+        for j in range(i):
+            springs.addBond(j, i)
+    system.addForce(springs)
+    return system, np.array(x)
+
+
+def three_parts():
+    """Six particles: an angle carried by kcons, a distance as a collective row, one particle on a sphere."""
+    places = [[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]]
+    system, x = tied(range(12, 18), "200*(r-0.5)^2", places)
+    carried = hold(system, [Angle([(0, 1, 2)], 1.9)], positions=x)
+    distance = openmm.CustomBondForce("r")
+    distance.addBond(3, 4)
+    rows = CollectiveRows(system, [Row(distance, 0.5)])
+    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
+    return system, x, (carried, rows, sphere)
+
+
+def on_their_rows(r, u):
+    """Check that `three_parts` hold what they should."""
+    assert abs(np.linalg.norm(r[3] - r[4]) - 0.5) < 1e-12
+    assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
+    assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
+    return r, u
+
+
+def three_on_a_sphere():
+    system, x = tied([20.0] * 3, "100*(r-0.5)^2", [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
+    return system, x, Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5)

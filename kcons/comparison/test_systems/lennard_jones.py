@@ -167,6 +167,26 @@ def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _line(x, i, j, box, inverse):  # type: ignore[no-untyped-def]
+    """From j to i, to the nearest image, and the square of its length."""
+    dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+    dx -= box * np.rint(dx * inverse)
+    dy -= box * np.rint(dy * inverse)
+    dz -= box * np.rint(dz * inverse)
+    return dx, dy, dz, dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True)
+def _push(f, i, j, fx, fy, fz):  # type: ignore[no-untyped-def]
+    f[i, 0] -= fx
+    f[i, 1] -= fy
+    f[i, 2] -= fz
+    f[j, 0] += fx
+    f[j, 1] += fy
+    f[j, 2] += fz
+
+
+@numba.njit(cache=True, nogil=True)
 def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-def]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
     n = x.shape[0]
@@ -174,20 +194,11 @@ def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-de
         for j in range(i + 1, n):
             if molecule[j] == molecule[i]:
                 continue
-            dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-            dx -= box * np.rint(dx * inverse)
-            dy -= box * np.rint(dy * inverse)
-            dz -= box * np.rint(dz * inverse)
-            r2 = dx * dx + dy * dy + dz * dz
+            dx, dy, dz, r2 = _line(x, i, j, box, inverse)
             if r2 < cut2:
                 u, slope, _ = _pair(r2, sites[i], sites[j], cutoff)
                 total += u
-                f[i, 0] -= slope * dx
-                f[i, 1] -= slope * dy
-                f[i, 2] -= slope * dz
-                f[j, 0] += slope * dx
-                f[j, 1] += slope * dy
-                f[j, 2] += slope * dz
+                _push(f, i, j, slope * dx, slope * dy, slope * dz)
     return total
 
 
@@ -213,19 +224,10 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
         for j in range(i + 1, n):
             if molecule[j] == molecule[i]:
                 continue
-            dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-            dx -= box * np.rint(dx * inverse)
-            dy -= box * np.rint(dy * inverse)
-            dz -= box * np.rint(dz * inverse)
-            r2 = dx * dx + dy * dy + dz * dz
+            dx, dy, dz, r2 = _line(x, i, j, box, inverse)
             if r2 < cut2:
                 _, slope, bend = _pair(r2, sites[i], sites[j], cutoff)
-                f[i, 0] -= slope * dx
-                f[i, 1] -= slope * dy
-                f[i, 2] -= slope * dz
-                f[j, 0] += slope * dx
-                f[j, 1] += slope * dy
-                f[j, 2] += slope * dz
+                _push(f, i, j, slope * dx, slope * dy, slope * dz)
                 shifts += 2.0 * (bend + 2.0 * slope)
                 for k in (i, j):
                     p2 = p[k, 0] ** 2 + p[k, 1] ** 2 + p[k, 2] ** 2

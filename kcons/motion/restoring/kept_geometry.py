@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from kcons.constraints import Distance
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.constraints.one_piece import minimum_image
+from kcons.constraints.periodic.one_piece import minimum_image
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.errors import InfeasibleError

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kcons.constraints.constraint import IntArray
-from kcons.constraints.one_piece import make_whole, neighbour_lists
+from kcons.constraints.periodic.one_piece import make_whole, neighbour_lists
 from kcons.constraints.target import FloatArray
 from kcons.constraints.vectors import cross
 from kcons.topology.topology import connected, sorted_pairs

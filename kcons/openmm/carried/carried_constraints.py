@@ -31,8 +31,6 @@ from kcons.openmm.carried.callbacks import (
 from kcons.openmm.carried.passage import CARRY_SCALE, hands_over_all
 from kcons.openmm.carried.requirements import (
     free_groups,
-    masses_of,
-    nanometers,
     refuse_agents,
     refuse_shared_atoms,
     refuse_single_precision,
@@ -44,7 +42,7 @@ from kcons.openmm.carried.requirements import (
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
-from kcons.openmm.quantities import accepted
+from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
 

@@ -23,7 +23,8 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.requirements import masses_of, refuse_agents
+from kcons.openmm.carried.requirements import refuse_agents
+from kcons.openmm.quantities import masses_of
 
 #: Hydrogens, also heavy ones, are lighter than this (dalton).
 _HYDROGEN = 4.5

@@ -8,32 +8,16 @@ from typing import Any
 
 import numpy as np
 import openmm
-from numpy.typing import ArrayLike
-from openmm import unit
 
 from kcons.constraints import Constraint, FixedAtoms
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.quantities import array
 
 #: Rounding of positions, relative to the shortest row, that a run begins to show.
 COARSE = 1e-11
-
-
-def nanometers(positions: unit.Quantity | ArrayLike, n: int) -> FloatArray:
-    """Positions as an array of shape (n, 3), nm."""
-    x = array(positions, unit.nanometer, "positions")
-    if x.shape != (n, 3):
-        raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
-    return x
-
-
-def masses_of(system: openmm.System) -> FloatArray:
-    """Masses in dalton, shape (n_particles,)."""
-    return np.array([system.getParticleMass(i)._value for i in range(system.getNumParticles())])
 
 
 def with_massless_atoms(given: tuple[Constraint, ...], masses: FloatArray) -> tuple[Constraint, ...]:

@@ -15,10 +15,12 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
 from kcons.openmm.collective.plain_rows import near_targets
 from kcons.openmm.collective.row_forces import energy, forces_in
+from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.part import BOND, NEAR, Miss
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
+from kcons.openmm.quantities import masses_of
 from kcons.openmm.topology import bonds_of
 
 if TYPE_CHECKING:
@@ -52,8 +54,7 @@ class ContextRows:
 
     @cached_property
     def masses(self) -> FloatArray:
-        system = self.context.getSystem()
-        return np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+        return masses_of(self.context.getSystem())
 
     @cached_property
     def _inverse_masses(self) -> FloatArray:
@@ -62,11 +63,11 @@ class ContextRows:
 
     @cached_property
     def positions(self) -> FloatArray:
-        return np.array(self.context.getState(getPositions=True).getPositions(asNumpy=True)._value)
+        return positions_of(self.context)
 
     @cached_property
     def velocities(self) -> FloatArray:
-        return np.array(self.context.getState(getVelocities=True).getVelocities(asNumpy=True)._value)
+        return velocities_of(self.context)
 
     @cached_property
     def _owner(self) -> openmm.CustomIntegrator | None:
@@ -144,7 +145,7 @@ class ContextRows:
         """v along the System's constraints at the context's positions; its velocities are overwritten."""
         self.context.setVelocities(v)
         self.context.applyVelocityConstraints(self._tight)
-        return np.array(self.context.getState(getVelocities=True).getVelocities(asNumpy=True)._value)
+        return velocities_of(self.context)
 
     @contextmanager
     def _kept(self, positions: bool = True) -> Iterator[None]:
@@ -240,7 +241,7 @@ class ContextRows:
                 if size <= tolerance:
                     self.context.setVelocities(velocities)
                     return done
-                here = self._here()
+                here = positions_of(self.context)
                 _, directions, gram = self.gram()
                 push = np.einsum("k,kai->ai", np.linalg.solve(gram, -off), directions)
                 share = 1.0
@@ -277,9 +278,6 @@ class ContextRows:
         only = [found[0] if len(found) == 1 else None for found in forces]
         led = near_targets(self.context, only, self.sigma(), self.targets(), pairs)
         return start if led is None else led
-
-    def _here(self) -> FloatArray:
-        return np.array(self.context.getState(getPositions=True).getPositions(asNumpy=True)._value)
 
     def _put(self, positions: FloatArray, velocities: FloatArray) -> None:
         self.context.setPositions(positions)

@@ -14,6 +14,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import KconsError
 from kcons.motion.motion import Motion
+from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.system_checks import SystemRows
 
 #: Two values of one coordinate, by OpenMM and by kcons, differ by less.
@@ -93,7 +94,7 @@ def near_targets(
     rows = [row for row in plain if row is not None]
     if len(rows) < len(plain):
         return None
-    x = np.array(context.getState(positions=True).getPositions(asNumpy=True)._value)
+    x = positions_of(context)
     held = SystemRows.of(system)
     if held.n_rows:
         rows.append(Distance(held.pairs, held.lengths))

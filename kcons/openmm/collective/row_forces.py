@@ -15,6 +15,7 @@ from openmm import unit
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.system_checks import ROW_NAME
+from kcons.openmm.quantities import nanometers
 
 #: Force groups of OpenMM.
 GROUPS = 32
@@ -366,11 +367,7 @@ def found_values(
     InputError
         Positions of the wrong shape, or at which a row is not a number.
     """
-    if unit.is_quantity(positions):
-        positions = positions.value_in_unit(unit.nanometer)  # type: ignore[attr-defined]
-    x = np.asarray(positions, dtype=float)
-    if x.shape != (system.getNumParticles(), 3):
-        raise InputError(f"positions have shape {x.shape}; give ({system.getNumParticles()}, 3)", item="positions")
+    x = nanometers(positions, system.getNumParticles())
     values = []
     for first in range(0, len(rows), GROUPS - 1):
         alone = openmm.System()

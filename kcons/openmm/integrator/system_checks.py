@@ -19,6 +19,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.integrator.interface import Integrator
+from kcons.openmm.quantities import masses_of
 from kcons.plan.plan import make_plan
 
 IntArray = NDArray[np.int64]
@@ -71,8 +72,7 @@ class SystemRows:
     @classmethod
     def of(cls, system: openmm.System, *, rounded: bool = False) -> SystemRows:
         """Those of a System; `rounded` where a platform computes as GPUs do, see `Precision.rounds_lengths`."""
-        n = system.getNumParticles()
-        masses = np.array([system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(n)])
+        masses = masses_of(system)
         pairs, lengths, numbers = [], [], []
         for k in range(system.getNumConstraints()):
             i, j, d = system.getConstraintParameters(k)
@@ -82,7 +82,7 @@ class SystemRows:
                 numbers.append(k)
         table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         given = np.array(lengths, dtype=float)
-        settled = _settled(table, given, n)
+        settled = _settled(table, given, len(masses))
         held = np.where(settled, given.astype(np.float32).astype(float), given)
         shaken = np.sqrt((given**2).astype(np.float32).astype(float)) if rounded else held
         slack = np.where(settled & rounded, 2.0**-23, 0.0)

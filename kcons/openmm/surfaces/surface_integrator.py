@@ -17,7 +17,7 @@ from kcons.errors import InputError, KconsError, NonFiniteError, UnsupportedErro
 from kcons.openmm.integrator.guard import Guard
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.quantities import accepted, array
+from kcons.openmm.quantities import accepted, nanometers
 from kcons.openmm.surfaces.compiled_quadrics import CompiledQuadricRows
 from kcons.openmm.surfaces.formulas import ExpressionSurface, ImplicitRows
 from kcons.openmm.surfaces.quadrics import QUADRICS, QuadricRows
@@ -70,7 +70,7 @@ def surface_parts(
     formulas = [item for item in given if isinstance(item, ExpressionSurface)]
     known = [item for item in given if not isinstance(item, ExpressionSurface)]
     atoms = _all_atoms(given, n)
-    x = None if positions is None else _in_nm(positions, n)
+    x = None if positions is None else nanometers(positions, n)
     rows = [_settled(item, x) for item in known]
     if system is not None:
         refuse_system(system, atoms)
@@ -260,13 +260,6 @@ def _all_atoms(given: Sequence[AnySurface], n: int) -> IntArray:
     if len(names) < len(atoms):
         raise UnsupportedError(f"particle {names[np.argmax(counts)]} is on two surfaces, that is on a curve; {CARRIER}")
     return atoms
-
-
-def _in_nm(positions: ArrayLike, n: int) -> FloatArray:
-    x = array(positions, unit.nanometer, "positions")
-    if x.shape != (n, 3):
-        raise InputError(f"positions must have shape ({n}, 3), not {x.shape}", item="positions")
-    return x
 
 
 def _settled(item: Constraint, x: FloatArray | None) -> Constraint:

@@ -17,6 +17,7 @@ from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteErro
 from kcons.motion.motion import Motion
 from kcons.openmm.integrator.part import BOND, NEAR, Miss, Part
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.quantities import masses_of
 
 #: A start that is farther from its surface (nm), or has a larger share of its velocity across it, is refused.
 START_TOLERANCE = 1e-6
@@ -239,8 +240,7 @@ def engine(context: openmm.Context, parts: Sequence[SurfaceRows], x: FloatArray)
     new_index = np.zeros(system.getNumParticles(), dtype=np.int64)
     new_index[atoms] = np.arange(len(atoms))
     rows = [item.renumbered(new_index) for part in parts for item in part.rows]
-    masses = [system.getParticleMass(int(a)).value_in_unit(unit.dalton) for a in atoms]
-    return Motion(ConstraintSet(rows, x[atoms], masses), x[atoms])
+    return Motion(ConstraintSet(rows, x[atoms], masses_of(system)[atoms]), x[atoms])
 
 
 def refuse_system(system: openmm.System, atoms: IntArray) -> None:

@@ -3,6 +3,7 @@
 - `elimination`: order and pattern, found once
 - `substitution`: the sweeps over one cluster
 - `step_control`: what the loops of Newton's method share
+- `row_functions`: rows that are called by their addresses
 - `row_values`: values and gradients of compiled rows
 - `distances`: held distances
 - `mixed_rows`: rows of mixed kinds

@@ -12,6 +12,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -37,7 +38,7 @@ from kcons.solvers.kernels.two_and_four_wide import (
     store_quad,
 )
 from kcons.solvers.sparse import step_control
-from kcons.solvers.sparse.elimination import FAST, make_pattern, make_small_pattern
+from kcons.solvers.sparse.elimination import FAST, make_pattern
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import RIGHT, backward, factor, factor_symmetric, forward
 
@@ -59,8 +60,6 @@ class SparseDistances(DistanceClusters):
         0 for atoms of infinite mass.
     late : ndarray of bool, shape (n_rows,), optional
         Rows that depend on the others of their cluster, see `make_pattern`.
-    small : bool
-        Whether to find order and pattern by what need not be compiled, for few rows.
     """
 
     name = "sparse"
@@ -72,8 +71,6 @@ class SparseDistances(DistanceClusters):
         lengths: FloatArray,
         inverse_masses: FloatArray,
         late: NDArray[np.bool_] | None = None,
-        *,
-        small: bool = False,
     ) -> None:
         atoms, local = np.unique(pairs, return_inverse=True)
         local = local.reshape(pairs.shape)
@@ -81,20 +78,19 @@ class SparseDistances(DistanceClusters):
         keep = movable[local]
         row_start = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
         row_atoms = local[keep].astype(np.int64)
-        if small:
-            pattern = make_small_pattern(row_start, row_atoms, late)
-        else:
-            pattern = make_pattern(row_start, row_atoms, len(atoms), late)
+        pattern = make_pattern(row_start, row_atoms, len(atoms), late)
         self.rows: IntArray = rows[pattern.order]
         pairs = pairs[pattern.order]
         self.lengths = lengths[pattern.order].copy()
         self._clusters = pattern.clusters
-        self._atoms, self._atom_start, ends = _plain(_number_atoms, small)(pairs, pattern.clusters, len(inverse_masses))
+        self._atoms, self._atom_start, ends = plain_if_small(_number_atoms, len(pairs))(
+            pairs, pattern.clusters, len(inverse_masses)
+        )
         self._w = inverse_masses[self._atoms]
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:-1, 2:] = pattern.start, pattern.target_start, ends
         weights = self._w[ends].sum(axis=1)
-        couplings = _plain(_couplings, small)(pattern.start, pattern.columns, ends, self._w)
+        couplings = plain_if_small(_couplings, len(pattern.columns))(pattern.start, pattern.columns, ends, self._w)
         self._tables = (self._clusters, self._atoms, self._atom_start, self._w, links.ravel(),
             pattern.columns, pattern.targets, couplings, weights,
         )  # fmt: skip
@@ -157,11 +153,6 @@ def sparse_distances(
     """The sparse solver, which has step control, for distance rows."""
     pairs = np.array([constraint_set.row_atoms(int(row)) for row in rows], dtype=np.int64)
     return SparseDistances(rows, pairs, constraint_set.target(time)[rows], inverse_masses)
-
-
-def _plain(kernel: Any, plain: bool) -> Any:
-    """A compiled function, or what it was made of."""
-    return kernel.py_func if plain else kernel
 
 
 @nb.njit(cache=True)

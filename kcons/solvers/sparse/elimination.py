@@ -20,8 +20,10 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.errors import UnsupportedError
 
@@ -90,7 +92,8 @@ def make_pattern(
         So many rows share an atom that the factors would not fit into memory.
     """
     late = np.zeros(len(row_start) - 1, np.bool_) if late is None else late
-    position, struct_start, struct = _minimum_degree(row_start, row_atoms, n_atoms, late)
+    size = int(np.sum(np.bincount(row_atoms) ** 2)) if len(row_atoms) else 0
+    position, struct_start, struct = plain_if_small(_minimum_degree, size)(row_start, row_atoms, n_atoms, late)
     sizes = np.diff(struct_start).astype(np.float64)
     updates = float(np.sum(sizes * (sizes - 1) / 2))
     if updates > MOST_UPDATES:
@@ -100,54 +103,7 @@ def make_pattern(
             "rows. Let atoms take part in fewer rows, and hold bodies of more than a thousand atoms by a rigid-body "
             "integrator"
         )
-    order, clusters, start, columns, target_start, targets = _finish(position, struct_start, struct)
-    return Pattern(order, clusters, start, columns, target_start, targets)
-
-
-def make_small_pattern(row_start: IntArray, row_atoms: IntArray, late: NDArray[np.bool_] | None = None) -> Pattern:
-    """The same for few rows, without anything to compile: sets in Python."""
-    n = len(row_start) - 1
-    members: dict[int, list[int]] = {}
-    for k in range(n):
-        for atom in row_atoms[row_start[k] : row_start[k + 1]].tolist():
-            members.setdefault(atom, []).append(k)
-    coupled: list[set[int]] = [{k} for k in range(n)]
-    for rows in members.values():
-        for k in rows:
-            coupled[k].update(rows)
-    cluster = list(range(n))
-    later: list[set[int]] = [set()] * n
-    remaining, eliminated = set(range(n)), []
-    while remaining:
-        k = min(remaining, key=lambda row: (late is not None and bool(late[row]), len(coupled[row]), row))
-        remaining.discard(k)
-        eliminated.append(k)
-        later[k] = coupled[k] - {k}
-        for other in later[k]:
-            coupled[other] |= later[k]
-            coupled[other].discard(k)
-    # From the last row back: whoever comes before another of its cluster belongs to that.
-    for k in reversed(eliminated):
-        if later[k]:
-            cluster[k] = cluster[next(iter(later[k]))]
-    order = sorted(eliminated, key=lambda row: cluster[row])
-    position = {k: place for place, k in enumerate(order)}
-    columns = [sorted(position[other] for other in later[k]) for k in order]
-    start = np.cumsum([0, *map(len, columns)])
-    targets, counts = [], [0]
-    for mine in columns:
-        for p, one in enumerate(mine):
-            targets += [int(start[one]) + columns[one].index(two) for two in mine[p + 1 :]]
-        counts.append(len(targets))
-    cuts = [place for place in range(n) if place == 0 or cluster[order[place]] != cluster[order[place - 1]]]
-    return Pattern(
-        np.array(order, dtype=np.int64),
-        np.array([*cuts, n], dtype=np.int64),
-        start.astype(np.int64),
-        np.array([column for mine in columns for column in mine], dtype=np.uint32),
-        np.array(counts, dtype=np.int64),
-        np.array(targets, dtype=np.uint32),
-    )
+    return Pattern(*plain_if_small(_finish, size)(position, struct_start, struct))
 
 
 @nb.njit(cache=True)
@@ -263,14 +219,14 @@ def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-unt
     return position, struct_start, struct[:struct_used].copy()
 
 
-@nb.njit(cache=True)
+@register_jitable
 def _grown(array, used):  # type: ignore[no-untyped-def]
     larger = np.empty(2 * len(array), array.dtype)
     larger[:used] = array[:used]
     return larger
 
 
-@nb.njit(cache=True)
+@register_jitable
 def _push(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
     last = tail[degree]
     preceding[k] = last
@@ -282,7 +238,7 @@ def _push(head, tail, following, preceding, degree, k):  # type: ignore[no-untyp
     tail[degree] = k
 
 
-@nb.njit(cache=True)
+@register_jitable
 def _unlink(head, tail, following, preceding, degree, k):  # type: ignore[no-untyped-def]
     before, after = preceding[k], following[k]
     if before >= 0:
@@ -348,7 +304,7 @@ def _finish(position, struct_start, struct):  # type: ignore[no-untyped-def]
     return order, clusters, start, columns, target_start, targets
 
 
-@nb.njit(cache=True)
+@register_jitable
 def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
     """Children before parents, branch by branch; neighbouring branches of a tree alternate.
 
@@ -415,9 +371,16 @@ def _interleaved_postorder(parent):  # type: ignore[no-untyped-def]
     return result, clusters[: n_clusters + 1].copy()
 
 
-@nb.njit(cache=True)
-def make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
+def make_triples(
+    start: IntArray, columns: UIntArray, slots: IntArray, slot_atoms: UIntArray, w: NDArray[np.float64]
+) -> tuple[UIntArray, UIntArray, NDArray[np.float64]]:
     """For each entry (k, l) of the matrix: pairs of slots of k and l on one movable atom, and its inverse mass."""
+    found = plain_if_small(_make_triples, len(slot_atoms) + len(columns))(start, columns, slots, slot_atoms, w)
+    return found  # type: ignore[no-any-return]
+
+
+@nb.njit(cache=True)
+def _make_triples(start, columns, slots, slot_atoms, w):  # type: ignore[no-untyped-def]
     begin = np.zeros(len(columns) + 1, np.uint32)
     for fill in range(2):
         if fill == 1:

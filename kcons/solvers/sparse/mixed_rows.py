@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -38,7 +39,8 @@ from kcons.solvers.kernels.two_and_four_wide import (
 )
 from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
-from kcons.solvers.sparse.row_values import DISTANCE, NOW, PARAMETERS, REFERENCE, evaluate, miss
+from kcons.solvers.sparse.row_functions import FUNCTION, GivenRows
+from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, evaluate, miss
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
@@ -82,18 +84,21 @@ class SparseRows:
         widths = np.diff(start)[order]
         slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
-        self._atoms, atom_start, slot_atoms = _number_atoms(flat, slots, pattern.clusters, len(inverse_masses))
+        self._atoms, atom_start, slot_atoms = plain_if_small(_number_atoms, len(flat))(
+            flat, slots, pattern.clusters, len(inverse_masses)
+        )
         w = inverse_masses[self._atoms]
         triple, sides, masses = make_triples(pattern.start, pattern.columns, slots, slot_atoms, w)
-        # Row by row: its first entry, its first target, its first slot.
+        # Row by row: its first entry, its first target, its first slot, its first parameter.
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
         self._links = links.ravel()
-        kinds, parameters = _kinds_and_parameters(constraint_set)
+        self._made_of = constraint_set, rows, inverse_masses, late
+        self._given = GivenRows(constraint_set, self.rows, int(widths.max(initial=0)))
+        links[:, 3] = self._given.starts
         self._tables = (
-            pattern.clusters, self._atoms, atom_start, slot_atoms, kinds[self.rows].astype(np.uint32),
-            np.ascontiguousarray(parameters[self.rows]).ravel(), self._links, pattern.columns, pattern.targets,
-            triple, sides, masses,
+            pattern.clusters, self._atoms, atom_start, slot_atoms, self._given.kinds, self._given.numbers, self._links,
+            pattern.columns, pattern.targets, triple, sides, masses,
         )  # fmt: skip
         self._scale = constraint_set.scale[self.rows]
         self._targets = np.ascontiguousarray(constraint_set.target(0.0)[self.rows])
@@ -109,9 +114,13 @@ class SparseRows:
         self._kept_solution = np.zeros(n)
         self._speeds = aligned(4 * len(self._atoms))
 
+    def __reduce__(self) -> tuple[type[SparseRows], tuple[object, ...]]:
+        return SparseRows, self._made_of  # addresses are of no use elsewhere
+
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, _, _, velocities, inv_dt = request
+        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request
+        self._given.numbers[:2] = time, reference_time
         targets = self._targets if wanted is None else wanted[self.rows]
         for careful in (False, True):
             failed, residual, iterations, worst = _positions(
@@ -119,6 +128,7 @@ class SparseRows:
                 *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
                 self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
+            self._given.refuse()
             if not failed:
                 break
         if not failed:
@@ -131,37 +141,27 @@ class SparseRows:
 
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, wanted, lattice, *_ = request
+        y, x, wanted, lattice, time, *_ = request
+        self._given.numbers[:2] = time
         rates = self._targets if wanted is None else wanted[self.rows]
         failed, residual, iterations, worst = _tangents(
             x, y, rates, wanted is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
             *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
             self._base, self._moves, self._speeds, self._solution,
         )  # fmt: skip
+        self._given.refuse()
         if not failed:
             _apply(y, 1.0, self._atoms, self._moves)
             if multipliers is not None:
                 np.negative(self._solution, out=multipliers)
         return Outcome(not failed, residual, iterations, worst)
 
-    def rank(self, x: FloatArray, lattice: FloatArray | None) -> int:
+    def rank(self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
-        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice))
+        outcome = self.tangents(Request(np.zeros_like(x), x, lattice=lattice, time=time))
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
-
-
-def _kinds_and_parameters(constraint_set: ConstraintSet) -> tuple[IntArray, FloatArray]:
-    kinds = np.zeros(constraint_set.n_rows, dtype=np.int64)
-    parameters = np.zeros((constraint_set.n_rows, PARAMETERS))
-    for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
-        rows = slice(start, start + item.n_rows)
-        kinds[rows] = item.kind
-        if item.kind:
-            given = item.parameters().reshape(item.n_rows, -1)[:, :PARAMETERS]
-            parameters[rows, : given.shape[1]] = given
-    return kinds, parameters
 
 
 @nb.njit(cache=True)
@@ -304,12 +304,15 @@ def _begin(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _measure(first, last, kinds, wanted, scale, floor, values, state):  # type: ignore[no-untyped-def]
+def _measure(first, last, kinds, parameters, links, wanted, scale, floor, values, state):  # type: ignore[no-untyped-def]
     """Right-hand sides; largest and total error, the row with the largest, and the largest excess over the floor."""
     error, total, excess = 0.0, 0.0, 0.0
     bad = first
     for k in range(first, last):
-        off = miss(entry(kinds, k), number(values, k), number(wanted, k))
+        kind, period = entry(kinds, k), 0.0
+        if kind >= FUNCTION:
+            period = number(parameters, entry(links, 4 * k + 3) + 1)
+        off = miss(kind, number(values, k), number(wanted, k), period)
         put(state, 2 * k + 1, off)
         e = abs(off) / number(scale, k)
         total += e
@@ -351,7 +354,9 @@ def _positions(  # type: ignore[no-untyped-def]
             evaluate(
                 first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
             )
-            error, total, excess, bad = _measure(first, last, kinds, wanted, scale, floor, values, state)
+            error, total, excess, bad = _measure(
+                first, last, kinds, parameters, links, wanted, scale, floor, values, state
+            )
             if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
                     return True, error, iteration, bad

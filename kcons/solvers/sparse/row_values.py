@@ -1,4 +1,4 @@
-"""Values and gradients of compiled rows: distances, angles, dihedrals, linear rows, spheres, cylinders.
+"""Values and gradients of compiled rows: distances, angles, dihedrals, linear rows, functions.
 
 Scalar code for one row at a time. Positions are held as ``base + moves`` so that differences of atoms that
 lie far from the origin keep their digits while moves are small; both as quads (x, y, z, any) by atom.
@@ -15,27 +15,23 @@ import numba as nb
 import numpy as np
 
 from kcons.constraints.constraint import RowKind
-from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad
+from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad, rolled
 from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, call_row
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
 DIHEDRAL = int(RowKind.DIHEDRAL)
 LINEAR = int(RowKind.LINEAR)
-SPHERE = int(RowKind.SPHERE)
-CYLINDER = int(RowKind.CYLINDER)
-#: Parameters of a row: up to four atoms with three coefficients each.
-PARAMETERS = 12
 
-
-#: Which of the two gradients in a slot's line.
-NOW, REFERENCE = 0, 1
+#: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
+NOW, REFERENCE = np.int64(0), np.int64(1)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     """Vector from atom j to atom i, as three numbers."""
-    return _near(
+    return near(
         load_quad(base, 4 * i) - load_quad(base, 4 * j),
         load_quad(moves, 4 * i) - load_quad(moves, 4 * j),
         cell, inverse, periodic,
@@ -43,7 +39,7 @@ def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
+def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     # No arrays come here: one that passes a branch costs reference counting.
     x, y, z = lane(whole, 0), lane(whole, 1), lane(whole, 2)
     if periodic:
@@ -106,11 +102,44 @@ def dihedral(f, g, h):  # type: ignore[no-untyped-def]
     return value, (-ga * ax, -ga * ay, -ga * az), (tx, ty, tz), (gb * bx, gb * by, gb * bz)
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _function(  # type: ignore[no-untyped-def]
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, cell, inverse, periodic, lines, which
+):
+    """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots."""
+    at, x, y, z = ROOM, 0.0, 0.0, 0.0
+    j = entry(slot_atoms, slot)
+    for p in range(slot, end):
+        rolled()
+        i = entry(slot_atoms, p)
+        if kind == FUNCTION:
+            r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
+            x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
+        else:
+            dx, dy, dz = _difference(i, j, base, moves, cell, inverse, periodic)
+            x, y, z = x + dx, y + dy, z + dz
+            j = i
+        put(parameters, at, x)
+        put(parameters, at + 1, y)
+        put(parameters, at + 2, z)
+        at += 3
+    call_row(parameters, offset, ROOM, offset + 2, number(parameters, which), at)
+    value = number(parameters, at)
+    for p in range(slot, end):
+        rolled()
+        _put(lines, 8 * p + which, number(parameters, at + 1), number(parameters, at + 2), number(parameters, at + 3))
+        at += 3
+    return value
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
     first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, which
 ):
-    """Values and gradients of rows first to last; ``links[4 k + 2]`` is the first slot of row k."""
+    """Values and gradients of rows first to last.
+
+    ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its first parameter.
+    """
     cell = (
         (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
         (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
@@ -124,7 +153,7 @@ def evaluate(  # type: ignore[no-untyped-def]
     for k in range(first, last):
         kind = entry(kinds, k)
         slot = entry(links, 4 * k + 2)
-        place, offset = 8 * slot + which, PARAMETERS * k
+        place, offset = 8 * slot + which, entry(links, 4 * k + 3)
         i = entry(slot_atoms, slot)
         if kind == DISTANCE:
             x, y, z = _difference(i, entry(slot_atoms, slot + 1), base, moves, cell, inverse, periodic)
@@ -164,28 +193,19 @@ def evaluate(  # type: ignore[no-untyped-def]
                 offset += 3
             value = whole + change
         else:
-            r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
-            x = lane(r, 0) - number(parameters, offset)
-            y = lane(r, 1) - number(parameters, offset + 1)
-            z = lane(r, 2) - number(parameters, offset + 2)
-            if kind == CYLINDER:
-                # From the axis through the point with the unit direction n.
-                nx, ny, nz = (
-                    number(parameters, offset + 3),
-                    number(parameters, offset + 4),
-                    number(parameters, offset + 5),
-                )
-                along = x * nx + y * ny + z * nz
-                x, y, z = x - along * nx, y - along * ny, z - along * nz
-            value = math.sqrt(x * x + y * y + z * z)
-            _put(lines, place, x / value, y / value, z / value)
+            end = entry(links, 4 * k + 6)
+            value = _function(
+                kind, slot, end, slot_atoms, parameters, offset, base, moves, cell, inverse, periodic, lines, which
+            )
         put(values, k, value)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def miss(kind, value, target):  # type: ignore[no-untyped-def]
-    """target - value, for dihedrals by the shorter way round."""
+def miss(kind, value, target, period):  # type: ignore[no-untyped-def]
+    """target - value, for dihedrals and functions with a period by the shorter way round."""
     difference = target - value
     if kind == DIHEDRAL:
         difference -= 2 * np.pi * np.rint(difference / (2 * np.pi))
+    elif period > 0.0:
+        difference -= period * np.rint(difference / period)
     return difference

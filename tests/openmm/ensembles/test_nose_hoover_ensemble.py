@@ -5,7 +5,15 @@ import copy
 import numpy as np
 import openmm
 import pytest
-from ensemble_runs import run, twice_kinetic
+from ensemble_runs import (
+    in_calls_of_any_length,
+    on_their_rows,
+    run,
+    three_on_a_sphere,
+    three_parts,
+    twice_kinetic,
+    warm,
+)
 from openmm import unit
 from openmm_systems import (
     GPUS,
@@ -24,17 +32,14 @@ from openmm_systems import (
 
 from kcons import ConstraintSet, Motion, State
 from kcons import System as CoreSystem
-from kcons.constraints import Angle, Distance, Sphere
+from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
-    CollectiveRows,
     NoseHoover,
     ProjectedIntegrator,
-    Row,
     SurfaceIntegrator,
     hold,
     positions_of,
-    surface_parts,
 )
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 from kcons.thermostats import NoseHooverChain
@@ -94,19 +99,7 @@ def test_one_bond_as_the_core_stepper(scheme, options):
 
 def test_calls_of_any_length_make_the_same_motion():
     """Two halves of the chain at one place need one sum: in between, nobody looks at K."""
-    system, x, v = alanine()
-    ends = []
-    for blocks in ([60], [1] * 60, [7, 30, 23]):
-        ensemble = NoseHoover(300.0, 20.0)
-        integrator = ProjectedIntegrator(1e-3, tolerance=1e-13, ensemble=ensemble)
-        context = started(system, integrator, x, v)
-        for steps in blocks:
-            integrator.step(steps)
-        ends.append((*state_of(context), ensemble.conserved_energy(integrator)))
-    for other in ends[1:]:
-        assert np.abs(other[0] - ends[0][0]).max() <= 1e-12
-        assert np.abs(other[1] - ends[0][1]).max() <= 1e-10
-        assert other[2] == pytest.approx(ends[0][2], rel=1e-10)
+    integrator = in_calls_of_any_length(lambda: NoseHoover(300.0, 20.0))
     unseen, seen = integrator.counts(seen=False), integrator.counts()
     assert (unseen.constraint_solves, unseen.passes, unseen.synchronisations) == (2, 6, 1)
     assert (seen.constraint_solves, seen.passes, seen.synchronisations) == (2, 8, 2)
@@ -160,39 +153,21 @@ def test_rows_that_are_carried_move_as_those_of_the_system():
 
 
 def test_parts_keep_their_rows():
-    system = openmm.System()
-    x = np.array([[0.1, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.05], [0.8, 0.1, 0], [0.8, 0.6, 0.1], [0.0, 0.6, 0.1]])
-    springs = openmm.CustomBondForce("200*(r-0.5)^2")
-    for i in range(6):
-        system.addParticle(12.0 + i)
-        for j in range(i):
-            springs.addBond(j, i)
-    system.addForce(springs)
-    carried = hold(system, [Angle([(0, 1, 2)], 1.9)], positions=x)
-    distance = openmm.CustomBondForce("r")
-    distance.addBond(3, 4)
-    rows = CollectiveRows(system, [Row(distance, 0.5)])
-    (sphere,) = surface_parts(Sphere([5], center=[0, 0, 0], radius=0.6), system=system)
+    system, x, parts = three_parts()
     ensemble = NoseHoover(300.0, 5.0)
-    integrator = ProjectedIntegrator(1e-3, parts=(carried, rows, sphere), ensemble=ensemble)
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.applyConstraints(context)
-    integrator.setVelocitiesToTemperature(context, 300, 4)
+    integrator = ProjectedIntegrator(1e-3, parts=parts, ensemble=ensemble)
+    context = warm(system, integrator, x, 4)
     values = []
     for _ in range(50):
         integrator.step(4)
         integrator.check()
         values.append(ensemble.conserved_energy(integrator))
-        r, u = state_of(context)
-        assert abs(np.linalg.norm(r[3] - r[4]) - 0.5) < 1e-12
-        assert abs(np.linalg.norm(r[5]) - 0.6) < 1e-13
-        assert abs((r[3] - r[4]) @ (u[3] - u[4])) < 1e-11 and abs(r[5] @ u[5]) < 1e-11
+        on_their_rows(*state_of(context))
     # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
     assert ensemble.count(integrator) == 15
     assert np.ptp(values) < 0.05 < abs(integrator.getGlobalVariableByName("chain_place"))
     with pytest.raises(UnsupportedError, match="multipliers_at"):
-        rows.multipliers(integrator)
+        parts[1].multipliers(integrator)
 
 
 def test_a_step_that_fails_leaves_the_chain_where_it_was():
@@ -231,21 +206,10 @@ def test_a_nan_leaves_the_chain_of_the_last_check():
 
 
 def test_surfaces_alone():
-    system = openmm.System()
-    springs = openmm.CustomBondForce("100*(r-0.5)^2")
-    x = np.array([[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]])
-    for k in range(3):
-        system.addParticle(20.0)
-        for j in range(k):
-            springs.addBond(j, k)
-    system.addForce(springs)
+    system, x, spheres = three_on_a_sphere()
     ensemble = NoseHoover(300.0, 10.0)
-    integrator = SurfaceIntegrator(
-        1e-3, surfaces=Sphere([0, 1, 2], center=[0, 0, 0], radius=0.5), system=system, ensemble=ensemble
-    )
-    context = context_of(system, integrator)
-    context.setPositions(x)
-    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator = SurfaceIntegrator(1e-3, surfaces=spheres, system=system, ensemble=ensemble)
+    context = warm(system, integrator, x, 1)
     values = []
     for _ in range(10):
         integrator.step(10)

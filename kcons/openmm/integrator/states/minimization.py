@@ -9,6 +9,7 @@ from openmm import unit
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.quantities import masses_of
 
 #: Longest way of a particle in one step, nm.
 _STRIDE = 0.01
@@ -37,13 +38,12 @@ def descend(integrator: openmm.Integrator, context: openmm.Context, tolerance: f
     Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006).
     """
     system = context.getSystem()
-    n = system.getNumParticles()
-    masses = np.array([system.getParticleMass(i).value_in_unit(unit.dalton) for i in range(n)])[:, None]
+    masses = masses_of(system)[:, None]
     inverse = np.divide(1.0, masses, out=np.zeros_like(masses), where=masses > 0)
     groups = integrator.getIntegrationForceGroups()
     kept = velocities_of(context)
     dt, alpha, since_turn = 1e-3, 0.1, 0
-    v = np.zeros((n, 3))
+    v = np.zeros((len(masses), 3))
     try:
         integrator.applyConstraints(context)
         for _ in range(iterations or 50_000):

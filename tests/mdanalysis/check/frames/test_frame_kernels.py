@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.constraints.one_piece import lattice_of, minimum_image
+from kcons.constraints.periodic.one_piece import lattice_of, minimum_image
 from kcons.mdanalysis.check.frames import frame_kernels as kernels
 from kcons.solvers.kernels.nearest_image import NO_LATTICE
 

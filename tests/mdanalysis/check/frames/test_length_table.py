@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import water_files as files
 
-from kcons.constraints.one_piece import lattice_of, minimum_image
+from kcons.constraints.periodic.one_piece import lattice_of, minimum_image
 from kcons.mdanalysis.check.files.file_precision import FilePrecision
 from kcons.mdanalysis.check.files.plain_dcd import Block
 from kcons.mdanalysis.check.frames.deviations import Deviations

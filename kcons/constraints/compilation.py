@@ -1,0 +1,142 @@
+"""Compiled kernels: where they are kept, what is said while they are made, and what needs none.
+
+Numba compiles a kernel when it is first called, and keeps the result on disk, so that a machine compiles it once. Each
+processor has results of its own in the same folder, and several processes may use it at once.
+
+- Where the folder of kcons cannot be written to, Numba keeps results below the user's home; where that cannot be
+  written to either, in ``$NUMBA_CACHE_DIR``. Without any of these they are kept for one process only.
+- Compiling that has taken a second is announced, once in a process, by the logger ``kcons`` (on standard error unless
+  logging is set up otherwise).
+- What is done once for a set of constraints is left to Python where there are few rows (`plain_if_small`).
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import shutil
+import tempfile
+import threading
+import time
+from typing import Any
+
+import numba
+from numba.core import event
+
+from kcons.errors import UnsupportedError
+
+logger = logging.getLogger("kcons")
+
+#: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk.
+SMALL = 3000
+#: Seconds of compiling, in all, before it is announced.
+PATIENCE = 1.0
+
+_config: Any = numba.config
+
+if _config.DISABLE_JIT:
+    raise UnsupportedError(
+        "NUMBA_DISABLE_JIT is set, and kcons has kernels that exist compiled only; unset it (to step through a kernel, "
+        "call its `py_func` where it has one)"
+    )
+
+
+def plain_if_small(kernel: Any, size: int) -> Any:
+    """A compiled function, or for little work the Python function that it was made of, unless it is loaded already.
+
+    For work on integers: both return the same.
+
+    Parameters
+    ----------
+    kernel : numba.core.registry.CPUDispatcher
+        What it calls must be `numba.extending.register_jitable`, which is compiled as a part of the caller only.
+    size : int
+        About how many elements are looked at; see `SMALL`.
+    """
+    return kernel.py_func if size <= SMALL and not kernel.signatures else kernel
+
+
+def _nothing() -> None:
+    """What `keep_somewhere` asks Numba to keep."""
+
+
+def keep_somewhere() -> str | None:
+    """See that kernels can be kept; returns the folder that this process alone uses, if there is no other."""
+    try:
+        numba.njit(cache=True)(_nothing)
+    except RuntimeError:  # no locator: neither folder can be written to
+        folder = tempfile.mkdtemp(prefix="kcons-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        _config.CACHE_DIR = folder
+        return folder
+    return None
+
+
+class Announcer(event.Listener):  # type: ignore[misc]
+    """Says that kernels of kcons are compiled, once it has taken `PATIENCE`.
+
+    Attributes
+    ----------
+    seconds : float
+        What compiling has taken in this process.
+    announced : bool
+    """
+
+    def __init__(self, own_folder: str | None = None) -> None:
+        self.seconds = 0.0
+        self.announced = False
+        self._own_folder = own_folder
+        self._lock = threading.Lock()
+        self._depth: dict[int, int] = {}
+        self._begun = 0.0
+        self._timer: threading.Timer | None = None
+
+    def on_start(self, event: Any) -> None:
+        kernel = event.data["dispatcher"].py_func
+        with self._lock:
+            thread = threading.get_ident()
+            if not self._depth and str(kernel.__module__).partition(".")[0] != "kcons":
+                return
+            self._depth[thread] = self._depth.get(thread, 0) + 1
+            if sum(self._depth.values()) > 1:
+                return
+            self._begun = time.perf_counter()
+            if not self.announced:
+                self._timer = threading.Timer(max(PATIENCE - self.seconds, 0.0), self._announce)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def on_end(self, event: Any) -> None:
+        with self._lock:
+            thread = threading.get_ident()
+            if thread not in self._depth:
+                return
+            self._depth[thread] -= 1
+            if not self._depth[thread]:
+                del self._depth[thread]
+            if self._depth:
+                return
+            self.seconds += time.perf_counter() - self._begun
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+
+    def _announce(self) -> None:
+        with self._lock:
+            if self.announced or not self._depth:
+                return
+            self.announced = True
+        if self._own_folder is None:
+            logger.warning(
+                "kcons compiles the kernels that this system needs. This happens once on a machine and takes some "
+                "seconds; `kcons warmup` does it beforehand"
+            )
+        else:
+            logger.warning(
+                "kcons compiles the kernels that this system needs, and can keep them nowhere: neither its own folder "
+                "nor your home can be written to. Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
+            )
+
+
+announcer = Announcer(keep_somewhere())
+event.register("numba:compile", announcer)

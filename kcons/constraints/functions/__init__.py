@@ -1,0 +1,6 @@
+"""Functions of one's own as rows.
+
+- `custom`: functions in Python, or compiled by Numba
+- `expressions`: formulas read, differentiated and written as code
+- `formula`: rows that are formulas
+"""

@@ -1,0 +1,395 @@
+"""Coordinates given by Python functions: implicit surfaces and any collective variable."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import ANY, lent, numbers
+from kcons.constraints.constraint import Constraint, RowKind
+from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
+from kcons.errors import InputError
+
+_FLOAT = np.dtype(np.float64)
+#: Relative deviation of a given derivative from a difference quotient that counts as a mistake.
+_WRONG = 1e-3
+
+
+class FunctionRows(Constraint):
+    """Rows whose coordinate and gradient are Python functions.
+
+    What is not given is taken by central differences: the gradient from four values a coordinate, order four, at steps
+    of 1e-3 `length` (about eleven digits if the function varies on the scale of `length`); the curvature from four
+    gradients along v in the same way, or without these from eight values along v, order eight, at steps of `length`/50
+    (about ten digits); time derivatives by eighth-order formulas with step `time_step`.
+    """
+
+    held = ANY
+    kind = RowKind.FUNCTION
+    #: Whether the functions take one row at a time.
+    by_row: ClassVar[bool] = True
+    functions: ClassVar[tuple[str, ...]] = ("function", "gradient_function", "hessian_vector", "time_derivatives")
+
+    def __init__(
+        self,
+        atoms: ArrayLike,
+        function: Callable[..., Any],
+        gradient: Callable[..., Any] | None,
+        hessian_vector: Callable[..., Any] | None,
+        target: Target,
+        time_dependent: bool,
+        time_derivatives: Callable[..., Any] | None,
+        length: float | None,
+        time_step: float,
+    ) -> None:
+        super().__init__(atoms, target)
+        for name, given in (("function", function), ("gradient", gradient)):
+            if not callable(given) and (given is not None or name == "function"):
+                raise InputError(f"{self.family}: {name} must be a function, not {given!r:.60}", item=name)
+        for name, size in (("length", length), ("time_step", time_step)):
+            if size is not None and not (np.isfinite(size) and size > 0):
+                raise InputError(f"{self.family}: {name} must be positive, not {size}", item=name)
+        self.function = function
+        self.gradient_function = gradient
+        self.hessian_vector = hessian_vector
+        self.time_derivatives = time_derivatives
+        self.time_dependent = bool(time_dependent) or time_derivatives is not None
+        self.length = length
+        self.time_step = float(time_step)
+
+    @property
+    def moving(self) -> bool:
+        return super().moving or self.time_dependent
+
+    @abstractmethod
+    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        """Results of a user's function for all rows, shape (n_rows, *shape)."""
+
+    def _time(self, time: float) -> tuple[float, ...]:
+        return (time,) if self.time_dependent else ()
+
+    def measure(self, r: FloatArray, time: float) -> FloatArray:
+        return self._call(self.function, "function", (), r, *self._time(time))
+
+    def gradient(self, r: FloatArray, time: float) -> FloatArray:
+        if self.gradient_function is None:
+            return self._differenced_gradient(r, time)
+        return self._call(self.gradient_function, "gradient", (self.width, 3), r, *self._time(time))
+
+    def _differenced_gradient(self, r: FloatArray, time: float) -> FloatArray:
+        step, slope = 1e-3 * self._length(r), np.empty(r.shape)
+        for a, i in np.ndindex(self.width, 3):
+            along = np.zeros((self.width, 3))
+            along[a, i] = 1.0
+            slope[:, a, i] = self._slope(r, along, step, time)
+        return slope
+
+    def _slope(self, r: FloatArray, along: FloatArray, step: FloatArray, time: float) -> FloatArray:
+        """Differenced change of the value along a direction of unit length."""
+        return first_derivative_4(
+            lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+        )
+
+    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
+        """Value and gradient of row `k` alone at `r`, shape (width, 3); for kernels."""
+        here = lent(r)
+        args = (here, time) if self.time_dependent else (here,)
+        value = self._checked(self.function(*args), k, "function", ())
+        if self.gradient_function is None:
+            only = self if self.n_rows == 1 else self.select([k])
+            return float(value), only.gradient(r[None], time)[0]
+        return float(value), self._checked(self.gradient_function(*args), k, "gradient", r.shape)
+
+    def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
+        """What a function returned for row `k`, as float64 of that shape."""
+        if type(found) is float and not shape:
+            return found
+        if type(found) not in (np.ndarray, np.float64) or found.dtype is not _FLOAT:
+            found = numbers(found, f"{self.row_name(k)}: {name}")
+        if found.shape != shape:
+            raise InputError(
+                f"{self.family}: {name} returned shape {found.shape} for row {k}; it must return "
+                f"{shape if shape else 'one number'}",
+                item=name,
+                atoms=self.atoms[k].tolist(),
+            )
+        return found
+
+    def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        if self.hessian_vector is None:
+            return self._differenced_curvature(r, v, time)
+        product = self._call(self.hessian_vector, "hessian_vector", (self.width, 3), r, v, *self._time(time))
+        return _contract(product, v)
+
+    def _differenced_curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        speed = np.sqrt(_contract(v, v))
+        along = v / np.where(speed > 0, speed, 1.0)[:, None, None]
+        if self.gradient_function is None:
+            step = 0.02 * self._length(r)
+            bend = second_derivative(
+                lambda s: self.measure(r + s[:, None, None] * along, time), np.zeros(self.n_rows), step
+            )
+            return bend * speed**2
+        slope = first_derivative_4(
+            lambda s: _contract(self.gradient(r + s[:, None, None] * along, time), along),
+            np.zeros(self.n_rows),
+            1e-3 * self._length(r),
+        )
+        return slope * speed**2
+
+    def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
+        if not self.time_dependent:
+            return super().time_terms(r, v, time)
+        if self.time_derivatives is not None:
+            both = self._call(self.time_derivatives, "time_derivatives", (2,), r, v, time)
+            return both[:, 0], both[:, 1]
+        h = self.time_step
+        rate = first_derivative(lambda t: self.measure(r, t), time, h)
+        second = second_derivative(lambda t: self.measure(r, t), time, h)
+        mixed = first_derivative(lambda t: _contract(self.gradient(r, t), v), time, h) if v.any() else 0.0
+        return rate, 2 * mixed + second
+
+    def scale(self, time: float = 0.0) -> FloatArray:
+        # The unit of the function is unknown: the set takes the size of the positions.
+        return np.zeros(self.n_rows)
+
+    def _length(self, r: FloatArray) -> FloatArray:
+        """Length over which the coordinate varies: as given, the spread of the atoms, or 1."""
+        if self.length is not None:
+            return np.full(self.n_rows, self.length)
+        apart = r - r.mean(axis=1, keepdims=True)
+        spread = np.sqrt(_contract(apart, apart) / max(self.width, 1))
+        return np.where(spread > 0, spread, 1.0)
+
+    def check(self, r: FloatArray, time: float, first_row: int) -> None:
+        if self.n_rows == 0:
+            return
+        value, slope = self.measure(r, time), self.gradient(r, time)
+        size = np.sqrt(_contract(slope, slope))
+        self.refuse_singular(
+            ~(np.isfinite(value) & np.isfinite(size) & (size > 0)),
+            first_row,
+            lambda k, row: (
+                f"{row}: value {value[k]:g} and norm of the gradient {size[k]:g} at atoms "
+                f"{self.atoms[k, :6].tolist()}; the gradient must be finite and not zero. Move the atoms, or use "
+                "another coordinate"
+            ),
+        )
+        # A wrong derivative would give wrong motion without any other sign.
+        along = np.random.default_rng(0).normal(size=r.shape)
+        along /= np.sqrt(_contract(along, along))[:, None, None]
+        length = self._length(r)
+        if self.gradient_function is not None:
+            difference = self._slope(r, along, 1e-3 * length, time)
+            self._compare("gradient", _contract(slope, along), difference, size, first_row, (r, slope, time))
+        if self.hessian_vector is not None:
+            curvature = self._differenced_curvature(r, along, time)
+            self._compare(
+                "hessian_vector",
+                self.curvature(r, along, time),
+                curvature,
+                np.abs(curvature) + size / length,
+                first_row,
+            )
+
+    def _compare(
+        self,
+        name: str,
+        given: FloatArray,
+        found: FloatArray,
+        size: FloatArray,
+        first_row: int,
+        components: tuple[FloatArray, FloatArray, float] | None = None,
+    ) -> None:
+        """Refuse what differences contradict; of a gradient, with `components`, the worst of these is named."""
+
+        def said(k: int) -> str:
+            one, other, where = given[k], found[k], "along a test direction"
+            if components is not None:
+                r, slope, time = components
+                differenced = self._differenced_gradient(r, time)[k]
+                a, i = np.unravel_index(int(np.argmax(np.abs(slope[k] - differenced))), slope[k].shape)
+                one, other = slope[k, a, i], differenced[a, i]
+                where = f"for {'xyz'[i]} of its atom {self.atoms[k, a]}"
+            return (
+                f"{name} gives {one:.6g} {where}, but differences of the function give {other:.6g}; correct it, or "
+                "give the length over which the function varies (length=...)"
+            )
+
+        self.refuse_input(~(np.abs(given - found) <= _WRONG * size), first_row, said, name)
+
+
+class ImplicitSurface(FunctionRows):
+    """Atoms on a surface given by a function, q = function(r); the surface is q = 0.
+
+    Parameters
+    ----------
+    atoms : int or array_like of int, shape (n_rows,)
+        The atoms; each is one row.
+    function : callable
+        ``function(r) -> (n_rows,)`` for positions of shape (n_rows, 3); with `time_dependent`, ``(r, t)``.
+    gradient : callable, optional
+        ``gradient(r) -> (n_rows, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced: see
+        `length`.
+    hessian_vector : callable, optional
+        ``hessian_vector(r, v) -> (n_rows, 3)``, the Hessian of q times v; with `time_dependent`,
+        ``(r, v, t)``. Without it the gradient is differenced along v: see `length`.
+    target : float, array_like, callable of time, MovingTarget or None
+        Level held: 0 by default, None for the level each atom starts on.
+    time_dependent : bool
+        Whether the surface moves, and the functions take the time as their last argument.
+    time_derivatives : callable, optional
+        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two arrays of shape (n_rows,). Without it
+        function and gradient are differenced in time, order eight, with step `time_step`.
+    length : float, optional
+        Length over which the surface bends (a radius); 1 by default. Differences are taken at 1e-3 of it
+        and leave about eleven digits of the curvature.
+    time_step : float
+        Step of the time differences: about 1/50 of the time over which the surface moves.
+
+    Raises
+    ------
+    InputError
+        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
+    SingularGeometryError
+        When put into a set, a gradient that is zero or not finite.
+
+    Examples
+    --------
+    The plane z = 0.1 sin(t):
+
+    >>> import numpy as np
+    >>> wave = ImplicitSurface(
+    ...     0,
+    ...     lambda r, t: r[:, 2] - 0.1 * np.sin(t),
+    ...     lambda r, t: np.tile([0.0, 0.0, 1.0], (len(r), 1)),
+    ...     time_dependent=True,
+    ... )
+    >>> wave.moving
+    True
+    """
+
+    family = "ImplicitSurface"
+    row_width = 1
+    by_row = False
+
+    def __init__(
+        self,
+        atoms: ArrayLike,
+        function: Callable[..., Any],
+        gradient: Callable[..., Any] | None = None,
+        hessian_vector: Callable[..., Any] | None = None,
+        target: Target = 0.0,
+        *,
+        time_dependent: bool = False,
+        time_derivatives: Callable[..., Any] | None = None,
+        length: float | None = None,
+        time_step: float = 0.02,
+    ) -> None:
+        column = np.asarray(atoms).reshape(-1, 1)
+        super().__init__(
+            column, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
+        )
+
+    @property
+    def kind(self) -> RowKind:  # type: ignore[override]
+        """Kernels take rows one by one, and only what knows a single row can be asked for one."""
+        return RowKind.FUNCTION if self.n_rows == 1 else RowKind.INTERPRETED
+
+    def row(self, k: int, r: FloatArray, time: float) -> tuple[float, FloatArray]:
+        here = r[None]
+        return float(self.measure(here, time)[0]), self.gradient(here, time)[0]
+
+    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        flat = [lent(a[:, 0]) if isinstance(a, np.ndarray) else a for a in arguments]
+        found = function(*flat)
+        if name == "time_derivatives":
+            found = np.stack([np.broadcast_to(numbers(part, name), (self.n_rows,)) for part in found], axis=-1)
+        result = numbers(found, f"ImplicitSurface: {name}")
+        wanted = (self.n_rows, 3) if shape == (1, 3) else (self.n_rows, *shape)
+        if result.shape != wanted:
+            raise InputError(
+                f"ImplicitSurface: {name} returned shape {result.shape} for positions of shape ({self.n_rows}, 3); "
+                f"it must return {wanted}",
+                item=name,
+            )
+        return result.reshape(self.n_rows, *shape)
+
+
+class Custom(FunctionRows):
+    """Any function of the positions of a few atoms, called once a row.
+
+    Parameters
+    ----------
+    atoms : array_like of int, shape (n_rows, width) or (width,)
+        Atoms of each row.
+    function : callable
+        ``function(r) -> float`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``.
+    gradient : callable, optional
+        ``gradient(r) -> (width, 3)``; with `time_dependent`, ``(r, t)``. Without it the function is differenced, order
+        four, at steps of 1e-3 `length`: about eleven digits. Where Numba has compiled it and the function, kernels call
+        both without Python.
+    hessian_vector : callable, optional
+        ``hessian_vector(r, v) -> (width, 3)``; with `time_dependent`, ``(r, v, t)``. Without it the
+        gradient is differenced along v, as above.
+    target : float, array_like, callable of time, MovingTarget or None
+        Value held; None takes the initial one.
+    time_dependent : bool
+        Whether the functions take the time as their last argument.
+    time_derivatives : callable, optional
+        ``(r, v, t) -> (dq/dt, 2 (d2q/dr dt) . v + d2q/dt2)``, two floats. Without it function and
+        gradient are differenced in time, order eight, with step `time_step`.
+    translation_invariant : bool
+        Whether only differences of positions count; then minimum images apply in periodic cells.
+    period : float, optional
+        Period of the value, such as 2 pi.
+    length : float, optional
+        Length over which the function varies; by default the spread of the atoms of the row, 1 for one atom.
+    time_step : float
+        Step of the time differences.
+
+    Raises
+    ------
+    InputError
+        Results of the wrong shape; when put into a set, a gradient or Hessian that contradicts the function.
+    SingularGeometryError
+        When put into a set, a gradient that is zero or not finite.
+    """
+
+    family = "Custom"
+
+    def __init__(
+        self,
+        atoms: ArrayLike,
+        function: Callable[..., Any],
+        gradient: Callable[..., Any] | None = None,
+        hessian_vector: Callable[..., Any] | None = None,
+        target: Target = None,
+        time_derivatives: Callable[..., Any] | None = None,
+        *,
+        time_dependent: bool = False,
+        translation_invariant: bool = False,
+        period: float | None = None,
+        length: float | None = None,
+        time_step: float = 0.02,
+    ) -> None:
+        super().__init__(
+            atoms, function, gradient, hessian_vector, target, time_dependent, time_derivatives, length, time_step
+        )
+        self.translation_invariant = bool(translation_invariant)
+        self.period = period
+
+    def _call(self, function: Callable[..., Any], name: str, shape: tuple[int, ...], *arguments: Any) -> FloatArray:
+        out = np.empty((self.n_rows, *shape))
+        for k in range(self.n_rows):
+            found = function(*(lent(a[k]) if isinstance(a, np.ndarray) else a for a in arguments))
+            out[k] = self._checked(found, k, name, shape)
+        return out
+
+
+def _contract(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("kai,kai->k", a, b))

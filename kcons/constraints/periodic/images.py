@@ -1,0 +1,435 @@
+"""Which periodic image of each atom a row means.
+
+Minimum images say it for a vector that is shorter than half the cell, and for no other. So rows are sorted at
+set-up:
+
+* A row is *plain* if a constant distance shorter than half the cell is held between each two neighbours in its
+  list of atoms. Minimum images along the list are then right at any time, whatever images are stored.
+* All other rows are *whole* rows: distances as long as half the cell and more (across a ring or an adsorbate),
+  linear rows, free dihedrals and angles, centres of groups, moving targets. Their atoms are made whole along a
+  spanning tree of the shortest links that the set has, held distances first, and the row takes positions in
+  the images found there.
+
+A link of the tree that no constant distance holds is *loose*: its image is unambiguous only as long as it is
+shorter than half the cell. `Images.make_whole` reports how near the worst one is, and `Images.refuse_loose_links`
+raises before it flips.
+
+A framework that closes upon itself through the boundary (a sheet, a polymer) has rows whose images differ from
+those of the tree by whole cells, the same at all times: `Constraint.windings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+import scipy.sparse as sp
+
+from kcons.constraints.compilation import plain_if_small
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
+from kcons.constraints.periodic.one_piece import BoolArray, follow_parents, minimum_image, spanning_tree
+from kcons.constraints.target import FloatArray
+from kcons.errors import ImageError, InputError
+
+#: Rows of up to so many atoms offer links between all pairs of them, wider ones between neighbours in the list.
+ALL_PAIRS_WIDTH = 12
+#: A link that closes a framework through the boundary is a bond: not much longer than the longest of the tree.
+BOND_LIKE = 1.5
+#: Parts of the cell at which a loose link is taken to have reached half of it.
+_HALF = 0.5 - 1e-9
+
+
+@dataclass(frozen=True)
+class Images:
+    """The tree along which the atoms of whole rows, and all atoms tied to them, are made whole.
+
+    Attributes
+    ----------
+    atoms, parents : ndarray of int, shape (k,)
+        Parents come before their children; a root is its own parent and keeps the image it is stored in.
+    loose : ndarray of int, shape (k,)
+        For loose links the row they come from, -1 for others.
+    longest : float
+        The longest of the other links.
+    """
+
+    atoms: IntArray
+    parents: IntArray
+    loose: IntArray
+    longest: float = 0.0
+
+    def make_whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
+        """Copy of `x`, shape (n_atoms, 3), with `atoms` in the images of the tree."""
+        y = x.copy()
+        follow_parents(y, self.atoms, self.parents, lattice)
+        return y
+
+    def follow(self, x: FloatArray, x_ref: FloatArray, y_ref: FloatArray, lattice: FloatArray) -> FloatArray:
+        """Shifts, shape (k, 3), that bring `atoms` in `x` next to where they are in `y_ref`, by whole cells.
+
+        `y_ref` is `x_ref` made whole: atoms move by less than half a cell from `x_ref` to `x`, if not wrapped.
+        """
+        step = x[self.atoms] - x_ref[self.atoms]
+        cells = np.round((y_ref - x_ref)[self.atoms] @ lattice[1]) - np.round(step @ lattice[1])
+        return cells @ lattice[0]
+
+    def reached_half(self, y: FloatArray, lattice: FloatArray) -> int:
+        """A loose link, as an index into `atoms`, that is as long as half the cell in positions made whole; or -1."""
+        links = np.flatnonzero(self.loose >= 0)
+        if not len(links):
+            return -1
+        parts = np.abs((y[self.atoms[links]] - y[self.parents[links]]) @ lattice[1]).max(axis=1)
+        worst = int(np.argmax(parts))
+        return int(links[worst]) if parts[worst] >= _HALF else -1
+
+    def among(self, atoms: IntArray, numbers: IntArray, rows: IntArray) -> Images | None:
+        """The part of the tree between `atoms` and between rows `rows`, with atom a called numbers[a].
+
+        An atom whose parent is not among them becomes a root: no row that is left needs what ties it to others.
+        """
+        kept = np.zeros(len(numbers), bool)
+        kept[atoms] = True
+        keep = kept[self.atoms]
+        if not keep.any():
+            return None
+        here, parents, loose = self.atoms[keep], self.parents[keep], self.loose[keep]
+        parents = np.where(kept[parents], parents, here)
+        # A loose link may come from a row that is not among these; any of them may name it.
+        place = np.minimum(np.searchsorted(rows, loose), max(len(rows) - 1, 0))
+        return Images(numbers[here], numbers[parents], np.where(loose < 0, -1, place), self.longest)
+
+    def ancestors(self, needed: IntArray, n_atoms: int) -> IntArray:
+        """`needed` and the atoms by which they are made whole."""
+        return self.atoms[plain_if_small(_with_ancestors, len(self.atoms))(self.atoms, self.parents, needed, n_atoms)]
+
+
+def image_error(row_name: str, atoms: IntArray, half_width: float) -> ImageError:
+    """The error for two atoms of a row that have drifted half the cell apart."""
+    return ImageError(
+        f"row {row_name}: atoms {atoms[0]} and {atoms[1]}, which nothing ties together, are half the cell apart "
+        f"({half_width:g} in its narrowest direction); further on the row would mean other periodic images. Use a "
+        "larger cell, make the ConstraintSet without a cell and keep positions unwrapped, or hold what ties these "
+        "atoms together",
+        atoms=atoms,
+    )
+
+
+def find_images(
+    constraints: Sequence[Constraint],
+    starts: IntArray,
+    x: FloatArray,
+    lattice: FloatArray | None,
+    half_width: float,
+    time: float,
+    ties: Sequence[Constraint] = (),
+) -> tuple[list[Constraint], Images | None]:
+    """Sort rows into plain and whole ones and find the tree.
+
+    Parameters
+    ----------
+    constraints : sequence of Constraint
+        Targets may still be missing.
+    starts : ndarray of int
+        First row of each.
+    x : ndarray, shape (n_atoms, 3)
+    lattice : ndarray, shape (2, 3, 3), or None
+    half_width : float
+    time : float
+    ties : sequence of Constraint
+        What the constraints replace: rows that are held still and tie atoms together.
+
+    Returns
+    -------
+    constraints : list of Constraint
+        Copies that know which of their rows are whole, and the windings of these.
+    images : Images or None
+        None if all rows are plain.
+
+    Raises
+    ------
+    InputError
+        A link of the tree as long as half the cell: its image is ambiguous.
+    """
+    given = [_unmarked(item) for item in constraints]
+    if lattice is None:
+        return given, None
+    tables = [
+        _Links(item, int(start), x, lattice, half_width, time)
+        for item, start in zip(given, starts, strict=False)
+        if item.relative and item.n_rows
+    ]
+    n_atoms = len(x)
+    _accept_small_pieces(tables, n_atoms, half_width)
+    if not tables or all(table.plain_at_once for table in tables):
+        return given, None
+    ties = [item for item in ties if item.family == "Distance" and not item.moving and item.n_rows]
+    others = [_Links(_unmarked(item), 0, x, lattice, half_width, time) for item in ties]
+    held = [t for t in [*tables, *others] if t.held]
+    keys = np.sort(np.concatenate([t.keys(n_atoms)[t.short] for t in held] or [np.zeros(0, np.int64)]))
+    for table in tables:
+        table.sort_rows(keys, n_atoms)
+    if not any(table.whole.any() or table.unsure.any() for table in tables):
+        return given, None
+    images, longest, component = _tree([*tables, *others], given, x, lattice, half_width)
+    y = images.make_whole(x, lattice)
+    frameworks = np.zeros(int(component.max(initial=-1)) + 1, bool)
+    for table in tables:
+        table.find_closures(y, lattice, longest, component, frameworks)
+    pairs = np.concatenate([t.item.atoms for t in held] or [np.zeros((0, 2), np.int64)])
+    ends = np.concatenate([pairs, pairs[:, ::-1]]).T
+    neighbours = sp.csr_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(n_atoms, n_atoms))
+    for table in tables:
+        table.settle(component, frameworks, neighbours)
+    needed = np.zeros(len(frameworks), bool)
+    for table in tables:
+        needed[component[table.item.atoms[table.whole].ravel()]] = True
+    marked = {id(t.item): t.marked(needed[component[t.item.atoms[:, 0]]]) for t in tables}
+    keep = needed[component[images.atoms]]
+    result = [marked.get(id(item), item) for item in given]
+    if not keep.any():
+        return result, None
+    return result, Images(images.atoms[keep], images.parents[keep], images.loose[keep], images.longest)
+
+
+class _Links:
+    """The links that the rows of one constraint offer, between neighbours in the list and others.
+
+    `whole` and `unsure` (distances whose target is still to be taken from one image or another) are by row.
+    """
+
+    def __init__(
+        self, item: Constraint, start: int, x: FloatArray, lattice: FloatArray, half_width: float, time: float
+    ) -> None:
+        self.item, self.start, self.half_width, self.time = item, start, half_width, time
+        self.neighbours = np.stack([item.atoms[:, :-1], item.atoms[:, 1:]], axis=-1)
+        raw = x[self.neighbours[..., 1]] - x[self.neighbours[..., 0]]
+        nearest = minimum_image(raw, lattice)
+        self.lengths = np.linalg.norm(nearest, axis=2)
+        #: Held at one length for good.
+        self.held = item.family == "Distance" and not item.moving
+        self.whole: BoolArray = np.zeros(item.n_rows, np.bool_)
+        self.unsure: BoolArray = np.zeros(item.n_rows, np.bool_)
+        self.windings = np.zeros((item.n_rows, item.width, 3), np.int64)
+        if self.held:
+            if item.target is None:
+                # Until the tree is known: the length found may be that of another image.
+                self.unsure[:] = True
+            else:
+                self.lengths = item.target_at(time)[:, None]
+            self.whole = ~self.unsure & (self.lengths[:, 0] >= half_width)
+        self._local: BoolArray | None = None
+
+    @property
+    def plain_at_once(self) -> bool:
+        return self.held and not (self.whole.any() or self.unsure.any())
+
+    @property
+    def short(self) -> BoolArray:
+        """Rows whose one link is a constant distance shorter than half the cell."""
+        return ~self.whole & (self.lengths[:, 0] < self.half_width)
+
+    def keys(self, n_atoms: int) -> IntArray:
+        pairs = np.sort(self.item.atoms[:, :2], axis=1)
+        return pairs[:, 0] * n_atoms + pairs[:, 1]
+
+    def sort_rows(self, keys: IntArray, n_atoms: int) -> None:
+        """Rows along links that are not among the held ones are whole rows."""
+        if self.held:
+            return
+        pairs = np.sort(self.neighbours, axis=2)
+        wanted = pairs[..., 0] * n_atoms + pairs[..., 1]
+        place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        found = keys[place] == wanted if len(keys) else np.zeros(wanted.shape, bool)
+        # The compiled solvers know minimum images of distances, angles and dihedrals only.
+        self.whole = np.logical_not(found.all(axis=1)) | (self.item.kind == RowKind.LINEAR)
+
+    def offered(self) -> tuple[IntArray, FloatArray, IntArray]:
+        """Pairs of atoms, lengths (NaN: to be measured) and rows of the links offered to the tree."""
+        rows = np.repeat(np.arange(self.item.n_rows), self.item.width - 1)
+        pairs, lengths = self.neighbours.reshape(-1, 2), self.lengths.ravel()
+        if 2 < self.item.width <= ALL_PAIRS_WIDTH and self.whole.any():
+            a, b = np.triu_indices(self.item.width, 2)
+            more = self.item.atoms[self.whole]
+            pairs = np.concatenate([pairs, np.stack([more[:, a], more[:, b]], axis=-1).reshape(-1, 2)])
+            lengths = np.concatenate([lengths, np.full(len(more) * len(a), np.nan)])
+            rows = np.concatenate([rows, np.repeat(np.flatnonzero(self.whole), len(a))])
+        return pairs, lengths, self.start + rows
+
+    def find_closures(
+        self, y: FloatArray, lattice: FloatArray, longest: FloatArray, component: IntArray, frameworks: BoolArray
+    ) -> None:
+        """Rows that mean minimum images rather than those of the tree, and which components close by them."""
+        item = self.item
+        label = component[item.atoms[:, 0]]
+        r = y[item.atoms]
+        apart = np.diff(r, axis=1)
+        cells = -np.round(apart @ lattice[1]).astype(np.int64)
+        nearest = np.linalg.norm(apart + cells @ lattice[0], axis=2)
+        differs = cells.any(axis=2)
+        self._long = np.linalg.norm(apart, axis=2)[:, 0] >= self.half_width
+        self.windings[:, 1:] = np.cumsum(cells, axis=1)
+        if item.target is not None and item.holonomic:
+            # The target tells which of the two is meant.
+            other = r + self.windings @ lattice[0]
+            with np.errstate(all="ignore"):
+                closing = np.abs(self._sigma(other)) < 0.5 * np.abs(self._sigma(r))
+        else:
+            bonds = (nearest < self.half_width) & (nearest <= BOND_LIKE * longest[label][:, None])
+            closing = (bonds | ~differs).all(axis=1)
+            self._local = (nearest < self.half_width).all(axis=1)
+            self._nearest = nearest
+        self._closing = closing & differs.any(axis=1)
+        frameworks[label[self._closing]] = True
+
+    def _sigma(self, r: FloatArray) -> FloatArray:
+        difference = self.item.measure(r, self.time) - self.item.target_at(self.time)
+        if self.item.period is not None:
+            difference -= self.item.period * np.round(difference / self.item.period)
+        return difference
+
+    def settle(self, component: IntArray, frameworks: BoolArray, held: sp.csr_array) -> None:
+        """Rows beside the tree: in a body they have its images, in a framework they are local."""
+        closing = self._closing
+        if self._local is not None:
+            closing = closing | (frameworks[component[self.item.atoms[:, 0]]] & self._local)
+        if self.held and self.item.target is None:
+            self._refuse_doubtful(self.windings.any(axis=(1, 2)) & ~closing, held)
+        if self.held:
+            self.whole |= self.unsure & ~closing & (self.windings.any(axis=(1, 2)) | self._long)
+        self.windings[~closing] = 0
+
+    def _refuse_doubtful(self, beside: BoolArray, held: sp.csr_array) -> None:
+        """Lengths that are to be found, of rows that may as well close through the boundary as span a body.
+
+        In a body that is held by distances they are one side of a triangle of such.
+        """
+        for k in np.flatnonzero(beside & (self._local if self._local is not None else False)):
+            a, b = (int(atom) for atom in self.item.atoms[k])
+            if held[[a]].multiply(held[[b]]).nnz:
+                continue
+            raise InputError(
+                f"row {self.start + k}, {self.item.row_name(int(k))}: its periodic image is ambiguous: atoms {a} and "
+                f"{b} are {self._nearest[k, 0]:g} apart across the boundary, and farther along the rows that tie them "
+                "together. Give the target of this row",
+                item="target",
+                atoms=[a, b],
+            )
+
+    def marked(self, needed: BoolArray) -> Constraint:
+        """A copy that knows its whole rows, and the windings of all rows whose atoms are made whole."""
+        self.windings[~needed] = 0
+        if not self.whole.any() and not self.windings.any():
+            return self.item
+        copy = self.item.with_target(self.item.target)
+        copy.whole = self.whole
+        copy.windings = self.windings if self.windings.any() else None
+        return copy
+
+
+def _accept_small_pieces(tables: Sequence[_Links], n_atoms: int, half_width: float) -> None:
+    """Lengths as found are right in pieces whose links, laid end to end, are shorter than half the cell."""
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
+    held = [table for table in tables if table.held]
+    if not any(table.unsure.any() for table in held):
+        return
+    pairs = np.concatenate([table.item.atoms for table in held])
+    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    piece = connected_components(graph, directed=False)[1]
+    reach = np.bincount(piece[pairs[:, 0]], weights=np.concatenate([t.lengths[:, 0] for t in held]))
+    for table in held:
+        table.unsure &= reach[piece[table.item.atoms[:, 0]]] >= half_width
+
+
+def _unmarked(item: Constraint) -> Constraint:
+    copy = item.with_target(item.target)
+    copy.whole = copy.windings = None
+    return copy
+
+
+def _tree(
+    tables: Sequence[_Links], given: Sequence[Constraint], x: FloatArray, lattice: FloatArray, half_width: float
+) -> tuple[Images, FloatArray, IntArray]:
+    """Spanning forest of the shortest links, held ones first; the longest link and the number of each component.
+
+    Raises
+    ------
+    InputError
+        A link that is needed is as long as half the cell.
+    """
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree  # slow to import
+
+    n_atoms = len(x)
+    offered = [table.offered() for table in tables]
+    pair = np.sort(np.concatenate([o[0] for o in offered]), axis=1)
+    row = np.concatenate([o[2] for o in offered])
+    length = np.concatenate([o[1] for o in offered])
+    held = np.concatenate([np.full(len(o[2]), table.held) for table, o in zip(tables, offered, strict=True)])
+    unknown = np.isnan(length)
+    apart = x[pair[unknown, 1]] - x[pair[unknown, 0]]
+    length[unknown] = np.linalg.norm(minimum_image(apart, lattice), axis=1)
+    # Held links as long as half the cell have no image of their own; they come last, to be refused.
+    order = np.lexsort((length, ~held, length >= half_width))
+    _, first = np.unique(pair[order, 0] * n_atoms + pair[order, 1], return_index=True)
+    chosen = order[np.sort(first)]
+    ranks = np.arange(1.0, len(chosen) + 1)
+    graph = sp.csr_array((ranks, (pair[chosen, 0], pair[chosen, 1])), shape=(n_atoms, n_atoms))
+    forest = minimum_spanning_tree(graph).tocoo()
+    link = chosen[np.asarray(forest.data, dtype=np.int64) - 1]
+    if np.any(length[link] >= half_width):
+        worst = int(link[np.argmax(length[link])])
+        _refuse_long(given, int(row[worst]), pair[worst], float(length[worst]), half_width)
+    component = connected_components(forest, directed=False)[1].astype(np.int64)
+    longest = np.zeros(int(component.max(initial=-1)) + 1)
+    np.maximum.at(longest, component[pair[link, 0]], length[link])
+    # Atoms that are fixed, or held in space by a row of their own, keep the image they are stored in.
+    firm = np.zeros(n_atoms, bool)
+    for item in given:
+        if item.width == 1:
+            firm[item.atoms.ravel()] = True
+    roots = np.concatenate([np.flatnonzero(firm), np.flatnonzero(~firm)])
+    atoms, parents = spanning_tree(pair[link], n_atoms, roots)
+    parent_of, loose = np.empty(n_atoms, np.int64), np.full(n_atoms, -1)
+    parent_of[atoms] = parents
+    i, j = pair[link].T
+    loose[np.where(parent_of[j] == i, j, i)] = np.where(held[link], -1, row[link])
+    tied = np.isin(atoms, pair[link])
+    atoms, parents = atoms[tied], parents[tied]
+    ties = float(np.max(length[link][held[link]], initial=0.0))
+    return Images(atoms, parents, loose[atoms], ties), longest, component
+
+
+def _refuse_long(given: Sequence[Constraint], row: int, pair: IntArray, length: float, half_width: float) -> None:
+    first = 0
+    for item in given:
+        if row < first + item.n_rows:
+            break
+        first += item.n_rows
+    atoms = [int(a) for a in pair]
+    what = (
+        f"target {length:g}" if item.family == "Distance" else f"distance {length:g} of atoms {atoms[0]} and {atoms[1]}"
+    )
+    raise InputError(
+        f"row {row}, {item.row_name(row - first)}: {what} is not shorter than half the box ({half_width:g}), and no "
+        "shorter rows tie these atoms together; its minimum image is ambiguous. Use a larger cell, no cell, or list "
+        "the atoms so that neighbours in the row are neighbours in space",
+        item="target" if item.family == "Distance" else "positions",
+        atoms=atoms,
+    )
+
+
+@nb.njit(cache=True)
+def _with_ancestors(atoms, parents, needed, n_atoms):  # type: ignore[no-untyped-def]
+    """Which of `atoms` are needed, or lie between a needed one and its root."""
+    marked = np.zeros(n_atoms, np.bool_)
+    for a in needed:
+        marked[a] = True
+    keep = np.zeros(len(atoms), np.bool_)
+    for back in range(len(atoms)):
+        k = len(atoms) - 1 - back
+        if marked[atoms[k]]:
+            keep[k] = True
+            marked[parents[k]] = True
+    return keep

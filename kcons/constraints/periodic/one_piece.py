@@ -1,0 +1,122 @@
+"""Periodic cells: shortest images, and what hangs together moved into one piece.
+
+The one place in which atoms are moved by whole cells: for rows (`images`), for molecules of files
+(`kcons.topology.whole_molecules`) and for molecules that are restored (`kcons.motion.restoring`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numba as nb
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from kcons.constraints.arguments import FloatArray, IntArray
+from kcons.errors import InputError
+
+BoolArray = NDArray[np.bool_]
+
+
+def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) -> FloatArray | None:
+    """Cell vectors as rows, and the inverse with zeros for directions without periodicity, shape (2, 3, 3).
+
+    Directions without periodicity get a unit vector normal to the others. None without a periodic direction.
+
+    Raises
+    ------
+    InputError
+        Periodic cell vectors that are zero or not independent.
+    """
+    periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
+    if cell is None or not periodic.any():
+        return None
+    full = cell.copy()
+    basis = cell[periodic]
+    _, singular, vh = np.linalg.svd(basis)
+    if singular.min() < 1e-10 * max(singular.max(), np.finfo(float).tiny):
+        raise InputError("the periodic cell vectors are zero or not independent", item="cell")
+    full[~periodic] = vh[len(basis) :]
+    inverse = np.linalg.inv(full)
+    inverse[:, ~periodic] = 0.0
+    return np.ascontiguousarray(np.stack([full, inverse]))
+
+
+def minimum_image(d: FloatArray, lattice: FloatArray | None) -> FloatArray:
+    """Shortest periodic images of difference vectors, shape (..., 3); `d` itself without a lattice."""
+    return d if lattice is None else d - np.round(d @ lattice[1]) @ lattice[0]
+
+
+def lined_up(r: FloatArray, lattice: FloatArray | None) -> FloatArray:
+    """Lists of atoms, shape (n, width, 3), each atom in the image nearest to the one before it; in place."""
+    if lattice is not None:
+        steps = minimum_image(np.diff(r, axis=1), lattice)
+        r[:, 1:] = r[:, :1] + np.cumsum(steps, axis=1)
+    return r
+
+
+def neighbour_lists(pairs: IntArray, n_atoms: int) -> tuple[IntArray, IntArray]:
+    """Where the neighbours of each atom begin, shape (n_atoms + 1,), and all of them, those of one atom ascending."""
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    start = np.concatenate([[0], np.cumsum(np.bincount(ends[:, 0], minlength=n_atoms))])
+    return start, ends[order, 1]
+
+
+def spanning_tree(pairs: IntArray, n_atoms: int, roots: IntArray | None = None) -> tuple[IntArray, IntArray]:
+    """All atoms breadth first along pairs, and their parents, which come before them.
+
+    Parameters
+    ----------
+    roots : ndarray of int, optional
+        All atoms; the first of a piece is its root, which is its own parent. By default the one of lowest number.
+    """
+    if not len(pairs):
+        return np.arange(n_atoms), np.arange(n_atoms)
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
+
+    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    label = connected_components(graph, directed=False)[1]
+    order = np.arange(n_atoms) if roots is None else roots
+    first = order[np.unique(label[order], return_index=True)[1]]
+    # One more node, from which all pieces hang.
+    ends = np.concatenate([pairs, np.stack([np.full(len(first), n_atoms), first], axis=1)])
+    tree = sp.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n_atoms + 1, n_atoms + 1))
+    found, parent_of = breadth_first_order(tree, n_atoms, directed=False)
+    atoms = found[1:].astype(np.int64)
+    parents = parent_of[atoms].astype(np.int64)
+    return atoms, np.where(parents == n_atoms, atoms, parents)
+
+
+def make_whole(x: FloatArray, atoms: IntArray, parents: IntArray, lattice: FloatArray | None) -> FloatArray:
+    """Copy of `x`, shape (n_atoms, 3), with `atoms` moved by whole cells next to their parents, which are among them.
+
+    Each atom is rounded once, wherever it is stored. Nothing is compiled for what is done once; see `follow_parents`.
+    """
+    if lattice is None:
+        return x.copy()
+    parent = np.arange(len(x))
+    parent[atoms] = parents
+    cells = -np.round((x - x[parent]) @ lattice[1])
+    while np.any(parent != parent[parent]):
+        cells += cells[parent]
+        parent = parent[parent]
+    return x + cells @ lattice[0]
+
+
+@nb.njit(cache=True)
+def follow_parents(y, atoms, parents, lattice):  # type: ignore[no-untyped-def]
+    """`make_whole` for what is done again and again: moves atoms in place, parents before their children."""
+    cell, inverse = lattice[0], lattice[1]
+    for k in range(len(atoms)):
+        a, b = atoms[k], parents[k]
+        if a == b:
+            continue
+        dx, dy, dz = y[a, 0] - y[b, 0], y[a, 1] - y[b, 1], y[a, 2] - y[b, 2]
+        na = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
+        nb_ = np.rint(dx * inverse[0, 1] + dy * inverse[1, 1] + dz * inverse[2, 1])
+        nc = np.rint(dx * inverse[0, 2] + dy * inverse[1, 2] + dz * inverse[2, 2])
+        if na != 0.0 or nb_ != 0.0 or nc != 0.0:
+            for i in range(3):
+                y[a, i] -= na * cell[0, i] + nb_ * cell[1, i] + nc * cell[2, i]

@@ -1,0 +1,248 @@
+"""Rows that share no atom with another one, each a function: Newton's method for one multiplier after the other.
+
+What one particle on a surface takes, and a hundred thousand. Values and gradients are called by address, see
+`kcons.solvers.sparse.row_functions`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.solvers.cluster_solver import Outcome, Request
+from kcons.solvers.kernels.nearest_image import NO_LATTICE
+from kcons.solvers.kernels.two_and_four_wide import entry, lane, load_point, number, put, quad, rolled
+from kcons.solvers.sparse.elimination import FAST
+from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
+from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
+from kcons.solvers.sparse.row_values import miss, near
+from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
+
+_EPS = float(np.finfo(float).eps)
+
+
+class SingleRows:
+    """Solver for clusters of one row, which is a function.
+
+    Parameters
+    ----------
+    constraint_set : ConstraintSet
+    rows : ndarray of int64
+        Row numbers, sorted.
+    inverse_masses : ndarray, shape (n_atoms,)
+        0 for atoms of infinite mass.
+    """
+
+    name = "single"
+
+    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, inverse_masses: FloatArray) -> None:
+        self.rows = rows
+        incidence = constraint_set.incidence[rows]
+        atoms = incidence.indices.astype(np.uint32)
+        widest = int(np.diff(incidence.indptr).max(initial=0))
+        self._given = GivenRows(constraint_set, rows, widest)
+        # Row by row: its first slot, its first parameter, its kind.
+        links = np.zeros((len(rows) + 1, 3), np.uint32)
+        links[:, 0], links[:, 1], links[:-1, 2] = incidence.indptr, self._given.starts, self._given.kinds
+        self._tables = links.ravel(), atoms, self._given.numbers, inverse_masses[atoms], np.zeros(3 * widest)
+        self._scale = constraint_set.scale[rows]
+        self._targets = np.ascontiguousarray(constraint_set.target(0.0)[rows])
+        self._pushes, self._solution = np.zeros(3 * len(atoms)), np.zeros(len(rows))
+        self._made_of = constraint_set, rows, inverse_masses
+
+    def __reduce__(self) -> tuple[type[SingleRows], tuple[object, ...]]:
+        return SingleRows, self._made_of  # addresses are of no use elsewhere
+
+    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
+        """Solve the SHAKE condition by true Newton, in place."""
+        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request
+        self._given.numbers[:2] = time, reference_time
+        found = _positions(
+            x, reference, self._targets if wanted is None else wanted[self.rows],
+            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, self._scale, self._pushes,
+            self._solution, x if velocities is None else velocities, 0.0 if velocities is None else inv_dt,
+        )  # fmt: skip
+        self._given.refuse()
+        if found[0] and multipliers is not None:
+            multipliers[:] = self._solution
+        return Outcome(*found)
+
+    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
+        """M-orthogonal projection of y onto A y = rates, in place."""
+        y, x, wanted, lattice, time, *_ = request
+        self._given.numbers[:2] = time
+        found = _tangents(
+            x, y, self._targets if wanted is None else wanted[self.rows], wanted is not None,
+            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, self._pushes,
+            self._solution,
+        )  # fmt: skip
+        self._given.refuse()
+        if found[0] and multipliers is not None:
+            np.negative(self._solution, out=multipliers)
+        return Outcome(*found)
+
+    def rank(self, x: FloatArray, lattice: FloatArray | None, time: float) -> int:
+        """Independent rows at `x`: those that some atom can answer."""
+        outcome = self.tangents(Request(np.zeros_like(x), x, None, lattice, time))
+        if not outcome.converged:
+            return len(self.rows)
+        return int(np.count_nonzero(np.add.reduceat(np.abs(self._pushes), 3 * self._tables[0][:-3:3].astype(np.int64))))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type: ignore[no-untyped-def]
+    """Positions of a row's atoms from `room[at]` on, as its function gets them."""
+    a, b, c = 0.0, 0.0, 0.0
+    before = load_point(x, 3 * entry(atoms, slot))
+    for p in range(slot, end):
+        rolled()
+        here = load_point(x, 3 * entry(atoms, p))
+        if relative:
+            cell = (
+                (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
+                (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
+                (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
+            )
+            inverse = (
+                (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
+                (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
+                (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
+            )
+            dx, dy, dz = near(here - before, quad(0.0, 0.0, 0.0, 0.0), cell, inverse, periodic)
+            a, b, c = a + dx, b + dy, c + dz
+            before = here
+        else:
+            a, b, c = lane(here, 0), lane(here, 1), lane(here, 2)
+        put(room, at, a)
+        put(room, at + 1, b)
+        put(room, at + 2, c)
+        at += 3
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _apply(x, factor, slot, end, atoms, pushes):  # type: ignore[no-untyped-def]
+    for p in range(slot, end):
+        rolled()
+        g = 3 * entry(atoms, p)
+        for i in range(3):
+            put(x, g + i, number(x, g + i) + factor * number(pushes, 3 * p + i))
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _positions(  # type: ignore[no-untyped-def]
+    x, x_ref, wanted, lattice, periodic, links, atoms, numbers, masses, base, scale, pushes, solution, velocities,
+    inv_dt,
+):  # fmt: skip
+    worst, worst_row, most = 0.0, -1, 0
+    for k in range(len(solution)):
+        slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
+        relative = entry(links, 3 * k + 2) != FUNCTION
+        out = ROOM + 3 * (end - slot)
+        count = 3 * (end - slot)
+        _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
+        call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+        reach = 0.0
+        for p in range(slot, end):
+            rolled()
+            size, far = 0.0, 0.0
+            for i in range(3):
+                g, r = number(numbers, out + 1 + 3 * (p - slot) + i), number(x, 3 * entry(atoms, p) + i)
+                put(pushes, 3 * p + i, g * number(masses, p))
+                size, far = size + g * g, far + r * r
+            reach += math.sqrt(size * far)
+        floor = max(1e-14 * number(scale, k), 2 * _EPS * reach)
+        _gather(x, slot, end, atoms, relative, lattice, periodic, base, 0)
+        lam, last, previous, iteration, halvings = 0.0, 0.0, np.inf, 0, 0
+        while True:
+            for i in range(count):
+                rolled()
+                put(numbers, ROOM + i, number(base, i) + lam * number(pushes, 3 * slot + i))
+            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
+            slope = 0.0
+            for i in range(count):
+                rolled()
+                slope += number(numbers, out + 1 + i) * number(pushes, 3 * slot + i)
+            off = miss(FUNCTION, number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
+            error = abs(off)
+            if not (error < np.inf):
+                return False, np.inf, iteration, k
+            if error <= floor and (error <= NEWTON_TOLERANCE * number(scale, k) or error > 0.1 * previous):
+                break
+            if iteration == MAX_ITERATIONS:
+                return False, error / number(scale, k), iteration, k
+            if iteration > 0 and not (error < 0.999 * previous) and error > 1e-10 * number(scale, k):
+                if halvings == MAX_HALVINGS:
+                    return False, error / number(scale, k), iteration, k
+                halvings += 1
+                lam = last + 0.5 * (lam - last)
+                continue
+            previous, last, halvings = error, lam, 0
+            lam += off / slope
+            iteration += 1
+        # A gradient must not have turned by 90 degrees or more within the step.
+        if not (slope > 0.0):
+            return False, np.inf, iteration, k
+        put(solution, k, lam)
+        error /= number(scale, k)
+        if error >= worst:
+            worst, worst_row = error, k
+        most = max(most, iteration)
+    for k in range(len(solution)):
+        slot, end, lam = entry(links, 3 * k), entry(links, 3 * k + 3), number(solution, k)
+        _apply(x, lam, slot, end, atoms, pushes)
+        if inv_dt != 0.0:
+            _apply(velocities, inv_dt * lam, slot, end, atoms, pushes)
+    return True, worst, most, worst_row
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _tangents(  # type: ignore[no-untyped-def]
+    x, y, wanted, driven, lattice, periodic, links, atoms, numbers, masses, base, pushes, solution
+):
+    worst, worst_row, most = 0.0, -1, 0
+    for k in range(len(solution)):
+        slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
+        out = ROOM + 3 * (end - slot)
+        _gather(x, slot, end, atoms, entry(links, 3 * k + 2) != FUNCTION, lattice, periodic, numbers, ROOM)
+        call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+        goal = number(wanted, k) if driven else 0.0
+        size, off, whole = abs(goal), goal, 0.0
+        for p in range(slot, end):
+            rolled()
+            for i in range(3):
+                g = number(numbers, out + 1 + 3 * (p - slot) + i)
+                part = g * number(y, 3 * entry(atoms, p) + i)
+                off -= part
+                size += abs(part)
+                put(pushes, 3 * p + i, g * number(masses, p))
+                whole += g * g * number(masses, p)
+        if not (size < np.inf):
+            return False, np.inf, 0, k
+        inverse = 1.0 / whole if whole > 0.0 else 0.0
+        lam, error, iteration = off * inverse, np.inf, 1
+        while True:
+            off = goal
+            for p in range(slot, end):
+                rolled()
+                for i in range(3):
+                    speed = number(y, 3 * entry(atoms, p) + i) + lam * number(pushes, 3 * p + i)
+                    off -= number(numbers, out + 1 + 3 * (p - slot) + i) * speed
+            if abs(off) <= SPEED_TOLERANCE * size or not (abs(off) < 0.5 * error):
+                break
+            error = abs(off)
+            lam += off * inverse
+            iteration += 1
+        put(solution, k, lam)
+        if not (abs(off) <= 1e3 * SPEED_TOLERANCE * size):
+            return False, abs(off), iteration, k
+        if abs(off) >= worst:
+            worst, worst_row = abs(off), k
+        most = max(most, iteration)
+    for k in range(len(solution)):
+        _apply(y, number(solution, k), entry(links, 3 * k), entry(links, 3 * k + 3), atoms, pushes)
+    return True, worst, most, worst_row

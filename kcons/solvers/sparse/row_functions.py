@@ -1,0 +1,283 @@
+"""Rows whose value and gradient are functions that the kernels call by their addresses.
+
+A kernel that knew every family would be compiled for all of them, and again for each of a user's own. Here a family is
+data: a function ``row(r, p, t, out)`` of the positions r of a row's atoms, its parameters p and the time t puts the
+value into ``out[0]`` and the gradient behind it, x, y, z by atom. It is compiled alone when it is first used. Python
+functions come in by the same door; their only parameter is the number of the row in its object.
+
+All parameters lie in one array. It begins with two times, now and at the reference, and with room for what functions
+get and give, from `ROOM` on; then come those of each row, and for a function before them its address and its period.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, is_jitted
+
+from kcons.constraints.constraint import Constraint, IntArray, RowKind
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.functions.custom import FunctionRows
+from kcons.constraints.functions.formula import Formula
+from kcons.constraints.target import FloatArray
+from kcons.solvers.sparse.elimination import FAST
+
+FUNCTION = int(RowKind.FUNCTION)
+#: A function of positions relative to the first atom.
+RELATIVE_FUNCTION = FUNCTION + 1
+#: First of the numbers that a function gets and gives.
+ROOM = 2
+_NUMBERS = types.CPointer(types.float64)
+ROW = types.void(_NUMBERS, _NUMBERS, types.float64, _NUMBERS)
+_C_ROW = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p)
+
+
+@intrinsic
+def call_row(typingctx, numbers, function, r, p, time, out):
+    """Call the function whose address is number `function`; r, p and out are places among the same numbers."""
+
+    def codegen(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        places = [builder.gep(data, [args[k]], inbounds=True) for k in (1, 2, 3, 5)]
+        integer = ir.IntType(64)
+        address = builder.load(builder.bitcast(places[0], ir.PointerType(integer)), align=8)
+        double = ir.DoubleType()
+        pointer = ir.PointerType(double)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, pointer, double, pointer])
+        function = builder.inttoptr(address, ir.PointerType(kind))
+        builder.call(function, [places[1], places[2], args[4], places[3]])
+        return context.get_dummy_value()
+
+    place = types.int64
+    return types.void(numbers, place, place, place, types.float64, place), codegen
+
+
+# -- families -----------------------------------------------------------------------------------------------
+
+
+def _sphere(r, p, t, out):
+    """Distance from the point p."""
+    x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    q = math.sqrt(x * x + y * y + z * z)
+    out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
+
+
+def _cylinder(r, p, t, out):
+    """Distance from the axis along p[3:6] through p[0:3]."""
+    x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    along = x * p[3] + y * p[4] + z * p[5]
+    x, y, z = x - along * p[3], y - along * p[4], z - along * p[5]
+    q = math.sqrt(x * x + y * y + z * z)
+    out[0], out[1], out[2], out[3] = q, x / q, y / q, z / q
+
+
+def _ellipsoid(r, p, t, out):
+    """s (|y| - 1), y = B (r - c); p holds s, c and B = D^-1 R^T by rows."""
+    x, y, z = r[0] - p[1], r[1] - p[2], r[2] - p[3]
+    a = p[4] * x + p[5] * y + p[6] * z
+    b = p[7] * x + p[8] * y + p[9] * z
+    c = p[10] * x + p[11] * y + p[12] * z
+    length = math.sqrt(a * a + b * b + c * c)
+    out[0] = p[0] * (length - 1.0)
+    f = p[0] / length
+    a, b, c = f * a, f * b, f * c
+    out[1] = p[4] * a + p[7] * b + p[10] * c
+    out[2] = p[5] * a + p[8] * b + p[11] * c
+    out[3] = p[6] * a + p[9] * b + p[12] * c
+
+
+def _torus(r, p, t, out):
+    """Distance from the circle of radius p[6] around p[0:3], normal to p[3:6]."""
+    x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    up = x * p[3] + y * p[4] + z * p[5]
+    x, y, z = x - up * p[3], y - up * p[4], z - up * p[5]
+    rho = math.sqrt(x * x + y * y + z * z)
+    h = rho - p[6]
+    q = math.sqrt(h * h + up * up)
+    f, g = h / (rho * q), up / q
+    out[0] = q
+    out[1] = f * x + g * p[3]
+    out[2] = f * y + g * p[4]
+    out[3] = f * z + g * p[5]
+
+
+def _center_distance(r, p, t, out):
+    """|sum w_i r_i|; p holds the number of atoms and the signed weights."""
+    n = int(p[0])
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(n):
+        w = p[1 + i]
+        x, y, z = x + w * r[3 * i], y + w * r[3 * i + 1], z + w * r[3 * i + 2]
+    q = math.sqrt(x * x + y * y + z * z)
+    out[0] = q
+    x, y, z = x / q, y / q, z / q
+    for i in range(n):
+        w = p[1 + i]
+        out[1 + 3 * i], out[2 + 3 * i], out[3 + 3 * i] = w * x, w * y, w * z
+
+
+def _radius_of_gyration(r, p, t, out):
+    """(sum w_i |r_i - C|^2)^1/2; p holds the number of atoms and the weights."""
+    n = int(p[0])
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(n):
+        w = p[1 + i]
+        x, y, z = x + w * r[3 * i], y + w * r[3 * i + 1], z + w * r[3 * i + 2]
+    square = 0.0
+    for i in range(n):
+        a, b, c = r[3 * i] - x, r[3 * i + 1] - y, r[3 * i + 2] - z
+        square += p[1 + i] * (a * a + b * b + c * c)
+    q = math.sqrt(square)
+    out[0] = q
+    for i in range(n):
+        f = p[1 + i] / q
+        out[1 + 3 * i] = f * (r[3 * i] - x)
+        out[2 + 3 * i] = f * (r[3 * i + 1] - y)
+        out[3 + 3 * i] = f * (r[3 * i + 2] - z)
+
+
+FAMILIES: dict[str, Callable[..., None]] = {
+    "Sphere": _sphere,
+    "Cylinder": _cylinder,
+    "Ellipsoid": _ellipsoid,
+    "Torus": _torus,
+    "CenterDistance": _center_distance,
+    "RadiusOfGyration": _radius_of_gyration,
+}
+
+
+@functools.cache
+def _compiled(function: Callable[..., None]) -> Any:
+    return nb.cfunc(ROW, cache=True, fastmath=FAST, error_model="numpy")(function)
+
+
+@functools.cache
+def _of_jitted(function: Any, gradient: Any, width: int, timed: bool) -> Any:
+    """A row of two functions that Numba has compiled, or will."""
+    shape = (width, 3)
+    if timed:
+
+        @nb.cfunc(ROW)
+        def row(r, p, t, out):
+            x = nb.carray(r, shape)
+            out[0] = function(x, t)
+            slope = gradient(x, t)
+            for i in range(width):
+                for j in range(3):
+                    out[1 + 3 * i + j] = slope[i, j]
+    else:
+
+        @nb.cfunc(ROW)
+        def row(r, p, t, out):
+            x = nb.carray(r, shape)
+            out[0] = function(x)
+            slope = gradient(x)
+            for i in range(width):
+                for j in range(3):
+                    out[1 + 3 * i + j] = slope[i, j]
+
+    return row
+
+
+class PythonRows:
+    """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended."""
+
+    def __init__(self, item: FunctionRows, numbers: FloatArray) -> None:
+        self.error: BaseException | None = None
+        width, count = item.width, 3 * item.width
+        start = numbers.ctypes.data
+        row = item.row
+
+        def called(r: int, p: int, time: float, out: int) -> None:
+            at = (out - start) >> 3
+            try:
+                first = (r - start) >> 3
+                # A copy: the function may keep what it sees.
+                place = numbers[first : first + count].reshape(width, 3).copy()
+                value, slope = row(int(numbers[(p - start) >> 3]), place, time)
+                numbers[at] = value
+                numbers[at + 1 : at + 1 + count] = slope.reshape(count)
+            except BaseException as error:
+                self.error = self.error or error
+                numbers[at : at + 1 + count] = np.nan
+
+        self._function = _C_ROW(called)
+        self.address = ctypes.cast(self._function, ctypes.c_void_p).value
+
+
+def row_function(item: Constraint, numbers: FloatArray) -> Any:
+    """What has the `address` of the function of an object's rows, to be kept as long as that is used.
+
+    `numbers` are those among which the function will find its arguments.
+    """
+    if isinstance(item, Formula):
+        return _compiled(item.code().row)
+    if isinstance(item, FunctionRows):
+        gradient = item.gradient_function
+        if item.by_row and gradient is not None and is_jitted(item.function) and is_jitted(gradient):
+            return _of_jitted(item.function, gradient, item.width, item.time_dependent)
+        return PythonRows(item, numbers)
+    return _compiled(FAMILIES[item.family])
+
+
+class GivenRows:
+    """What kernels are given of rows besides their atoms.
+
+    Attributes
+    ----------
+    kinds : ndarray of uint32, shape (n,)
+        Of each row, `RELATIVE_FUNCTION` included.
+    numbers : ndarray of float64
+        All parameters, as the module says.
+    starts : ndarray of int64, shape (n + 1,)
+        First parameter of each row, and the end.
+    """
+
+    def __init__(self, constraint_set: ConstraintSet, rows: IntArray, widest: int) -> None:
+        """`rows` of the set in the order of the kernels; `widest` is the most atoms that one of them has."""
+        items = list(zip(constraint_set.constraints, constraint_set.starts, strict=False))
+        kinds, sizes = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
+        tables: list[FloatArray] = []
+        for item, start in items:
+            mine = slice(start, start + item.n_rows)
+            table = item.parameters().reshape(item.n_rows, -1) if item.kind else np.zeros((item.n_rows, 0))
+            kinds[mine] = item.kind
+            if item.kind == FUNCTION:
+                kinds[mine] += item.relative
+                numbered = [np.arange(item.n_rows)[:, None]] if item.functions else []
+                table = np.hstack([np.tile([0.0, item.period or 0.0], (item.n_rows, 1)), table, *numbered])
+            sizes[mine] = table.shape[1]
+            tables.append(table)
+        self.kinds = kinds[rows]
+        self.starts = ROOM + 6 * widest + 1 + np.concatenate([[0], np.cumsum(sizes[rows])])
+        self.numbers = np.zeros(int(self.starts[-1]))
+        place = np.full(constraint_set.n_rows, -1)
+        place[rows] = self.starts[:-1]
+        self.functions = []
+        for (item, start), table in zip(items, tables, strict=True):
+            at = place[start : start + item.n_rows]
+            here = at >= 0
+            at = at[here]
+            self.numbers[at[:, None] + np.arange(table.shape[1])] = table[here]
+            if item.kind == FUNCTION and len(at):
+                self.functions.append(row_function(item, self.numbers))
+                self.numbers.view(np.int64)[at] = self.functions[-1].address
+
+    @property
+    def python(self) -> list[PythonRows]:
+        return [each for each in self.functions if isinstance(each, PythonRows)]
+
+    def refuse(self) -> None:
+        """Raise what a Python function has raised while a kernel ran."""
+        for each in self.functions:
+            if isinstance(each, PythonRows) and each.error is not None:
+                error, each.error = each.error, None
+                raise error

@@ -1,0 +1,307 @@
+"""The constraint object under ASE's hooks: dynamics, degrees of freedom, targets, changes of the atoms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.calculators.tip3p import TIP3P
+from ase.constraints import (
+    FixBondLengths,
+)
+from ase.md.langevin import Langevin
+from ase.md.velocitydistribution import thermalize_momenta
+from ase.md.verlet import VelocityVerlet
+from ase.optimize import BFGS
+from ase_systems import (
+    Free,
+    loose_waters,
+    off,
+    random,
+    rigid,
+    row_of_dumbbells,
+    slip,
+)
+
+from kcons.ase import Constraints, constrain, rigid_water
+from kcons.constraints import (
+    Angle,
+    Distance,
+    FixedAtoms,
+)
+from kcons.errors import (
+    ContradictionError,
+    InfeasibleError,
+    InputError,
+)
+
+# -- dynamics and optimisation ----------------------------------------------------------------------
+
+
+def test_velocity_verlet_on_rigid_water():
+    atoms, held = rigid(8)
+    energies = []
+    dyn = VelocityVerlet(atoms, 1 * units.fs)
+    dyn.attach(lambda: energies.append(atoms.get_total_energy()))
+    dyn.run(150)
+    assert off(atoms, held) <= 1e-13
+    assert slip(atoms, held) <= 1e-13
+    slope = np.polyfit(np.arange(len(energies)), energies, 1)[0]  # eV a step
+    assert abs(slope) * 150 <= 2e-4 * atoms.get_kinetic_energy()
+    assert np.ptp(energies) <= 5e-3 * atoms.get_kinetic_energy()
+
+
+def test_velocity_verlet_goes_back_and_does_not_stand_still():
+    atoms, held = rigid(2)
+    before = atoms.get_positions(), atoms.get_momenta()
+    dyn = VelocityVerlet(atoms, 1 * units.fs)
+    dyn.run(50)
+    dyn.dt = -1 * units.fs
+    dyn.run(50)
+    assert np.abs(atoms.positions - before[0]).max() <= 1e-11
+    assert np.abs(atoms.get_momenta() - before[1]).max() <= 1e-11
+    dyn.dt = 0.0  # ASE divides by the time step
+    with np.errstate(all="ignore"), pytest.raises(InputError, match="not finite"):
+        dyn.run(1)
+    assert off(atoms, held) <= 1e-13
+
+
+def test_agrees_with_fix_bond_lengths():
+    atoms, _ = rigid(2)
+    peer = atoms.copy()
+    peer.set_constraint(FixBondLengths(rigid_water(peer).atoms))
+    peer.calc = TIP3P(rc=6.0)
+    for a in (atoms, peer):
+        VelocityVerlet(a, 1 * units.fs).run(50)
+    assert np.abs(atoms.positions - peer.positions).max() <= 1e-9
+    assert np.abs(atoms.get_velocities() - peer.get_velocities()).max() <= 1e-9
+
+
+def test_free_dumbbells_keep_energy_momentum_and_angular_momentum():
+    atoms = row_of_dumbbells(3)
+    held = constrain(atoms, Distance([[0, 1], [2, 3], [4, 5]]))
+    thermalize_momenta(atoms, 300, rng=random(0))
+    before = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    VelocityVerlet(atoms, 2 * units.fs).run(100)
+    after = (atoms.get_kinetic_energy(), atoms.get_momenta().sum(axis=0), atoms.get_angular_momentum())
+    for a, b in zip(before, after, strict=True):
+        assert a == pytest.approx(b, rel=1e-10, abs=1e-10)
+    assert off(atoms, held) <= 1e-14
+
+
+def test_langevin_reaches_the_right_temperature():
+    atoms = row_of_dumbbells(60)
+    pairs = np.arange(120).reshape(-1, 2)
+    # Every row twice: counting rows instead of the rank would show 5/4 of the temperature.
+    held = constrain(atoms, [Distance(pairs), Distance(pairs)])
+    thermalize_momenta(atoms, 300, rng=random(4))
+    rng = np.random.default_rng(7)
+    dyn = Langevin(atoms, 2 * units.fs, temperature_K=300, friction=0.05 / units.fs, fixcm=False, rng=rng)
+    seen = []
+    dyn.attach(lambda: seen.append(atoms.get_temperature()))
+    dyn.run(1200)
+    blocks = np.array(seen[1:]).reshape(12, -1).mean(axis=1)
+    assert abs(blocks.mean() - 300) <= 4 * blocks.std(ddof=1) / np.sqrt(len(blocks))
+    assert blocks.std(ddof=1) / np.sqrt(len(blocks)) < 5
+    assert off(atoms, held) <= 1e-13
+
+
+def test_optimiser_keeps_bonds_and_angles():
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    rows = [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2], [1, 0, 3]])]
+    held = constrain(atoms, rows)
+    start = held.engine(atoms).constraint_set.measure(atoms.positions)
+    energy = atoms.get_potential_energy()
+    BFGS(atoms, logfile=None).run(fmax=0.02, steps=200)
+    assert np.abs(atoms.get_forces()).max() <= 0.02
+    assert atoms.get_potential_energy() < energy - 0.1
+    assert np.abs(held.engine(atoms).constraint_set.measure(atoms.positions) - start).max() <= 1e-13
+
+
+def test_periodic_wrap_changes_nothing():
+    cell = np.array([[7.0, 0, 0], [2.0, 6.5, 0], [-1.0, 1.5, 6.0]])
+    whole = molecule("H2O")
+    whole.set_cell(cell)
+    whole.pbc = True
+    whole.positions += cell.sum(axis=0) - whole.positions[0]  # the oxygen sits on the corner
+    whole.calc = Free()
+    thermalize_momenta(whole, 800, rng=random(3))
+    wrapped = whole.copy()
+    wrapped.calc = Free()
+    for a in (whole, wrapped):
+        constrain(a, rigid_water(a))
+    dyn = VelocityVerlet(wrapped, 2 * units.fs)
+    dyn.attach(wrapped.wrap)
+    dyn.run(300)
+    VelocityVerlet(whole, 2 * units.fs).run(300)
+    cells = (wrapped.positions - whole.positions) @ np.linalg.inv(cell)
+    assert np.abs(cells - np.round(cells)).max() <= 1e-11
+    assert np.ptp(np.round(cells), axis=0).max() > 0  # the molecule was really cut
+
+
+def test_pendulum_of_fixed_atom_and_bond():
+    atoms = Atoms("CO", positions=[[0, 0, 0], [1.1, 0, 0]], calculator=Free())
+    held = constrain(atoms, [Distance([0, 1]), FixedAtoms([0])])
+    atoms.set_momenta([[3.0, 0, 0], [1.0, 2.0, 0]])
+    VelocityVerlet(atoms, 1 * units.fs).run(100)
+    assert np.array_equal(atoms.positions[0], [0, 0, 0])
+    assert np.array_equal(atoms.get_momenta()[0], [0, 0, 0])
+    assert off(atoms, held) <= 1e-14
+    assert atoms.get_kinetic_energy() == pytest.approx(0.5 * 2.0**2 / atoms.get_masses()[1], rel=1e-10)
+
+
+def test_float32_forces():
+    class Single(EMT):
+        def get_forces(self, atoms=None):
+            return super().get_forces(atoms).astype(np.float32)
+
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = Single()
+    held = constrain(atoms, Distance([[0, 1], [1, 2]]))
+    forces = atoms.get_forces()
+    exact = held.engine(atoms).project_forces(atoms.positions, atoms.get_forces(apply_constraint=False))
+    assert forces.dtype == np.float32
+    assert np.abs(forces - exact).max() <= 1e-5
+    VelocityVerlet(atoms, 1 * units.fs).run(20)
+    assert off(atoms, held) <= 1e-13
+
+
+def test_arrays_that_are_not_contiguous():
+    atoms, held = rigid(2)
+    new = atoms.positions + 0.01
+    new[0] += 0.05
+    plain = new.copy()
+    held.adjust_positions(atoms, plain)
+    transposed = np.asfortranarray(new)
+    held.adjust_positions(atoms, transposed)
+    assert np.array_equal(plain, transposed)
+    whole = np.array([[3, 0, 0]] * 6)
+    held.adjust_momenta(atoms, np.asfortranarray(whole.astype(float)))
+
+
+# -- degrees of freedom, momenta --------------------------------------------------------------------
+
+
+def test_dof_counts_the_rank():
+    atoms = loose_waters(2)
+    rows = rigid_water(atoms)
+    atoms.set_constraint(Constraints([rows, rows, Distance([0, 1])]))
+    assert atoms.get_number_of_degrees_of_freedom() == 12
+    atoms.set_constraint(Constraints([rows]))
+    assert atoms.get_number_of_degrees_of_freedom() == 12
+
+
+def test_temperature_uses_the_rank():
+    atoms, _ = rigid(2)
+    assert atoms.get_temperature() == pytest.approx(2 * atoms.get_kinetic_energy() / (12 * units.kB))
+
+
+def test_momenta_are_projected_once():
+    atoms, held = rigid(2, temperature=None)
+    rng = np.random.default_rng(2)
+    raw = rng.normal(size=(6, 3))
+    masses = atoms.get_masses()[:, None]
+    kinetic = 0.5 * (raw**2 / masses).sum()
+    atoms.set_momenta(raw)
+    assert slip(atoms, held) <= 1e-14
+    assert atoms.get_kinetic_energy() < kinetic
+    assert atoms.get_momenta().sum(axis=0) == pytest.approx(raw.sum(axis=0), abs=1e-13)
+    once = atoms.get_momenta()
+    atoms.set_momenta(once)
+    assert np.abs(atoms.get_momenta() - once).max() <= 1e-14
+
+
+def test_constrain_projects_momenta_that_are_there():
+    atoms = molecule("H2O")
+    atoms.set_momenta(np.random.default_rng(0).normal(size=(3, 3)))
+    assert slip(atoms, constrain(atoms, rigid_water(atoms))) <= 1e-14
+
+
+def test_no_hook_that_would_act_twice():
+    # Its presence would make ASE apply adjust_forces to the forces of dynamics.
+    assert not hasattr(Constraints, "adjust_potential_energy")
+
+
+def test_forces_off_the_surface_use_the_rows_there():
+    atoms, held = rigid(1, temperature=None)
+    atoms.positions[1] += [0.05, 0.02, 0.0]
+    forces = np.random.default_rng(1).normal(size=(3, 3))
+    held.adjust_forces(atoms, forces)
+    rows = held.engine(atoms).constraint_set.jacobian(atoms.positions)
+    assert np.abs(rows @ (forces / atoms.get_masses()[:, None]).ravel()).max() <= 1e-14
+
+
+# -- targets ----------------------------------------------------------------------------------------
+
+
+def test_targets_are_taken_at_first_use_and_kept():
+    atoms = molecule("H2O")
+    atoms.set_constraint(Constraints(Distance([0, 1])))
+    length = atoms.get_distance(0, 1)
+    atoms.set_positions(atoms.positions + np.random.default_rng(0).normal(scale=0.05, size=(3, 3)))
+    assert atoms.get_distance(0, 1) == pytest.approx(length, abs=1e-15)
+
+
+def test_explicit_target_off_is_refused_with_its_size():
+    atoms = molecule("H2O")
+    with pytest.raises(InputError, match=r"off row #0 Distance\(0, 1\) by 0\.031.*project=True"):
+        constrain(atoms, Distance([0, 1], 1.0))
+    assert atoms.constraints == []
+    atoms.set_constraint(Constraints(Distance([0, 1], 1.0)))
+    before = atoms.positions.copy()
+    with pytest.raises(InputError, match="restore"):
+        atoms.set_positions(before + 0.01)
+    assert np.array_equal(atoms.positions, before)
+
+
+def test_project_moves_to_the_nearest_point():
+    atoms = molecule("H2O")
+    centre = atoms.get_center_of_mass()
+    held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
+    assert off(atoms, held) <= 1e-15
+    assert atoms.get_center_of_mass() == pytest.approx(centre, abs=1e-14)
+    assert atoms.get_distance(0, 1) == pytest.approx(0.9572, abs=1e-14)
+    assert atoms.get_angle(1, 0, 2) == pytest.approx(104.52, abs=1e-11)
+
+
+def test_restore_after_an_edit():
+    atoms, held = rigid(2)
+    atoms.rattle(0.1, rng=np.random.default_rng(0))
+    atoms.positions += np.random.default_rng(0).normal(scale=0.1, size=(6, 3))
+    assert off(atoms, held) > 1e-2
+    held.restore(atoms)
+    assert off(atoms, held) <= 1e-14
+    assert slip(atoms, held) <= 1e-14
+
+
+def test_impossible_restore_changes_nothing():
+    atoms = Atoms("H3", positions=[[0, 0, 0], [1, 0, 0], [0.4, 0.9, 0]])
+    before = atoms.positions.copy()
+    with pytest.raises((InfeasibleError, ContradictionError)):
+        constrain(atoms, Distance([[0, 1], [1, 2], [0, 2]], [1.0, 1.0, 3.0]), project=True)
+    assert np.array_equal(atoms.positions, before)
+    assert atoms.constraints == []
+
+
+# -- changes of the atoms ---------------------------------------------------------------------------
+
+
+def test_appended_atoms_are_free():
+    atoms, held = rigid(1)
+    atoms.extend(Atoms("Ar", positions=[[5, 5, 5]]))
+    atoms.calc = Free()
+    VelocityVerlet(atoms, 1 * units.fs).run(5)
+    assert atoms.get_number_of_degrees_of_freedom() == 12 - 3
+    assert off(atoms, held) <= 1e-14
+
+
+def test_same_object_on_several_images():
+    atoms, held = rigid(1)
+    other = Atoms(atoms.symbols, positions=atoms.positions, constraint=held)
+    new = other.positions + np.random.default_rng(0).normal(scale=0.02, size=(3, 3))
+    other.set_positions(new)
+    atoms.set_positions(new)
+    assert np.array_equal(other.positions, atoms.positions)

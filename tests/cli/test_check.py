@@ -1,0 +1,273 @@
+"""`kcons check`: exit status, table, files, errors on one line."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import water_files as files
+
+from kcons.cli.main import main
+from kcons.mdanalysis.check import report
+
+N = 20
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("command")
+    x = files.water(N, 5)
+    files.topology(folder / "t.gro", N, x[0])
+    files.write(folder / "good.xtc", x)
+    v = np.random.default_rng(0).normal(size=x.shape)
+    files.write(folder / "good.trr", x, velocities=v)
+    x[3, 7] += 0.2
+    files.write(folder / "bad.xtc", x % 12.0)
+    data = (folder / "bad.xtc").read_bytes()
+    (folder / "cut.xtc").write_bytes(data[:-20])
+    (folder / "short.xtc").write_bytes((folder / "good.xtc").read_bytes()[:-20])
+    y = files.water(N, 5)
+    y[3, 7] = np.nan
+    files.write(folder / "nan.dcd", y)
+    files.write(folder / "nothing.dcd", y[3:])
+    return folder
+
+
+def command(folder, name, *more):
+    arguments = [str(folder / name), "--topology", str(folder / "t.gro"), "--constrain", "none"]
+    return main(["check", *arguments, "--out", str(folder / f"out-{name}"), *more])
+
+
+def test_kept(folder, capsys):
+    assert command(folder, "good.trr") == 0
+    page = capsys.readouterr().out
+    assert "5 of 5 frames, 60 atoms; 60 rows on 60 atoms" in page and "rank 60" in page
+    assert "single precision" in page and " K (mean and" in page and "|Av|" in page
+    out = folder / "out-good.trr"
+    data = json.loads((out / "check.json").read_text())
+    assert data["status"] == "kept" and len(data["series"]["largest Å"]) == 5
+    assert data["degrees_of_freedom"] in (120, 117) and data["broken"] is None
+    assert (out / "check.png").stat().st_size > 5000
+    assert data["verdict"] in (out / "check.txt").read_text()
+
+
+def test_violated(folder, capsys):
+    assert command(folder, "bad.xtc", "--worst", "2", "--no-rank") == 1
+    page = capsys.readouterr().out
+    assert "violated by" in page and "SOL3" in page and "0.001 nm" in page and "rank" not in page
+
+
+def test_a_file_that_ends_too_early(folder, capsys):
+    assert command(folder, "cut.xtc") == 1
+    page = capsys.readouterr().out
+    assert "4 of 5 frames" in page and "ends too early, at frame 4" in page
+
+
+@pytest.mark.parametrize(
+    "name,more,words",
+    [
+        ("short.xtc", [], "ends too early, at frame 4"),
+        ("nan.dcd", [], "frame 3 cannot be used, nor what follows: position of atom 7"),
+        ("good.xtc", ["--frames", "2:3"], "targets come from the only frame"),
+    ],
+)
+def test_incomplete_has_a_status_of_its_own(folder, capsys, name, more, words):
+    assert command(folder, name, *more) == 3
+    page = " ".join(capsys.readouterr().out.split())
+    assert words in page and "incomplete: " in page and "violated" not in page
+    data = json.loads((folder / f"out-{name}" / "check.json").read_text(encoding="utf-8"))
+    assert data["status"] == "incomplete" and words in data["verdict"] and data["gaps"]
+
+
+def test_nothing_that_can_be_read_is_incomplete_too(folder, capsys):
+    """Numbers, picture and table of an earlier check of the same file do not stay beside."""
+    out = folder / "out-nothing.dcd"
+    good = (folder / "nothing.dcd").read_bytes()
+    (folder / "nothing.dcd").write_bytes((folder / "nan.dcd").read_bytes())
+    assert command(folder, "nothing.dcd", "--frames", ":3") == 0
+    assert {path.name for path in out.iterdir()} == set(report.FILES)
+    (folder / "nothing.dcd").write_bytes(good)
+    capsys.readouterr()
+    assert command(folder, "nothing.dcd") == 3
+    said = capsys.readouterr()
+    assert said.err.startswith("kcons: ") and "atom 7" in said.err
+    data = json.loads((out / "check.json").read_text(encoding="utf-8"))
+    assert data["status"] == "incomplete" and "atom 7" in data["verdict"]
+    assert [path.name for path in out.iterdir()] == ["check.json"]
+
+
+def test_the_help_says_what_the_exit_status_means(capsys):
+    with pytest.raises(SystemExit):
+        main(["check", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Exit status 0: kept; 1: violated; 2: wrong use; 3: incomplete" in text
+
+
+# -- folders ----------------------------------------------------------------------------------------
+
+
+def test_the_check_of_another_trajectory_is_not_overwritten(folder, tmp_path, monkeypatch, capsys):
+    """Files of one name in several folders, and of one stem: each has its own folder, also when checked again."""
+    top = str(folder / "t.gro")
+    monkeypatch.chdir(tmp_path)
+    places = []
+    for name, source in (("a/run.xtc", "good.xtc"), ("b/run.xtc", "bad.xtc"), ("a/run.trr", "good.trr")):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes((folder / source).read_bytes())
+        places.append(name)
+    for _ in range(2):
+        status = [main(["check", name, "--topology", top, "--constrain", "none", "--no-rank"]) for name in places]
+        assert status == [0, 1, 0]
+    found = {path.parent.name: json.loads(path.read_text()) for path in tmp_path.glob("check*/check.json")}
+    assert {name: (data["trajectory"], data["status"]) for name, data in found.items()} == {
+        "check-run": ("a/run.xtc", "kept"),
+        "check-run-2": ("b/run.xtc", "violated"),
+        "check-run-3": ("a/run.trr", "kept"),
+    }
+    assert found["check-run"]["file"] == str((tmp_path / "a" / "run.xtc").resolve())
+    capsys.readouterr()
+    before = (tmp_path / "check-run" / "check.json").read_bytes()
+    assert main(["check", "b/run.xtc", "--topology", top, "--constrain", "none", "--out", "check-run"]) == 2
+    said = capsys.readouterr().err
+    assert "check-run holds the check of" in said and "a/run.xtc; give another folder (--out)" in said
+    assert (tmp_path / "check-run" / "check.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("what", ["link to a file", "dangling link", "folder", "other file", "other picture"])
+def test_what_is_no_check_is_not_overwritten(folder, tmp_path, capsys, what):
+    out, other = tmp_path / "out", tmp_path / "other"
+    out.mkdir()
+    other.write_text("precious")
+    if what == "link to a file":
+        (out / "check.txt").symlink_to(other)
+    elif what == "dangling link":
+        (out / "check.json").symlink_to(tmp_path / "nowhere")
+    elif what == "folder":
+        (out / "check.png").mkdir()
+    elif what == "other file":
+        (out / "check.json").write_text('{"precious": 1}')
+    else:
+        (out / "check.png").write_text("precious")
+    before = sorted(path.name for path in out.iterdir())
+    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), "--constrain", "none", "--no-rank"]
+    assert main(["check", *arguments, "--out", str(out)]) == 2
+    assert "give another folder (--out)" in capsys.readouterr().err
+    assert sorted(path.name for path in out.iterdir()) == before
+    assert other.read_text() == "precious" and not (tmp_path / "nowhere").exists()
+
+
+def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "check-good").symlink_to(tmp_path / "elsewhere")
+    arguments = [str(folder / "good.xtc"), "--topology", str(folder / "t.gro"), "--constrain", "none", "--no-rank"]
+    assert main(["check", *arguments]) == 0
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert (tmp_path / "check-good-2" / "check.json").is_file()
+
+
+# -- terminals --------------------------------------------------------------------------------------
+
+
+def process(folder, name, tail="", **variables):
+    """`kcons check` in a shell: status of the check, what came out at the end of the pipe, and of errors."""
+    words = [sys.executable, "-m", "kcons", "check", folder / name, "--topology", folder / "t.gro"]
+    line = " ".join(map(str, [*words, "--constrain none --no-rank --out", folder / f"out-{name}"]))
+    done = subprocess.run(
+        ["bash", "-c", f"{line} {tail}; exit ${{PIPESTATUS[0]}}"],
+        capture_output=True,
+        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHONUTF8")} | variables,
+    )
+    return done.returncode, done.stdout, done.stderr.decode(errors="replace")
+
+
+@pytest.mark.parametrize(
+    "name,status,buffered", [("good.trr", 0, "1"), ("bad.xtc", 1, ""), ("short.xtc", 3, ""), ("none.xtc", 2, "")]
+)
+def test_in_a_c_locale(folder, name, status, buffered):
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii", "PYTHONUNBUFFERED": buffered}
+    found, out, errors = process(folder, name, **plain)
+    assert found == status and "Traceback" not in errors
+    out.decode("ascii")
+    if status != 2:
+        assert b"steps of " in out and b" A " in out and not errors
+        assert "Å" in (folder / f"out-{name}" / "check.txt").read_text(encoding="utf-8")
+    if status == 1:
+        assert b"SOL3:OW-HW1" in out
+
+
+@pytest.mark.parametrize(
+    "name,status,buffered,tail",
+    [
+        ("good.trr", 0, "", "| head -1"),
+        ("good.trr", 0, "1", "| head -1"),
+        ("bad.xtc", 1, "1", "| true"),
+        ("short.xtc", 3, "", "2>&1 | head -c 0"),
+        ("good.trr", 0, "", ">&-"),
+    ],
+)
+def test_into_a_pipe_that_nobody_reads(folder, name, status, buffered, tail):
+    json_file = folder / f"out-{name}" / "check.json"
+    json_file.unlink(missing_ok=True)
+    for other in ("check.png", "check.txt"):
+        (folder / f"out-{name}" / other).unlink(missing_ok=True)
+    found, out, errors = process(folder, name, tail, PYTHONUNBUFFERED=buffered)
+    assert found == status and not errors
+    assert out.count(b"\n") == (1 if "-1" in tail else 0)
+    assert json.loads(json_file.read_text(encoding="utf-8"))["status"] in ("kept", "violated", "incomplete")
+
+
+def test_a_full_device_is_said_and_the_files_are_there(folder):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("needs /dev/full")
+    found, _, errors = process(folder, "good.trr", "> /dev/full")
+    assert found == 2 and "No space left" in errors and "Traceback" not in errors and "Exception" not in errors
+
+
+@pytest.mark.parametrize(
+    "name,more,words",
+    [
+        ("none.xtc", [], "no file"),
+        ("good.xtc", ["--targets", "nope.toml"], "nope.toml"),
+        ("good.xtc", ["--constrain", "hbnds"], "hbonds"),
+        ("good.xtc", ["--select", "resname ABC"], "ABC"),
+        ("good.xtc", ["--frames", "9:"], "no frames"),
+        ("good.xtc", ["--tolerance", "-1"], "tolerance"),
+        ("good.xtc", ["--worst", "-1"], "worst"),
+    ],
+)
+def test_errors_take_one_line(folder, capsys, name, more, words):
+    assert command(folder, name, *more) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("kcons: ") and said.err.count("\n") == 1 and words in said.err
+
+
+def test_no_rows_may_be_named(folder, capsys):
+    assert command(folder, "good.xtc", "--worst", "0") == 0 and command(folder, "bad.xtc", "--worst", "0") == 1
+    assert "SOL3" in capsys.readouterr().out  # in the verdict
+
+
+def test_advice_is_of_the_command(folder, tmp_path, capsys):
+    """What remarks and errors tell to do can be done with files and options."""
+    bare = tmp_path / "t.xyz"
+    atoms = "".join(f"{'OHH'[k % 3]} {k}.0 0.0 0.0\n" for k in range(3 * N))
+    bare.write_text(f"{3 * N}\n\n{atoms}")
+    arguments = [str(folder / "good.trr"), "--topology", str(bare), "--constrain", "allbonds", "--no-rigid-water"]
+    assert main(["check", *arguments, "--out", str(tmp_path / "out")]) in (0, 1, 2)
+    said = capsys.readouterr()
+    page = " ".join((said.out + said.err).split())
+    assert "bonds were guessed from distances and covalent radii" in page and "give a topology with bonds" in page
+    for name in ("short.trr", "few.gro"):
+        (tmp_path / name).write_bytes(b"")
+    files.topology(tmp_path / "few.gro", N - 1, files.water(N - 1, 1)[0])
+    main(["check", str(folder / "good.trr"), "--topology", str(tmp_path / "few.gro"), "--out", str(tmp_path / "few")])
+    said = capsys.readouterr()
+    page += said.out + said.err
+    for words in ("guess_bonds", "universe", "guess_TopologyAttrs", "backend", "select_atoms"):
+        assert words not in page
+
+
+# -- picture ----------------------------------------------------------------------------------------

@@ -1,0 +1,123 @@
+"""Coordinates given by Python functions: checks of what was given, accuracy of what was not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from constraint_cases import MASSES, TIME, hoop, saddle, scattered, spread
+
+from kcons.constraints import Custom, Distance, ImplicitSurface
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import InputError, SingularGeometryError
+
+
+def gap(r):
+    return float(np.linalg.norm(r[0] - r[1]))
+
+
+def gap_gradient(r):
+    u = (r[0] - r[1]) / gap(r)
+    return np.array([u, -u])
+
+
+@pytest.mark.parametrize(
+    ("make", "atoms"), [(saddle, [0, 3, 5]), (spread, [[0, 1, 2], [5, 3, 4]])], ids=["surface", "custom"]
+)
+def test_differenced_curvature_has_ten_digits(make, atoms):
+    x, v = scattered(0), 10 * scattered(1)
+    exact, differenced = make(atoms, exact=True), make(atoms, exact=False)
+    r, u = x[exact.atoms], v[exact.atoms]
+    found = differenced.curvature(r, u, TIME)
+    expected = exact.curvature(r, u, TIME)
+    assert np.abs(found - expected).max() < 1e-10 * np.einsum("kai,kai->k", u, u).max()
+
+
+def test_differenced_curvature_does_not_depend_on_the_unit_of_time():
+    item = spread([[0, 1, 2]], exact=False)
+    r, v = scattered(0)[item.atoms], scattered(1)[item.atoms]
+    slow, fast = item.curvature(r, 1e-6 * v, TIME), item.curvature(r, 1e6 * v, TIME)
+    assert slow * 1e24 == pytest.approx(fast, rel=1e-9)
+    assert item.curvature(r, 0 * v, TIME).tolist() == [0.0]
+
+
+def test_differenced_time_terms():
+    exact, differenced = hoop([0, 1], exact=True), hoop([0, 1], exact=False)
+    r, v = scattered(0)[exact.atoms], scattered(1)[exact.atoms]
+    for found, expected in zip(differenced.time_terms(r, v, TIME), exact.time_terms(r, v, TIME), strict=True):
+        assert found == pytest.approx(expected, abs=2e-11)
+
+
+def test_custom_distance_is_the_distance():
+    x = scattered(3)
+    v = scattered(4)
+    ours = ConstraintSet([Custom([[0, 1], [4, 2]], gap, gap_gradient, translation_invariant=True)], x, MASSES)
+    theirs = ConstraintSet([Distance([[0, 1], [4, 2]])], x, MASSES)
+    assert ours.target() == pytest.approx(theirs.target(), rel=1e-15)
+    assert ours.acceleration_target(x, v) == pytest.approx(theirs.acceleration_target(x, v), rel=1e-10)
+
+
+def test_custom_coordinate_with_a_period():
+    item = Custom([0], lambda r: np.arctan2(r[0, 1], r[0, 0]), _polar_gradient, target=3.1, period=2 * np.pi)
+    x = np.array([[np.cos(-3.1), np.sin(-3.1), 0.0]])
+    assert ConstraintSet([item], x, np.ones(1)).value(x)[0] == pytest.approx(2 * np.pi - 6.2, rel=1e-12)
+
+
+def _polar_gradient(r):
+    x, y, _ = r[0]
+    return np.array([[-y, x, 0.0]]) / (x * x + y * y)
+
+
+def test_minimum_image_where_only_differences_count():
+    x = np.array([[0.2, 0.0, 0.0], [9.9, 0.0, 0.0]])
+    item = Custom([0, 1], gap, gap_gradient, translation_invariant=True)
+    assert ConstraintSet([item], x, np.ones(2), cell=[10.0] * 3).target() == pytest.approx([0.3])
+
+
+def test_a_wrong_gradient_is_found_before_it_moves_anything():
+    with pytest.raises(InputError, match=r"row 1, Custom\(0, 1\): gradient gives .* but differences .* give"):
+        ConstraintSet([Distance([2, 3]), Custom([0, 1], gap, lambda r: 2 * gap_gradient(r))], scattered(0), MASSES)
+    with pytest.raises(InputError, match=r"row 0, ImplicitSurface\(0\): gradient gives"):
+        ConstraintSet(
+            [ImplicitSurface(0, lambda r: r[:, 2] + r[:, 0] ** 2, lambda r: np.eye(3)[[2] * len(r)])],
+            scattered(0),
+            MASSES,
+        )
+
+
+def test_a_wrong_hessian_is_found_too():
+    wrong = Custom([0, 1], gap, gap_gradient, hessian_vector=lambda r, v: v)
+    with pytest.raises(InputError, match="hessian_vector gives"):
+        ConstraintSet([wrong], scattered(0), MASSES)
+
+
+def test_a_gradient_that_vanishes_is_refused():
+    flat = ImplicitSurface([0, 1], lambda r: r[:, 0] ** 2, lambda r: 2 * r * [1.0, 0.0, 0.0], target=None)
+    x = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    with pytest.raises(SingularGeometryError, match=r"row 1, ImplicitSurface\(1\): .*norm of the gradient 0"):
+        ConstraintSet([flat], x, np.ones(2))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Custom([0, 1], 3.0, gap_gradient), "function must be a function"),
+        (lambda: Custom([0, 1], gap, 3.0), "gradient must be a function"),
+        (lambda: Custom([0, 1], gap, gap_gradient, length=0.0), "length must be positive"),
+        (lambda: Custom([0, 1], gap, gap_gradient, time_step=np.nan), "time_step must be positive"),
+    ],
+)
+def test_arguments_are_checked(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_results_of_the_wrong_shape_are_named():
+    x = scattered(0)
+    with pytest.raises(InputError, match=r"Custom: gradient returned shape \(3,\) for row 0; it must return \(2, 3\)"):
+        ConstraintSet([Custom([0, 1], gap, lambda r: gap_gradient(r)[0])], x, MASSES)
+    with pytest.raises(
+        InputError, match=r"Custom: function returned shape \(3,\) for row 0; it must return one number"
+    ):
+        ConstraintSet([Custom([0, 1], lambda r: r[0], gap_gradient)], x, MASSES)
+    with pytest.raises(InputError, match=r"ImplicitSurface: function returned shape \(\).*it must return \(2,\)"):
+        ConstraintSet([ImplicitSurface([0, 1], lambda r: 1.0, lambda r: r)], x, MASSES)

@@ -1,0 +1,124 @@
+"""Rows that are formulas against hand-written families, their data, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from constraint_cases import MASSES, TIME, scattered
+
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import CenterDistance, Distance, Ellipsoid, Formula, Sphere, Torus, from_dict
+from kcons.errors import InputError, SingularGeometryError
+
+LENGTH = "sqrt((x1 - x2)**2 + (y1 - y2)**2 + (z1 - z2)**2)"
+TORUS = "sqrt((sqrt((x1 - a)**2 + (y1 + 0.1)**2) - R)**2 + (z1 - c)**2)"
+FAMILIES = {
+    "distance": (Formula(LENGTH, [[0, 1], [5, 2]], target=None), Distance([[0, 1], [5, 2]])),
+    "sphere": (Formula("sqrt(x1**2 + y1**2 + (z1 - h)**2)", [3, 6], {"h": [0.5, 4]}, None), None),
+    "torus": (Formula(TORUS, [4], {"a": 0.2, "R": 1.5, "c": 0.3}, None), Torus(4, [0.2, -0.1, 0.3], [0, 0, 2.0], 1.5)),
+    "ellipsoid": (
+        Formula("6**(1/3)*(sqrt(x1**2 + y1**2/4 + z1**2/9) - 1)", 7, target=None),
+        Ellipsoid(7, [0.0, 0.0, 0.0], [1.0, 2.0, 3.0], target=None),
+    ),
+    "centres": (
+        Formula(f"sqrt({' + '.join(f'((m1*{c}1 + m2*{c}2)/(m1 + m2) - {c}3)**2' for c in 'xyz')})", [0, 1, 2],
+                {"m1": MASSES[0], "m2": MASSES[1]}, None),
+        CenterDistance([0, 1], [2]),
+    ),
+}  # fmt: skip
+FAMILIES["sphere"] = (FAMILIES["sphere"][0], Sphere([3, 6], [[0, 0, 0.5], [0, 0, 4.0]]))
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_formula_is_the_family_written_by_hand(name):
+    ours, theirs = FAMILIES[name]
+    x, v = scattered(0), scattered(1)
+    one, other = ConstraintSet(ours, x, MASSES), ConstraintSet(theirs, x, MASSES)
+    np.testing.assert_allclose(one.target(), other.target(), rtol=1e-14)
+    np.testing.assert_allclose(one.jacobian(x).toarray(), other.jacobian(x).toarray(), atol=1e-14)
+    np.testing.assert_allclose(one.acceleration_target(x, v), other.acceleration_target(x, v), rtol=1e-12)
+    a, b = Motion(one, x), Motion(other, x)
+    u = a.project_velocities(x, v)
+    np.testing.assert_allclose(u, b.project_velocities(x, v), atol=1e-13)
+    step = x + 0.02 * u
+    np.testing.assert_allclose(a.project_positions(step, x), b.project_positions(step, x), atol=1e-13)
+
+
+@pytest.mark.parametrize("cell", [None, np.array([[9.0, 0, 0], [2, 8, 0], [-1, 2, 10]])], ids=["open", "triclinic"])
+def test_differences_take_minimum_images(cell):
+    x = scattered(2)
+    moved = x if cell is None else x + np.random.default_rng(0).integers(-1, 2, (8, 3)) @ cell
+    row = Formula(f"{LENGTH} - (x2 - x3)*(y1 - y3)/9", [0, 1, 2], target=None)
+    assert row.translation_invariant
+    plain, wrapped = ConstraintSet(row, x, MASSES, cell=cell), ConstraintSet(row, moved, MASSES, cell=cell)
+    np.testing.assert_allclose(wrapped.target(), plain.target(), rtol=1e-12)
+    step = 0.01 * scattered(3)
+    one = Motion(plain, x).project_positions(x + step, x) - x
+    other = Motion(wrapped, moved).project_positions(moved + step, moved) - moved
+    np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_a_moving_formula_is_followed():
+    """A bead on a wave that runs; its height and its speed are those of the wave."""
+    wave = Formula("z1 - a*sin(k*x1 - t)", 0, {"a": 0.1, "k": 2.0})
+    x = np.array([[0.3, 0.0, 0.1 * np.sin(0.6)]])
+    motion = Motion(ConstraintSet(wave, x, [1.0]), x)
+    v = motion.project_velocities(x, np.array([[0.2, 0.1, 0.0]]))
+    end = run(System(motion, lambda x, t: np.array([[0.0, 0.0, -1.0]])), State(x, v), 0.01, 100)
+    (px, _, pz), (vx, _, vz) = end.positions[0], end.velocities[0]
+    phase = 2 * px - end.time
+    assert pz == pytest.approx(0.1 * np.sin(phase), abs=1e-14)
+    assert vz == pytest.approx(0.1 * np.cos(phase) * (2 * vx - 1), abs=1e-13)
+
+
+def test_a_period_goes_the_shorter_way():
+    row = Formula("atan2(y1, x1)", 0, target=3.1, period=2 * np.pi)
+    x = np.array([[-1.0, -0.03, 0.0]])
+    motion = Motion(ConstraintSet(row, x, [1.0]), x)
+    y = motion.project_positions(x, x)
+    assert np.arctan2(y[0, 1], y[0, 0]) == pytest.approx(3.1) and np.abs(y - x).max() < 0.1
+
+
+def test_files_keep_formulas():
+    row = Formula("a*x1 - z2", [[0, 1], [2, 3]], {"a": [1.0, 2.0]}, target=[0.5, 0.25], period=7.0)
+    again = from_dict(row.todict())
+    assert again.todict() == row.todict()
+    assert from_dict(Formula("x1", [0, 1]).todict()).n_rows == 2
+    with pytest.raises(InputError, match=r"\['values'\] are missing"):
+        from_dict({key: value for key, value in row.todict().items() if key != "values"})
+
+
+@pytest.mark.parametrize(
+    ("make", "item", "message"),
+    [
+        (lambda: Formula("x1 - x2", [[0, 1, 2]]), "atoms", "names 2 atoms a row, and atoms has 3"),
+        (lambda: Formula("a*x1", [0, 1], {"a": [1.0, 2.0, 3.0]}), "a", r"'a' has shape \(3,\).* 2 rows"),
+        (lambda: Formula("a*x1", [0, 1], {"a": np.nan}), "a", "one finite number"),
+        (lambda: Formula("x1", 0, {"x7": 1.0}), "x7", "cannot be the name"),
+        (lambda: Formula("x1", 0, {"sin": 1.0}), "sin", "cannot be the name"),
+        (lambda: Formula("x1", 0, {"lambda": 1.0}), "lambda", "cannot be the name"),
+        (lambda: Formula("x1 - b", 0, {"a": 1.0}), "b", "known are .*a. Give it"),
+    ],
+)
+def test_bad_arguments_are_named(make, item, message):
+    with pytest.raises(InputError, match=message) as caught:
+        make()
+    assert caught.value.item == item
+
+
+@pytest.mark.parametrize(
+    ("formula", "x1", "message"),
+    [
+        ("sqrt(1 - x1**2) - z1", 2.0, r"sqrt\(1 - x1 \*\* 2\) is nan where 1 - x1 \*\* 2 = -3 at the start"),
+        ("log(x1)", 0.0, r"log\(x1\) is -inf where x1 = 0"),
+        ("a/x1 + y1", 0.0, r"a / x1 is inf"),
+        ("x1**2", 0.0, "its gradient is zero"),
+        ("sqrt(x1) + y1", 0.0, "its gradient is not finite"),
+    ],
+)
+def test_what_is_undefined_at_the_start_is_named(formula, x1, message):
+    row = Formula(formula, 1, {"a": 1.0}, target=None)
+    x = np.array([[0.0, 0.0, 0.0], [x1, 0.0, 0.0]])
+    with pytest.raises((SingularGeometryError, InputError), match=message) as caught:
+        ConstraintSet([Sphere(0, [1.0, 0, 0]), row], x, np.ones(2), time=TIME)
+    assert caught.value.atoms in ((1,), ())

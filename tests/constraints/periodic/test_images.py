@@ -1,0 +1,239 @@
+"""Which images rows mean: atoms stored anywhere, bodies longer than half the cell, frameworks, and drifting apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    CenterOfMass,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    LinearCombination,
+    LinearRelation,
+    MovingTarget,
+)
+from kcons.errors import ContradictionError, ImageError, InputError
+
+CELLS = {
+    "box": (np.diag([9.0, 11.0, 10.0]), (True, True, True)),
+    "triclinic": (np.array([[9.0, 0, 0], [2.5, 9.5, 0], [-2.0, 1.5, 10.0]]), (True, True, True)),
+    "slab": (np.array([[9.0, 0, 0], [3.0, 9.5, 0], [0.0, 0.0, 7.0]]), (True, True, False)),
+    "wire": (np.diag([9.0, 4.0, 5.0]), (True, False, False)),
+}
+MASSES = np.array([1.0, 16.0, 12.0, 2.0, 30.0, 1.0])
+CHAIN = np.array([[0, 0, 0], [1.1, 0.2, 0], [1.5, 1.3, 0.3], [2.6, 1.5, 1.1], [3.0, 2.7, 1.0], [2.2, 3.5, 1.6]])
+ROWS = {
+    "relation": [LinearRelation(0, [1, 2], [0.7, 0.3], None)],
+    "relation of bonded atoms": [Distance([[0, 1], [1, 2]]), LinearRelation(0, [1, 2], [0.7, 0.3], None)],
+    "combination": [LinearCombination([0, 1, 2], [[1.0, 0.5, 0.2], [-0.4, -0.5, 0.3], [-0.6, 0, -0.5]])],
+    "free angle": [Angle([[0, 1, 2]])],
+    "free dihedral": [Dihedral([[0, 1, 2, 3]]), Distance([[3, 4]])],
+    "centres": [CenterDistance([0, 1, 2], [3, 4, 5])],
+    "centre of a molecule": [
+        Distance([[0, 1], [1, 2], [2, 3]]),
+        Dihedral([[0, 1, 2, 3]]),
+        CenterDistance([0, 3], [4, 5]),
+    ],
+    "moving length": [Distance([[0, 1]], lambda t: 1.1180339887498950 + 0.1 * t), Distance([[1, 2]])],
+    "all": [
+        FixedAtoms([2]),
+        Distance([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]]),
+        Angle([[0, 1, 2]]),
+        Dihedral([[2, 3, 4, 5]]),
+        LinearCombination([0, 5], [[1.0, 1.0, 0], [-1.0, -1.0, 0]]),
+    ],
+}
+
+
+def stored(x, cell, periodic, seed):
+    """`x` with every atom in an image of its own, and the shifts."""
+    images = np.random.default_rng(seed).integers(-2, 3, x.shape) * np.array(periodic)
+    return x + images @ cell, images @ cell
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("cell", CELLS.values(), ids=CELLS)
+@pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS)
+def test_atoms_in_any_image_are_held_as_whole_ones(rows, cell, seed):
+    lattice, periodic = cell
+    fixed = [2] if isinstance(rows[0], FixedAtoms) else []
+    there, shift = stored(CHAIN, lattice, periodic, seed)
+    shift[fixed] = 0.0
+    there[fixed] = CHAIN[fixed]
+    free = Motion(ConstraintSet(rows, CHAIN, MASSES), CHAIN)
+    held = ConstraintSet(rows, there, MASSES, cell=lattice, pbc=periodic)
+    motion = Motion(held, there)
+    rng = np.random.default_rng(seed)
+    step, v, f = (rng.normal(size=CHAIN.shape) for _ in range(3))
+    assert motion.rank == free.rank
+    right = free.project_positions(CHAIN + 1e-2 * step, CHAIN)
+    out = motion.project_positions(there + 1e-2 * step, there)
+    assert np.abs(out - shift - right).max() < 1e-12
+    assert np.abs(held.value(out)).max() < 1e-12
+    # Also where the atoms were stored elsewhere again in between.
+    again, other = stored(right, lattice, periodic, seed + 7)
+    other[fixed] = 0.0
+    again[fixed] = right[fixed]
+    right = free.project_positions(right - 1e-2 * v, right)
+    assert np.abs(motion.project_positions(again - 1e-2 * v, again) - other - right).max() < 1e-12
+    tangent = free.project_velocities(CHAIN, v)
+    assert np.abs(motion.project_velocities(there, v) - tangent).max() < 1e-12
+    assert np.abs(motion.acceleration(there, tangent, f) - free.acceleration(CHAIN, tangent, f)).max() < 1e-11
+    assert np.abs(held.measure(there) - free.constraint_set.measure(CHAIN)).max() < 1e-12
+
+
+def ring(n, radius):
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(n)], axis=1)
+
+
+def all_pairs(n):
+    return [[i, j] for i in range(n) for j in range(i + 1, n)]
+
+
+@pytest.mark.parametrize("targets", ["given", "found"])
+def test_a_body_longer_than_half_the_cell_keeps_its_shape(targets):
+    x, n, cell = ring(6, 1.4), 6, np.array([[5.2, 0, 0], [2.6, 4.5, 0], [0, 0, 12.0]])
+    pairs = all_pairs(n)
+    lengths = np.linalg.norm(np.array([x[i] - x[j] for i, j in pairs]), axis=1)
+    there, _ = stored(x, cell, (True, True, True), 3)
+    rows = ConstraintSet(Distance(pairs, lengths if targets == "given" else None), there, np.ones(n), cell=cell)
+    assert np.abs(rows.target() - lengths).max() < 1e-12
+    motion = Motion(rows, there)
+    assert motion.degrees_of_freedom == 6
+    v = motion.project_velocities(there, np.random.default_rng(0).normal(size=x.shape))
+    end = run(System(motion, None), State(there, v), 0.01, 300).positions
+    assert np.abs(rows.value(end)).max() < 1e-12
+    wide = ConstraintSet(Distance(pairs, lengths), x, np.ones(n))
+    assert np.abs(wide.value(end - (there - x))).max() < 1e-12
+
+
+def test_a_single_rod_as_long_as_half_the_cell_stays_refused():
+    x = np.array([[0.0, 0, 0], [6.0, 0, 0], [3.0, 1.0, 0]])
+    with pytest.raises(InputError, match="no shorter rows tie"):
+        ConstraintSet(Distance([[0, 1]], 6.0), x, np.ones(3), cell=[10.0] * 3)
+    tied = ConstraintSet(Distance([[0, 1], [0, 2], [1, 2]], [6.0, 10**0.5, 10**0.5]), x, np.ones(3), cell=[10.0] * 3)
+    assert tied.target()[0] == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("bonds_held", [True, False])
+def test_a_polymer_that_closes_through_the_boundary(bonds_held):
+    n, length = 6, 6 * 1.2
+    x = np.stack([1.2 * np.arange(n), 0.3 * (-1.0) ** np.arange(n), 0.2 * np.cos(2.0 * np.arange(n))], axis=1)
+    bonds = [[k, (k + 1) % n] for k in range(n)]
+    angles = Angle([[k, (k + 1) % n, (k + 2) % n] for k in range(n)])
+    across = LinearCombination([0, 2], [[0, 0, 1.0], [0, 0, -1.0]])
+    cell = np.diag([length, 9.0, 9.0])
+    rows = ([Distance(bonds)] if bonds_held else [angles]) + [across]
+    there, _ = stored(x, cell, (True, True, True), 1)
+    held = ConstraintSet(rows, there, np.ones(n), cell=cell)
+    motion = Motion(held, there)
+    # The same with six more atoms, moved along, on either side.
+    along = np.array([length, 0.0, 0.0])
+    long = np.concatenate([x - along, x, x + along])
+    inner = held.measure(there)[:n]
+    if bonds_held:
+        expected = [np.linalg.norm(long[n + k + 1] - long[n + k]) for k in range(n)]
+    else:
+        u, w = long[n : 2 * n] - long[n + 1 : 2 * n + 1], long[n + 2 : 2 * n + 2] - long[n + 1 : 2 * n + 1]
+        expected = np.arccos(np.sum(u * w, axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(w, axis=1))
+    assert np.abs(inner - expected).max() < 1e-12
+    step = 1e-3 * np.random.default_rng(2).normal(size=x.shape)
+    out = motion.project_positions(there + step, there)
+    assert np.abs(held.value(out)).max() < 1e-12
+    assert np.abs(out - there).max() < 0.1
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_atoms_that_nothing_ties_raise_before_their_image_flips(wrapped):
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.0, 1.0, 0]])
+    row, cell = CenterDistance([0, 1], [2, 3]), np.diag([10.0, 10.0, 10.0])
+    rows, free = ConstraintSet(row, x, [1.0, 3, 1, 1], cell=cell), ConstraintSet(row, x, [1.0, 3, 1, 1])
+    motion = Motion(rows, x)
+    system = System(motion, None)
+    v = motion.project_velocities(x, np.array([[0, 0, 0.3], [0, 0, -0.3], [0, 0, 0], [0, 0, 0]]))
+    state, true = State(x, v), x
+    with pytest.raises(ImageError, match="half the cell apart") as caught:
+        for _ in range(400):
+            before = state.positions.copy()
+            after = run(system, state, 0.05, 1)
+            true = true + (after.positions - state.positions)
+            assert abs(free.value(true)[0]) < 1e-12
+            y = after.positions % 10.0 if wrapped else after.positions
+            state = State(y, after.velocities, after.time)
+    assert set(caught.value.atoms) <= {0, 1, 2, 3}
+    assert "time step" not in str(caught.value)
+    assert np.array_equal(state.positions % 10.0 if wrapped else state.positions, before)
+
+
+def test_a_molecule_across_the_boundary_held_by_its_centre():
+    x = np.array([[9.5, 5.0, 5.0], [10.5, 5.0, 5.0], [10.0, 5.8, 5.0]])
+    rows = [Distance([[0, 1], [1, 2]]), LinearCombination([0, 2], [[0, 1.0, 0], [0, -1.0, 0]]), CenterOfMass([0, 1, 2])]
+    masses = np.array([1.0, 2.0, 3.0])
+    free, there = Motion(ConstraintSet(rows, x, masses), x), x % 10.0
+    motion = Motion(ConstraintSet(rows, there, masses, cell=[10.0] * 3), there)
+    step = 1e-2 * np.random.default_rng(0).normal(size=x.shape)
+    right = free.project_positions(x + step, x)
+    out = motion.project_positions(there + step, there)
+    assert np.abs(out - there - (right - x)).max() < 1e-13
+
+
+def test_rows_between_fixed_atoms_that_begin_to_move():
+    """They are fulfilled at set-up, and asked for what the fixed atoms do not do later."""
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    late = MovingTarget(lambda t: 1 + max(0.0, t - 1) ** 2, lambda t: 2 * max(0.0, t - 1), lambda t: 2.0 * (t > 1))
+    motion = Motion(ConstraintSet([FixedAtoms([0, 1]), Distance([[0, 1]], late), Distance([[1, 2]])], x, np.ones(3)), x)
+    nothing = np.zeros((3, 3))
+    assert np.array_equal(motion.project_velocities(x, nothing, time=0.5), nothing)
+    for call in (
+        lambda: motion.project_positions(x, x, time=2.0),
+        lambda: motion.project_velocities(x, nothing, time=2.0),
+        lambda: motion.acceleration(x, nothing, nothing, 2.0),
+    ):
+        with pytest.raises(ContradictionError, match=r"Distance\(0, 1\) lies between fixed atoms"):
+            call()
+
+
+def test_conversions_are_visible():
+    x = np.array([[-1.16, 0, 0], [0, 0, 0], [1.16, 0, 0], [5.0, 0, 0]])
+    motion = Motion(ConstraintSet(Distance([[0, 1], [1, 2], [0, 2]]), x, np.ones(4)), x)
+    (body,) = motion.conversions
+    assert str(body) == "atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows"
+    assert f"converted: {body}" in str(motion.report(x))
+    assert Motion(ConstraintSet(Distance([[0, 1]]), x, np.ones(4)), x).conversions == ()
+
+
+def far_body(images):
+    """All ten distances of five atoms, each atom stored `images` cells away or in the cell itself."""
+    cell = np.array([[7.9, 0, 0], [-0.5, 8.4, 0], [-0.5, -1.8, 8.6]])
+    x = CHAIN[:5] * 0.8
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    shift = np.random.default_rng(1).integers(-images, images + 1, (5, 3)) @ cell
+    return x, x + shift, cell, pairs
+
+
+def test_lengths_found_far_away_can_be_held_near_the_origin():
+    """Stored at 3000 Å, positions are rounded to 5e-13, and so would be ten lengths of rank nine, each on its own."""
+    x, far, cell, pairs = far_body(400)
+    rows = ConstraintSet(Distance(pairs), far, MASSES[:5], cell=cell)
+    exact = ConstraintSet(Distance(pairs), x, MASSES[:5]).target()
+    assert 0 < np.abs(rows.target() - exact).max() < 400 * 3 * 8.6 * 4e-16
+    motion = Motion(rows, far)
+    found = motion.restore_positions(x)
+    # Ten lengths of one shape in space fit each other: the oracle needs no cell.
+    assert np.abs(rows.value(found)).max() < 4e-15
+    state = run(System(motion, lambda x, t: -x), State(found, motion.project_velocities(found, x[:, ::-1])), 0.01, 20)
+    assert np.abs(rows.value(state.positions)).max() < 3e-14
+
+
+def test_a_length_found_and_the_same_one_given():
+    x, far, cell, _ = far_body(40)
+    given = float(np.linalg.norm(x[1] - x[0]))
+    rows = ConstraintSet([Distance([[1, 2], [1, 0]]), Distance([[0, 1]], given)], far, MASSES[:5], cell=cell)
+    assert rows.target()[1] == rows.target()[2] == given
+    assert rows.target()[0] == pytest.approx(np.linalg.norm(x[2] - x[1]), abs=1e-12)

@@ -1,0 +1,168 @@
+"""Where compiled kernels are kept, what is said of them, and what is not compiled."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+from numba.core import event
+
+import kcons
+from kcons.constraints import compilation
+from kcons.constraints.compilation import SMALL, Announcer, plain_if_small
+
+#: Compiles one small kernel; says how many kernels came from the folder, and how many were compiled.
+ONE_KERNEL = """
+import numpy as np
+from kcons.constraints import compilation
+compilation.PATIENCE = 0.0
+from kcons.constraints.periodic.one_piece import follow_parents
+y = np.array([[0.1, 0, 0], [2.9, 0, 0]])
+follow_parents(y, np.array([1]), np.array([0]), np.array([3 * np.eye(3), np.eye(3) / 3]))
+assert np.allclose(y[1], [-0.1, 0, 0]), y
+stats = follow_parents.stats
+print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+"""
+
+
+def started(code: str, **environment: str) -> subprocess.Popen[str]:
+    given = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")} | environment
+    given.setdefault("PYTHONPATH", str(Path(kcons.__file__).parents[1]))
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=given
+    )
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    return out.strip(), err
+
+
+def test_kept_in_a_folder_and_announced_once(tmp_path):
+    first, second = (ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path))) for _ in range(2))
+    assert first[0] == "0 1"
+    assert first[1].count("This happens once on a machine") == 1 and "kcons warmup" in first[1]
+    assert second == ("1 0", "")
+
+
+def test_two_processes_at_once(tmp_path):
+    both = [started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
+    assert {ended(process)[0] for process in both} <= {"0 1", "1 0"}
+    assert ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path)))[0] == "1 0"
+
+
+def test_processors_that_share_a_folder(tmp_path):
+    """Each has its own kernels in it: what one has made is never run by the other."""
+    other = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    for given, found in ((other, "0 1"), ({}, "0 1"), (other, "1 0"), ({}, "1 0")):
+        assert ended(started(ONE_KERNEL, NUMBA_CACHE_DIR=str(tmp_path), **given))[0] == found
+
+
+def test_nothing_can_be_written_to(tmp_path):
+    """Neither the package's folder nor the home: kernels are kept for one process, and that is said."""
+    package = tmp_path / "kcons"
+    shutil.copytree(Path(kcons.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in [package, *(path for path in package.rglob("*") if path.is_dir())]:
+        (folder / "__pycache__").touch()  # where a folder would have to be: this stops root, too
+    nowhere = str(tmp_path / "kcons" / "__init__.py" / "home")
+    given = {"PYTHONPATH": str(tmp_path), "HOME": nowhere, "XDG_CACHE_HOME": nowhere, "TMPDIR": str(tmp_path)}
+    out, err = ended(started(ONE_KERNEL, PYTHONDONTWRITEBYTECODE="1", **given))
+    assert out == "0 1"
+    assert "Set NUMBA_CACHE_DIR to a folder of yours" in err
+    assert not list(tmp_path.glob("kcons-*")), "the folder of the process is removed"
+
+
+def test_without_compiling_there_is_a_word():
+    process = started("import kcons", NUMBA_DISABLE_JIT="1")
+    err = process.communicate(timeout=60)[1]
+    assert process.returncode == 1
+    assert "UnsupportedError: NUMBA_DISABLE_JIT is set" in err and "unset it" in err
+
+
+def test_little_work_is_left_to_python():
+    @numba.njit
+    def twice(n):
+        return 2 * n
+
+    assert plain_if_small(twice, SMALL) is twice.py_func
+    assert plain_if_small(twice, SMALL + 1) is twice
+    assert twice(1) == 2
+    assert plain_if_small(twice, 1) is twice  # it is there
+
+
+def test_a_small_molecule_compiles_its_numerics_only(tmp_path):
+    """What orders its rows is left to Python; one kernel for positions, one for tangents, each once."""
+    code = """
+import numpy as np
+from numba.core import event
+class Names(event.Listener):
+    def on_start(self, event): names.append(event.data["dispatcher"].py_func)
+    def on_end(self, event): pass
+names = []
+event.register("numba:compile", Names())
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Angle, Distance
+x = np.array([[0, 0, 0], [1.5, 0, 0], [2, 1.4, 0], [3.5, 1.4, 0.5]])
+Motion(ConstraintSet([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])], x, np.ones(4)), x)
+print(*(f"{f.__module__}.{f.__name__}" for f in names if f.__module__.startswith("kcons")))
+"""
+    names = ended(started(code, NUMBA_CACHE_DIR=str(tmp_path)))[0].split()
+    assert "kcons.solvers.sparse.mixed_rows._tangents" in names
+    assert not [name for name in names if ".plan." in name or ".elimination." in name]
+    assert len(names) == len(set(names)), "each is compiled for one kind of arguments"
+
+
+# -- the announcement -------------------------------------------------------------------------------
+
+
+def compiling(name: str):
+    def kernel():
+        pass
+
+    kernel.__module__ = name
+    return event.Event("numba:compile", event.EventStatus.START, {"dispatcher": SimpleNamespace(py_func=kernel)})
+
+
+def test_announced_after_a_second_in_all(monkeypatch, caplog):
+    monkeypatch.setattr(compilation, "PATIENCE", 0.2)
+    announcer = Announcer()
+    kernel, other = compiling("kcons.solvers.chains"), compiling("numpy.linalg")
+    pause = threading.Event()
+    with caplog.at_level(logging.WARNING, "kcons"):
+        announcer.on_start(other)  # nobody's business
+        pause.wait(0.3)
+        announcer.on_end(other)
+        announcer.on_start(kernel)
+        announcer.on_end(kernel)
+        assert announcer.seconds < 0.2 and not caplog.messages
+        pause.wait(0.3)  # between kernels no time is counted
+        announcer.on_start(kernel)
+        announcer.on_start(other)  # a part of it
+        pause.wait(0.3)
+        announcer.on_end(other)
+        assert len(caplog.messages) == 1
+        pause.wait(0.1)
+        announcer.on_end(kernel)
+        assert announcer.seconds == pytest.approx(0.4, abs=0.15)
+        announcer.on_start(kernel)
+        pause.wait(0.3)
+        announcer.on_end(kernel)
+    assert len(caplog.messages) == 1 and "once on a machine" in caplog.messages[0]
+
+
+def test_kernels_here_are_watched():
+    before = compilation.announcer.seconds
+    kernel = numba.njit(lambda y: y + 1)
+    kernel.py_func.__module__ = "kcons.here"
+    assert kernel(np.float32(1)) == 2
+    assert compilation.announcer.seconds > before

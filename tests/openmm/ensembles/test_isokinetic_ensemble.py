@@ -1,0 +1,319 @@
+"""Isokinetic motion in OpenMM: trajectories, constants, and what is held."""
+
+import copy
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import (
+    in_calls_of_any_length,
+    on_their_rows,
+    run,
+    three_on_a_sphere,
+    three_parts,
+    twice_kinetic,
+    warm,
+)
+from openmm import unit
+from openmm_systems import (
+    alanine,
+    context_of,
+    dumbbell,
+    forces_at,
+    loose_alanine,
+    masses_of,
+    started,
+    state_of,
+    water_box,
+)
+
+from kcons import ConstraintSet, Motion, State
+from kcons import System as CoreSystem
+from kcons.constraints import Distance
+from kcons.errors import ConvergenceError, InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import Isokinetic, ProjectedIntegrator, SurfaceIntegrator, hold
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.thermostats import Isokinetic as CoreIsokinetic
+
+pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
+
+
+ORDERS = {"rattle": 2, "isokinetic4": 4, "isokinetic6": 6}
+
+
+# -- isokinetic: trajectories -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ORDERS)
+def test_one_bond_as_the_core_stepper(scheme):
+    system, x, v = dumbbell()
+    dt = 0.5e-3
+    v = Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x).project_velocities(x, v)
+    integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-14, ensemble=Isokinetic(momentum="free"))
+    context = started(system, integrator, x, v)
+    k, c = 50.0, 500.0
+
+    def force(r, t):
+        x, y, z = r.T
+        return -np.stack([2 * k * x + c * y**3, 2.6 * k * y + 3 * c * x * y**2, 1.4 * k * z], axis=1)
+
+    core = CoreSystem(Motion(ConstraintSet([Distance([[0, 1]], 0.1)], x, masses_of(system)), x), force)
+    stepper, state = CoreIsokinetic(order=ORDERS[scheme], momentum="free"), State(x, v)
+    # Order 6 has 90 drifts a step, whose velocities are differences of positions.
+    for steps, limit in ((50, 1e-12), (250, 2e-11)) if scheme != "isokinetic6" else ((50, 2e-11),):
+        for _ in range(steps):
+            state = stepper.step(core, state, dt)
+        integrator.step(steps)
+        r, u = state_of(context)
+        assert np.abs(r - state.positions).max() <= limit
+        assert np.abs(u - state.velocities).max() <= 100 * limit
+
+
+#: System, time, reference steps, and the numbers of steps of each scheme. In many small steps velocities, which are
+#: differences of positions, are rounding: order 6 shows on the dumbbell only.
+RUNS = {
+    "dumbbell": (0.4, 64, {"rattle": (64, 128, 256), "isokinetic4": (16, 24, 32), "isokinetic6": (16, 20, 24)}),
+    "alanine": (0.016, 24, {"rattle": (16, 32, 64), "isokinetic4": (8, 12, 16)}),
+}
+
+
+@pytest.mark.parametrize(("name", "scheme"), [(name, scheme) for name, run in RUNS.items() for scheme in run[2]])
+def test_order(name, scheme):
+    """Slope of the error at fixed time: a bond in a field, and alanine dipeptide with all bonds held."""
+    system, x, v = dumbbell() if name == "dumbbell" else alanine()
+    span, many, runs = RUNS[name]
+
+    def end(scheme, n):
+        integrator = ProjectedIntegrator(span / n, scheme, tolerance=1e-14, ensemble=Isokinetic())
+        return state_of(run(system, integrator, x, v, n))[0]
+
+    exact = end("isokinetic6", many)
+    errors = [np.abs(end(scheme, n) - exact).max() for n in runs[scheme]]
+    slope = -np.polyfit(np.log(runs[scheme]), np.log(errors), 1)[0]
+    assert slope == pytest.approx(ORDERS[scheme], abs=0.15)
+
+
+@pytest.mark.parametrize("platform", ["Reference", "CPU"])
+@pytest.mark.parametrize("scheme", [*ORDERS, "geodesic"])
+def test_kinetic_energy_stays(scheme, platform):
+    system, x = water_box()
+    ensemble = Isokinetic(300 * unit.kelvin)
+    integrator = ProjectedIntegrator(1e-3, scheme, ensemble=ensemble)
+    context = context_of(system, integrator, platform)
+    context.setPositions(x)
+    integrator.minimizeEnergy(context, maxIterations=20)
+    integrator.setVelocitiesToTemperature(context, 300, 2)
+    v = state_of(context)[1]
+    masses = masses_of(system)
+    context.setVelocities(v - masses @ v / masses.sum())
+    for _ in range(5):
+        integrator.step(20)
+        found = twice_kinetic(system, state_of(context)[1])
+        assert abs(found / ((6 * 27 - 4) * GAS_CONSTANT * 300) - 1) <= 1e-13
+    assert ensemble.count(integrator) == 6 * 27 - 3
+    kelvin = integrator.computeSystemTemperature().value_in_unit(unit.kelvin)
+    assert kelvin == pytest.approx(300, rel=1e-12)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
+def test_kinetic_energy_stays_for_a_million_steps(scheme):
+    system, x, v = dumbbell()
+    integrator = ProjectedIntegrator(1e-3, scheme, tolerance=1e-12, ensemble=Isokinetic())
+    context = started(system, integrator, x, v)
+    integrator.step(1)
+    first = twice_kinetic(system, state_of(context)[1])
+    for _ in range(1000):
+        integrator.step(1000)
+        assert abs(twice_kinetic(system, state_of(context)[1]) / first - 1) <= 1e-13
+
+
+def test_calls_of_any_length_make_the_same_motion():
+    """Two half kicks at one place are a whole one: in between, K and the pseudo-energy need not be looked at."""
+    integrator = in_calls_of_any_length(lambda: Isokinetic(300.0))
+    unseen, seen = integrator.counts(seen=False), integrator.counts()
+    assert (unseen.constraint_solves, seen.constraint_solves) == (3, 4)
+    assert (unseen.passes, seen.passes) == (8, 14)
+
+
+def test_half_a_kick_is_not_owed_after_a_failure():
+    """A NaN within a call: the state of the last check, and the next step begins there with half a kick."""
+    system, x, v = alanine()
+    mine = copy.deepcopy(system)
+    bomb = openmm.CustomExternalForce("select(step(x-edge), sqrt(edge-x), 0)")
+    bomb.addGlobalParameter("edge", 1e6)
+    bomb.addParticle(0, [])
+    mine.addForce(bomb)
+
+    def begun(x, v, sign=1.0):
+        integrator = ProjectedIntegrator(1e-3, check_every=10, tolerance=1e-8, ensemble=Isokinetic())
+        return integrator, started(mine, integrator, x, sign * v, "CPU")
+
+    integrator, context = begun(x, v, 1.0)
+    forth = context.getState(positions=True).getPositions(asNumpy=True)._value[0, 0]
+    integrator.step(5)
+    moved = state_of(context)[0][0, 0]
+    sign = 1.0 if moved > forth else -1.0
+    (integrator, context), (other, twin) = begun(x, v, sign), begun(x, v, sign)
+    other.step(5)
+    context.setParameter("edge", 0.5 * (forth + state_of(twin)[0][0, 0]))
+    before = state_of(context)
+    with pytest.raises(NonFiniteError):
+        integrator.step(10)
+    np.testing.assert_array_equal(state_of(context), before)
+    context.setParameter("edge", 1e6)
+    twin.setPositions(before[0])
+    twin.setVelocities(before[1])
+    for one in (integrator, other):
+        one.step(10)
+    np.testing.assert_allclose(state_of(context), state_of(twin), rtol=0, atol=1e-6)
+
+
+def test_pseudo_energy_converges_with_the_order():
+    system, x, v = alanine()
+    spread = {}
+    for scheme, dt in (("rattle", 1e-3), ("rattle", 5e-4), ("isokinetic4", 1e-3)):
+        ensemble = Isokinetic(300.0)
+        integrator = ProjectedIntegrator(dt, scheme, tolerance=1e-13, ensemble=ensemble)
+        context = started(system, integrator, x, v)
+        values = []
+        for _ in range(50):
+            integrator.step(round(2e-3 / dt))
+            values.append(ensemble.conserved_energy(integrator))
+        spread[scheme, dt] = np.ptp(values)
+        assert context.getStepCount() == 50 * round(2e-3 / dt)
+    assert spread["rattle", 1e-3] / spread["rattle", 5e-4] == pytest.approx(4, rel=0.3)
+    assert spread["isokinetic4", 1e-3] < 1e-3 * spread["rattle", 1e-3]
+
+
+def test_friction_and_compression_rate():
+    system, x, v = loose_alanine()
+    ensemble = Isokinetic(300.0)
+    integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+    with pytest.warns(UserWarning, match="momentum"):
+        context = run(system, integrator, x, v, 1)
+    u = state_of(context)[1]
+    alpha = np.sum(u * forces_at(context)) / twice_kinetic(system, u)
+    assert ensemble.friction(integrator) == pytest.approx(alpha, rel=1e-12)
+    # A bond is free, and momentum is conserved.
+    assert ensemble.count(integrator) == 66 - 20 - 3
+    assert ensemble.compression_rate(integrator) == pytest.approx(-(ensemble.count(integrator) - 1) * alpha, rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+def test_strong_kicks_keep_the_kinetic_energy():
+    """c h of 2 to 10^6 in one kick, without overflow; velocities end along the force."""
+    for strength in (1.0, 1e3, 1e6, 1e12):
+        system = openmm.System()
+        field = openmm.CustomExternalForce("-a*x")
+        field.addGlobalParameter("a", 16.0 * strength)
+        for _ in range(2):
+            field.addParticle(system.addParticle(16.0), [])
+        system.addForce(field)
+        ensemble = Isokinetic()
+        integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
+        v = np.array([[0.0, 0.3, 0.4], [-0.1, 0.2, 0.5]])
+        context = run(system, integrator, np.zeros((2, 3)), v, 1)
+        u = state_of(context)[1]
+        assert abs(twice_kinetic(system, u) / twice_kinetic(system, v) - 1) <= 4e-15
+        if strength >= 1e6:
+            np.testing.assert_allclose(u[:, 0], np.sqrt(np.sum(v**2) / 2), rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:total momentum")
+def test_velocities_straight_against_a_strong_force():
+    system = openmm.System()
+    field = openmm.CustomExternalForce("-a*x")
+    field.addGlobalParameter("a", 1e9)
+    field.addParticle(system.addParticle(16.0), [])
+    system.addForce(field)
+    integrator = ProjectedIntegrator(1e-3, ensemble=Isokinetic(), check_every=1)
+    context = started(system, integrator, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]))
+    with pytest.raises(ConvergenceError, match="turned"):
+        integrator.step(1)
+    assert np.array_equal(state_of(context)[1], [[-1.0, 0, 0]])
+
+
+# -- isokinetic: with what is held -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["rattle", "isokinetic4"])
+def test_parts_keep_their_rows_and_the_kinetic_energy(scheme):
+    system, x, parts = three_parts()
+    ensemble = Isokinetic(300.0)
+    integrator = ProjectedIntegrator(1e-3, scheme, parts=parts, ensemble=ensemble)
+    context = warm(system, integrator, x, 4)
+    for block in range(4):
+        integrator.step(20)
+        integrator.check()
+        r, u = on_their_rows(*state_of(context))
+        # 18 coordinates, three rows; the sphere stands in space, so that momentum is not conserved.
+        assert abs(twice_kinetic(system, u) / ((18 - 3 - 1) * GAS_CONSTANT * 300) - 1) <= 1e-13
+        if block == 1:  # somebody moves x between steps
+            context.setPositions(r + 0.0)
+            integrator.applyConstraints(context)
+    with pytest.raises(UnsupportedError, match="multipliers_at"):
+        parts[1].multipliers(integrator)
+    with pytest.raises(InputError, match="constant energy"):
+        parts[0].step_multipliers()
+
+
+def test_rows_that_are_carried_move_as_those_of_the_system():
+    """The same bonds held by OpenMM and by kcons: one trajectory, although others move x in between."""
+    system, x, v = loose_alanine()
+    other = copy.deepcopy(system)
+    carried = hold(other, [], positions=x, take="all")
+    ends = []
+    for this, parts in ((system, ()), (other, (carried,))):
+        ensemble = Isokinetic(300.0, momentum="free")
+        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=ensemble)
+        context = run(this, integrator, x, v, 10)
+        r, u = state_of(context)
+        context.setPositions(r + 0.7)
+        context.setVelocities(u)
+        integrator.step(10)
+        ends.append(state_of(context))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
+
+
+def test_surfaces_alone():
+    system, x, spheres = three_on_a_sphere()
+    integrator = SurfaceIntegrator(1e-3, surfaces=spheres, system=system, ensemble=Isokinetic(300.0))
+    context = warm(system, integrator, x, 1)
+    integrator.step(100)
+    r, u = state_of(context)
+    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 0.5, atol=1e-14)
+    assert abs(twice_kinetic(system, u) / (5 * GAS_CONSTANT * 300) - 1) <= 1e-13
+
+
+def test_leapfrog_keeps_the_kinetic_energy_of_half_steps():
+    system, x, v = alanine()
+    integrator = ProjectedIntegrator(1e-3, "leapfrog", ensemble=Isokinetic(300.0))
+    context = started(system, integrator, x, v)
+    for _ in range(5):
+        integrator.step(10)
+        found = context.getState(energy=True).getKineticEnergy().value_in_unit(unit.kilojoule_per_mole)
+        assert abs(2 * found / (41 * GAS_CONSTANT * 300) - 1) <= 1e-13
+
+
+def test_a_part_of_the_particles():
+    system, x, v = water_box()[0], water_box()[1], np.random.default_rng(0).normal(size=(81, 3))
+    chosen = np.arange(12)
+    ensemble = Isokinetic(300.0, atoms=chosen)
+    integrator = ProjectedIntegrator(5e-4, ensemble=ensemble)
+    context = run(system, integrator, x, 0.3 * v, 30)
+    masses, u = masses_of(system), state_of(context)[1]
+    assert ensemble.count(integrator) == 24
+    wanted = 23 * GAS_CONSTANT * 300
+    assert abs(masses[:12] @ np.sum(u[:12] ** 2, axis=1) / wanted - 1) <= 1e-13
+    # The others move by Newton's equations: the same first step as without a thermostat.
+    plain = ProjectedIntegrator(5e-4)
+    start = started(system, plain, x, 0.3 * v)
+    plain.step(1)
+    again = ProjectedIntegrator(5e-4, ensemble=Isokinetic(atoms=chosen))
+    both = run(system, again, x, 0.3 * v, 1)
+    np.testing.assert_allclose(state_of(both)[0][12:], state_of(start)[0][12:], atol=1e-13)
+    assert np.abs(state_of(both)[0][:12] - state_of(start)[0][:12]).max() > 1e-9
+    with pytest.raises(UnsupportedError, match="couples"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300, atoms=[0, 1])), x, v, 1)

@@ -1,0 +1,174 @@
+"""Rows that kernels call by address: families, Numba's functions, Python's, and what these raise."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numba
+import numpy as np
+import pytest
+from constraint_cases import CASES, MASSES, TIME, scattered
+
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Custom, Distance, RowKind
+from kcons.errors import InputError
+from kcons.solvers.cluster_solver import Request
+from kcons.solvers.general_clusters import GeneralClusters
+from kcons.solvers.sparse.mixed_rows import SparseRows
+
+FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
+
+
+@numba.njit
+def bend(r):
+    return (r[0, 0] - r[1, 0]) ** 2 + np.sin(r[0, 2])
+
+
+@numba.njit
+def bend_gradient(r):
+    out = np.zeros((2, 3))
+    out[0, 0] = 2 * (r[0, 0] - r[1, 0])
+    out[1, 0] = -out[0, 0]
+    out[0, 2] = np.cos(r[0, 2])
+    return out
+
+
+@numba.njit
+def wave(r, t):
+    return r[0, 2] - np.sin(r[0, 0] - t)
+
+
+@numba.njit
+def wave_gradient(r, t):
+    return np.array([[-np.cos(r[0, 0] - t), 0.0, 1.0]])
+
+
+def both(rows, x, time=TIME):
+    whole = ConstraintSet(rows, x, MASSES, time=time)
+    numbers = np.arange(whole.n_rows)
+    return SparseRows(whole, numbers, 1 / MASSES), GeneralClusters(whole, numbers, 0 * numbers, 1 / MASSES), whole
+
+
+@pytest.mark.parametrize("far", [0.0, 50.0], ids=["near", "far"])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_kernels_agree_with_the_dense_solver(name, far):
+    x = scattered(1) + (far if CASES[name]().translation_invariant else 0.0)
+    fast, dense, whole = both([CASES[name](), Distance([[6, 7]])], x)
+    rng = np.random.default_rng(2)
+    new, y = x + 0.02 * rng.normal(size=x.shape), rng.normal(size=x.shape)
+    wanted = whole.target(TIME + 0.01)
+    found = []
+    for solver in (fast, dense):
+        positions, tangents, multipliers = new.copy(), y.copy(), np.empty((2, whole.n_rows))
+        moved = Request(positions, x, wanted, None, TIME + 0.01, TIME)
+        assert solver.positions(moved, multipliers[0]).converged
+        assert solver.tangents(Request(tangents, x, wanted, None, TIME), multipliers[1]).converged
+        order = np.argsort(solver.rows)
+        found.append((positions, tangents, multipliers[:, order]))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-11 if "ithout" in name else 1e-13 * max(1, far))
+    assert np.all(np.abs(whole.value(found[0][0], TIME + 0.01)) <= 2 * whole.tolerance(x, TIME + 0.01))
+
+
+@pytest.mark.parametrize(
+    ("item", "plain"),
+    [
+        (Custom([[0, 1], [5, 2]], bend, bend_gradient), Custom([[0, 1], [5, 2]], bend.py_func, bend_gradient.py_func)),
+        (
+            Custom([0], wave, wave_gradient, time_dependent=True),
+            Custom([0], wave.py_func, wave_gradient.py_func, time_dependent=True),
+        ),
+    ],
+    ids=["two atoms", "moving"],
+)
+def test_functions_of_numba_are_called_without_python(item, plain):
+    x = scattered(4)
+    fast, _, _ = both([item], x)
+    slow, _, _ = both([plain], x)
+    assert not fast._given.python and len(slow._given.python) == 1
+    ends = []
+    for solver in (fast, slow):
+        y = x + 0.01
+        assert solver.positions(Request(y, x, solver._targets, None, TIME, TIME)).converged
+        ends.append(y)
+    np.testing.assert_allclose(*ends, rtol=1e-14, atol=1e-15)
+
+
+class Fickle:
+    """A distance that breaks when told to."""
+
+    broken: object = None
+
+    def __call__(self, r):
+        if isinstance(self.broken, Exception):
+            raise self.broken
+        return np.linalg.norm(r[0] - r[1]) if self.broken is None else self.broken
+
+    @staticmethod
+    def gradient(r):
+        u = (r[0] - r[1]) / np.linalg.norm(r[0] - r[1])
+        return np.array([u, -u])
+
+
+@pytest.mark.parametrize(
+    ("broken", "error", "message"),
+    [
+        (ZeroDivisionError("of its own"), ZeroDivisionError, "of its own"),
+        (np.zeros(2), InputError, r"function returned shape \(2,\) for row [01]; it must return one number"),
+        ("many", InputError, "no array of numbers"),
+    ],
+)
+def test_what_python_raises_comes_out_and_nothing_has_changed(broken, error, message):
+    function = Fickle()
+    x = scattered(0)
+    motion = Motion(ConstraintSet(Custom([[0, 1], [2, 3]], function, function.gradient), x, MASSES), x)
+    new, v = x + 0.01, np.ones_like(x)
+    kept = new.copy()
+    function.broken = broken
+    with pytest.raises(error, match=message):
+        motion.project_positions(new, x, velocities=v, dt=0.1, out=new)
+    assert np.array_equal(new, kept) and np.array_equal(v, np.ones_like(x))
+    function.broken = None
+    assert motion.project_positions(new, x, out=new) is new
+
+
+def test_a_function_may_keep_what_it_sees():
+    seen = []
+
+    def height(r):
+        seen.append((r, r.copy()))
+        return float(r[0, 2])
+
+    x = scattered(0)
+    motion = Motion(ConstraintSet(Custom([0], height, lambda r: np.array([[0, 0, 1.0]])), x, MASSES), x)
+    del seen[:]
+    motion.project_positions(x + 0.1, x)
+    assert len({then.tobytes() for _, then in seen}) > 1
+    assert all(np.array_equal(now, then) for now, then in seen)
+    with pytest.raises(ValueError, match="read-only"):
+        seen[-1][0][0, 0] = 1.0
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))], ids=["copy", "pickle"])
+def test_copies_have_addresses_of_their_own(duplicate):
+    x = scattered(1)
+    solver, _, whole = both([CASES["Torus"](), Custom([0, 3], bend, bend_gradient)], x)
+    other = duplicate(solver)
+    del solver
+    y = x + 0.01
+    assert other.positions(Request(y, x)).converged
+    assert np.all(np.abs(whole.value(y)) <= whole.tolerance(y))
+
+
+def test_rows_that_elimination_takes_for_dependent_go_to_the_dense_solver():
+    x = scattered(0)
+    weights = np.random.default_rng(0).uniform(0.5, 2, (2, 3))
+
+    def square(w):
+        return Custom([0, 1], lambda r: np.sum(w * r * r), lambda r: 2 * w * r)
+
+    motion = Motion(
+        ConstraintSet([square(weights), square(weights + np.array([[1e-6, 0, 0], [0, 0, 0]]))], x, MASSES), x
+    )
+    assert motion.rank == 2 and isinstance(motion.plan.solvers[0], GeneralClusters)
