@@ -289,9 +289,9 @@ class NoseHooverMiddle(NoseHoover):
     """The same chain in the middle of the drift, for `ProjectedIntegrator(ensemble=...)`: take it for large time steps.
 
     Half a kick, half a drift along the constraints, a step of the chain, half a drift, half a kick. At the ends of
-    steps of length h, K of a harmonic vibration of frequency omega is too low by a part (omega h)^2/4 beside that of its
-    configurations, with any integrator of this kind. `NoseHoover` acts there: it makes K right and configurations too
-    warm. In the middle both are right. The reported temperature is that of the ends of steps, and too low.
+    steps of length h, K of a harmonic vibration of frequency omega is too low by a part (omega h)^2/4 beside that of
+    its configurations, with any integrator of this kind. `NoseHoover` acts there: it makes K right and configurations
+    too warm. In the middle both are right. The reported temperature is that of the ends of steps, and too low.
 
     Parameters
     ----------
