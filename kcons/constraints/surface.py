@@ -348,6 +348,7 @@ class Plane(LinearRows):
     """
 
     family = "Plane"
+    kind = RowKind.FUNCTION
     row_width = 1
 
     def __init__(

@@ -106,7 +106,7 @@ def as_target(target: Target, rows: int) -> FloatArray | MovingTarget | None:
 # -- derivatives that a user did not give: central differences ---------------------------------------
 
 # Weights of f(a + kh) -/+ f(a - kh), k = 1, 2, ...
-_FIRST_4 = (2 / 3, -1 / 12)
+FIRST_4 = (2 / 3, -1 / 12)
 _FIRST_8 = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 _SECOND_8 = (8 / 5, -1 / 5, 8 / 315, -1 / 560)
 
@@ -115,7 +115,7 @@ Function = Callable[[Any], FloatArray]
 
 def first_derivative_4(function: Function, at: Any, step: Any) -> FloatArray:
     """df/ds, error of order step^4; best at a step of about 1e-3 of the scale of f (12 digits)."""
-    return _first(function, at, step, _FIRST_4)
+    return _first(function, at, step, FIRST_4)
 
 
 def first_derivative(function: Function, at: Any, step: Any) -> FloatArray:

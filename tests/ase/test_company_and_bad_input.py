@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ase import Atoms, units
+from ase import units
 from ase.build import molecule
 from ase.calculators.emt import EMT
 from ase.constraints import (
     FixAtoms,
-    FixBondLengths,
     FixCartesian,
-    FixCom,
-    FixedPlane,
     Hookean,
 )
 from ase.md.langevin import Langevin
@@ -21,7 +18,6 @@ from ase.md.verlet import VelocityVerlet
 from ase.optimize import FIRE
 from ase_systems import (
     Free,
-    loose_waters,
     off,
     rigid,
 )
@@ -31,7 +27,6 @@ from kcons.constraints import (
     Angle,
     Distance,
     LinearVelocity,
-    Sphere,
 )
 from kcons.errors import (
     ContradictionError,
@@ -44,54 +39,6 @@ from kcons.errors import (
 from kcons.steppers import BlanesMoan4
 
 # -- company ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("other", "hint"),
-    [
-        (FixAtoms([0]), "FixedAtoms"),
-        (FixBondLengths([[0, 4]]), "Distance"),
-        (FixedPlane([1], (0, 0, 1)), "Plane"),
-        (FixCartesian([2]), "LinearCombination"),
-        (Constraints(Distance([2, 4])), ""),
-    ],
-    ids=lambda v: type(v).__name__,
-)
-@pytest.mark.parametrize("first", [True, False])
-def test_company_on_the_same_atoms_is_refused(other, hint, first):
-    atoms, held = rigid(2)
-    held.restore(atoms)
-    atoms.set_constraint([held, other] if first else [other, held])
-    before = atoms.positions.copy()
-    with pytest.raises(UnsupportedError, match=f"{type(other).__name__} acts on atom.*one Constraints object.*{hint}"):
-        atoms.set_positions(before + np.random.default_rng(0).normal(scale=0.01, size=(6, 3)))
-    assert np.array_equal(atoms.positions, before)
-    with pytest.raises(UnsupportedError):
-        atoms.get_forces()
-
-
-def test_constrain_beside_something_else():
-    atoms = loose_waters(2)
-    atoms.set_constraint(FixAtoms([4]))
-    held = constrain(atoms, Distance([0, 1]))
-    assert [type(c).__name__ for c in atoms.constraints] == ["FixAtoms", "Constraints"]
-    assert atoms.get_number_of_degrees_of_freedom() == 18 - 3 - 1
-    new = atoms.positions + np.random.default_rng(0).normal(scale=0.01, size=(6, 3))
-    fixed = atoms.positions[4].copy()
-    atoms.set_positions(new)
-    assert np.array_equal(atoms.positions[4], fixed) and off(atoms, held) <= 1e-14
-    with pytest.raises(UnsupportedError, match="FixAtoms acts on atom 4"):
-        constrain(atoms, Distance([4, 5]))
-    assert len(atoms.constraints) == 2
-
-
-def test_forces_only_company_is_welcome():
-    atoms, held = rigid(2)
-    atoms.set_constraint([held, Hookean(a1=0, a2=3, rt=2.5, k=1.0), FixCom()])
-    atoms.set_momenta(atoms.get_momenta())
-    VelocityVerlet(atoms, 1 * units.fs).run(10)
-    assert off(atoms, held) <= 1e-13
-    assert atoms.get_number_of_degrees_of_freedom() == 12 - 3
 
 
 @pytest.mark.parametrize("run", ["VelocityVerlet", "Langevin", "ConstrainedDynamics", "FIRE"])
@@ -116,14 +63,6 @@ def test_fixed_atoms_and_components_alongside(run):
     assert np.abs(moved[7, [0, 2]]).max() <= 1e-14 and abs(moved[7, 1]) > 1e-5
     assert off(atoms, held) <= 1e-13
     assert atoms.get_number_of_degrees_of_freedom() == 27 - 3 - 2 - 3
-
-
-def test_fix_com_beside_a_surface_is_refused():
-    atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
-    held = constrain(atoms, Sphere([0], [0, 0, 0]))
-    atoms.set_constraint([FixCom(), held])
-    with pytest.raises(UnsupportedError, match=r"FixCom acts on atom 0.*CenterOfMass"):
-        atoms.set_momenta(np.ones((2, 3)))
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import ase.md
 import ase.optimize
 import numpy as np
@@ -37,8 +35,6 @@ from ase_systems import (
     random,
     slip,
 )
-
-from kcons.errors import UnsupportedError
 
 # -- dynamics ---------------------------------------------------------------------------------------
 
@@ -168,52 +164,11 @@ def test_contour_exploration_keeps_lengths():
     assert off(atoms, held) <= 1e-12
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_classes_that_move_atoms_past_constraints_are_found(name):
-    make, steps, message = REFUSED[name]
-    atoms, held = dumbbells(10)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ASE's own advice about its class
-        with pytest.raises(UnsupportedError, match=f"{message}.*ConstrainedDynamics.*Langevin") as caught:
-            make(atoms).run(steps)
-    assert name in str(caught.value) or name in ("NPT",)
-    # The object still works once the atoms are put right.
-    held.restore(atoms)
-    atoms.set_momenta(atoms.get_momenta())
-    VelocityVerlet(atoms, FS).run(3)
-    assert off(atoms, held) <= 1e-12
-
-
 @pytest.mark.parametrize("name", REFUSE_THEMSELVES)
 def test_classes_that_refuse_constraints_themselves(name):
     atoms, _ = dumbbells(4)
     with pytest.raises(NotImplementedError, match="does not support constraints"):
         REFUSE_THEMSELVES[name](atoms)
-
-
-def test_honest_dynamics_raise_no_alarm():
-    # Positions set again and again between momenta, velocities drawn anew, long steps.
-    atoms, held = dumbbells(6)
-    raw = atoms.positions + random().normal(scale=0.02, size=atoms.positions.shape)
-    for _ in range(4):
-        atoms.set_positions(raw)
-        thermalize_momenta(atoms, 900, rng=random())
-    atoms.set_positions(raw)
-    for _ in range(4):
-        VelocityVerlet(atoms, 8 * FS).run(20)
-        thermalize_momenta(atoms, 900, rng=random())
-    assert off(atoms, held) <= 1e-12
-
-
-def test_momenta_of_edited_atoms():
-    atoms, held = dumbbells(2)
-    before = atoms.get_momenta()
-    atoms.positions[0] += 0.1
-    with pytest.raises(UnsupportedError, match=r"off row #0 Distance\(0, 1\).*restore"):
-        atoms.set_momenta(np.ones((4, 3)))
-    assert np.array_equal(atoms.get_momenta(), before)
-    held.restore(atoms)
-    atoms.set_momenta(np.ones((4, 3)))
 
 
 @pytest.mark.validation

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ase import Atoms, units
-from ase.build import bulk, molecule
+from ase import units
+from ase.build import molecule
 from ase.calculators.lj import LennardJones
 from ase.constraints import (
     FixAtoms,
@@ -22,7 +22,7 @@ from ase.constraints import (
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import constrain, from_ase_constraints, rigid_water
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import UnsupportedError
 
 
 def test_from_ase_constraints():
@@ -106,40 +106,3 @@ def test_unknown_ase_constraints_are_named(other):
     atoms.set_constraint(other)
     with pytest.raises(UnsupportedError, match=f"{type(other).__name__}.*Custom"):
         from_ase_constraints(atoms)
-
-
-def test_rigid_water_finds_water_only():
-    atoms = molecule("H2O") + molecule("CH3CH2OH") + molecule("OH") + bulk("Cu") + molecule("H2O")
-    n = len(atoms)
-    atoms.positions[:3] += 20
-    atoms.positions[n - 3 :] -= 20
-    rows = rigid_water(atoms).atoms
-    assert np.array_equal(rows, [[0, 1], [0, 2], [1, 2], [n - 3, n - 2], [n - 3, n - 1], [n - 2, n - 1]])
-
-
-def test_rigid_water_spares_hydronium():
-    atoms = Atoms("OH3", positions=[[0, 0, 0], [0.98, 0, 0], [-0.49, 0.85, 0], [-0.49, -0.85, 0]])
-    with pytest.raises(InputError, match="no water found"):
-        rigid_water(atoms)
-
-
-def test_rigid_water_across_a_boundary():
-    atoms = molecule("H2O")
-    atoms.set_cell([8, 8, 8])
-    atoms.pbc = True
-    atoms.positions -= atoms.positions[0]
-    atoms.wrap()
-    assert rigid_water(atoms).n_rows == 3
-
-
-def test_rigid_water_geometry():
-    atoms = molecule("H2O")
-    assert rigid_water(atoms, (1.0, 90.0)).target == pytest.approx([1.0, 1.0, np.sqrt(2)])
-    assert rigid_water(atoms).target is None
-    with pytest.raises(InputError, match="geometry"):
-        rigid_water(atoms, "spc")
-
-
-def test_no_water():
-    with pytest.raises(InputError, match="no water found"):
-        rigid_water(molecule("CH4"))

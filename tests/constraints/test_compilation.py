@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -100,26 +101,25 @@ def test_little_work_is_left_to_python():
     assert plain_if_small(twice, 1) is twice  # it is there
 
 
-def test_a_small_molecule_compiles_its_numerics_only(tmp_path):
-    """What orders its rows is left to Python; one kernel for positions, one for tangents, each once."""
+def test_a_small_molecule_needs_its_numerics_only():
+    """What orders its rows is left to Python; kernels are made for one kind of arguments."""
     code = """
 import numpy as np
-from numba.core import event
-class Names(event.Listener):
-    def on_start(self, event): names.append(event.data["dispatcher"].py_func)
-    def on_end(self, event): pass
-names = []
-event.register("numba:compile", Names())
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Distance
 x = np.array([[0, 0, 0], [1.5, 0, 0], [2, 1.4, 0], [3.5, 1.4, 0.5]])
 Motion(ConstraintSet([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])], x, np.ones(4)), x)
-print(*(f"{f.__module__}.{f.__name__}" for f in names if f.__module__.startswith("kcons")))
+import numba, sys
+for module in [module for name, module in sys.modules.items() if name.startswith("kcons.")]:
+    for name, kernel in vars(module).items():
+        if isinstance(kernel, numba.core.registry.CPUDispatcher) and kernel.py_func.__module__ == module.__name__:
+            print(f"{module.__name__}.{name}", len(kernel.signatures))
 """
-    names = ended(started(code, NUMBA_CACHE_DIR=str(tmp_path)))[0].split()
-    assert "kcons.solvers.sparse.mixed_rows._tangents" in names
-    assert not [name for name in names if ".plan." in name or ".elimination." in name]
-    assert len(names) == len(set(names)), "each is compiled for one kind of arguments"
+    counts = dict(line.split() for line in ended(started(code))[0].splitlines())
+    assert counts.pop("kcons.solvers.sparse.mixed_rows._tangents") == "1"
+    assert {counts[f"kcons.solvers.sparse.elimination.{name}"] for name in ("_minimum_degree", "_finish")} == {"0"}
+    assert {counts[f"kcons.plan.independent_blocks.{name}"] for name in ("_is_forest", "_edge_blocks")} == {"0"}
+    assert set(counts.values()) <= {"0", "1"}
 
 
 # -- the announcement -------------------------------------------------------------------------------
@@ -166,3 +166,16 @@ def test_kernels_here_are_watched():
     kernel.py_func.__module__ = "kcons.here"
     assert kernel(np.float32(1)) == 2
     assert compilation.announcer.seconds > before
+
+
+def test_the_clock_stands_still_while_kernels_are_compiled():
+    kernel = compiling("kcons.solvers.chains")
+    whole, timed = time.perf_counter(), compilation.clock()
+    for pause in (0.3, 0.1):
+        if pause == 0.3:
+            compilation.announcer.on_start(kernel)
+        time.sleep(pause)
+        if pause == 0.3:
+            compilation.announcer.on_end(kernel)
+    whole, timed = time.perf_counter() - whole, compilation.clock() - timed
+    assert 0.1 <= timed < whole - 0.29

@@ -92,6 +92,48 @@ def test_names_of_modules_are_their_own():
     assert {name for name, count in stems.items() if count > 1} <= SHARED
 
 
+TESTS = ROOT / "tests"
+#: Modules without a test file of their own, and where they are tested. What gets one is taken out.
+TESTED_ELSEWHERE = {
+    **dict.fromkeys(
+        (
+            f"comparison/hard_cases/{theme}.py"
+            for theme in ("bodies", "chains", "growth_models", "inputs", "invariance", "long_runs", "motions")
+        ),
+        "comparison/hard_cases/test_cases_of_kcons.py",
+    ),
+    **dict.fromkeys(
+        (f"comparison/hard_cases/{theme}.py" for theme in ("rings", "starts", "steps", "thermostats")),
+        "comparison/hard_cases/test_cases_of_kcons.py",
+    ),
+    "comparison/methods/peers/mici_leapfrog.py": "comparison/methods/peers/test_peer_methods.py",
+    "comparison/methods/peers/shake.py": "comparison/methods/peers/test_peer_methods.py",
+    "comparison/work_precision/whole_page.py": "comparison/work_precision/test_whole.py",
+    "comparison/hard_cases/contract.py": "comparison/hard_cases/test_programs.py",
+    "openmm/ensembles/conserved_momenta.py": "openmm/ensembles/test_nose_hoover_ensemble.py",
+    "openmm/integrator/ensemble.py": "openmm/test_ensemble_settings.py",
+    "openmm/integrator/interface.py": "openmm/integrator/test_projected.py",
+    "openmm/integrator/states/states_on_constraints.py": "openmm/integrator/states/test_minimization.py",
+    "openmm/surfaces/compiled_quadrics.py": "openmm/surfaces/test_surface_step_writer.py",
+    "openmm/surfaces/formulas.py": "openmm/surfaces/test_surface_integrator.py",
+    "openmm/surfaces/quadrics.py": "openmm/surfaces/test_surface_step_writer.py",
+    "openmm/surfaces/surface_rows.py": "openmm/surfaces/test_surface_integrator.py",
+    "openmm/surfaces/tori.py": "openmm/surfaces/test_surface_step_writer.py",
+    "openmm/topology.py": "contracts/test_views_agree.py",
+    "solvers/kernels/eight_wide.py": "solvers/test_rigid_triangles.py",
+    "solvers/kernels/groups_of_eight.py": "solvers/test_small_clusters.py",
+    "solvers/kernels/two_and_four_wide.py": "solvers/sparse/test_distances.py",
+}
+
+
+def test_each_module_has_its_test_file():
+    """Of its name, in the same place below tests/."""
+    modules = {path.relative_to(PACKAGE).as_posix() for path in FILES if not path.stem.startswith("__")}
+    without = {name for name in modules if not (TESTS / name).with_name(f"test_{name.rpartition('/')[2]}").is_file()}
+    assert without == set(TESTED_ELSEWHERE)
+    assert [place for place in TESTED_ELSEWHERE.values() if not (TESTS / place).is_file()] == []
+
+
 #: At most: lines of a module, of a function and of a class; parameters but for self, outside of the compiled solvers.
 LINES, FUNCTION, CLASS, PARAMETERS = 500, 100, 300, 11
 #: Folders whose kernels take one argument an array.

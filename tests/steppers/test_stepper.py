@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from stepper_systems import (
     EVERY,
-    NYSTROM,
-    PROJECTED,
     SYMMETRIC,
     gravity,
     growing_rod,
@@ -19,14 +15,11 @@ from stepper_systems import (
 )
 
 from kcons.constraints import Angle, Distance
-from kcons.errors import ConvergenceError, InputError, NonFiniteError, ReversibilityError, UnsupportedError
+from kcons.errors import ConvergenceError, InputError, NonFiniteError
 from kcons.steppers import (
     Baumgarte,
-    Geodesic,
     ProjectedRungeKutta4,
     ProjectedVerlet,
-    Rattle,
-    ReversibilityCheck,
     State,
     System,
     run,
@@ -345,111 +338,7 @@ def test_moving_frame_does_not_matter(stepper) -> None:
 # -- run --------------------------------------------------------------------------------------------
 
 
-def test_observers_see_start_and_every_kth_step() -> None:
-    system, state = rotor()
-    seen: list[int] = []
-    run(system, state, 0.01, 10, observers=[lambda s: seen.append(s.step)], every=4)
-    assert seen == [0, 4, 8]
-
-
-@pytest.mark.parametrize(("steps", "every"), [(-1, 1), (3, 0)])
-def test_bad_run_arguments(steps, every) -> None:
-    system, state = rotor()
-    with pytest.raises(InputError, match="steps >= 0"):
-        run(system, state, 0.1, steps, every=every)
-
-
-def test_run_uses_rattle_unless_told() -> None:
-    system, state = molecule()
-    assert np.array_equal(
-        run(system, state, 0.02, 10).positions, run(system, state, 0.02, 10, stepper=Rattle()).positions
-    )
-
-
-@pytest.mark.parametrize("stepper", NYSTROM, ids=repr)
-def test_unsupported_forces_are_refused_before_the_first_observer(stepper) -> None:
-    system, state = rotor(force=lambda x, v, t: -v, velocity_dependent=True)
-    seen: list[State] = []
-    for attempt in (
-        lambda: run(system, state, 0.1, 1, stepper=stepper, observers=[seen.append]),
-        lambda: run(system, state, 0.1, 0, stepper=ReversibilityCheck(stepper), observers=[seen.append]),
-        lambda: stepper.step(system, state, 0.1),
-    ):
-        with pytest.raises(UnsupportedError, match="use Suzuki4 or KahanLi6"):
-            attempt()
-    assert not seen
-
-
 # -- the reversibility check ------------------------------------------------------------------------
-
-
-@REVERSIBLE
-def test_check_passes_good_steps_and_changes_nothing(stepper) -> None:
-    system, start = molecule()
-    checked = ReversibilityCheck(stepper)
-    a, b = run(system, start, 0.02, 50, stepper=checked), run(system, start, 0.02, 50, stepper=stepper)
-    assert np.array_equal(a.positions, b.positions)
-    assert (checked.order, checked.symplectic) == (stepper.order, stepper.symplectic)
-    assert checked.force_evaluations == 2 * stepper.force_evaluations
-
-
-class Drifting(Rattle):
-    """Claims to be reversible and loses a little speed."""
-
-    def step(self, system: System, state: State, dt: float) -> State:
-        after = super().step(system, state, dt)
-        return State(after.positions, after.velocities * (1 - 1e-7), after.time, None, after.step)
-
-
-def test_check_finds_a_stepper_that_is_not_reversible() -> None:
-    system, state = rotor()
-    state = State(state.positions, state.velocities, step=6)
-    before = copies(state)
-    with pytest.raises(ReversibilityError, match="step 7 is not reversible: taken back, atom") as caught:
-        ReversibilityCheck(Drifting()).step(system, state, 0.1)
-    assert caught.value.step == 7 and 1e-8 < caught.value.residual < 1e-6
-    assert_untouched(state, before)
-    ReversibilityCheck(Drifting(), tolerance=1e-5).step(system, state, 0.1)
-
-
-def test_check_finds_forces_with_a_memory() -> None:
-    """As by neighbour lists that are out of date: not a function of the positions."""
-    counter = itertools.count()
-    system, state = rotor(force=lambda x, t: -x * (1 + 1e-4 * next(counter)))
-    with pytest.raises(ReversibilityError, match="not reversible"):
-        run(system, state, 0.1, 10, stepper=ReversibilityCheck(Rattle()))
-
-
-def test_check_reports_a_step_that_cannot_be_taken_back() -> None:
-    class OneWay(Rattle):
-        def step(self, system: System, state: State, dt: float) -> State:
-            if dt < 0:
-                raise ConvergenceError("no way back", residual=0.5, row=0, atoms=[0, 1])
-            return super().step(system, state, dt)
-
-    system, state = rotor()
-    with pytest.raises(ReversibilityError, match="step 1 cannot be taken back: no way back") as caught:
-        ReversibilityCheck(OneWay()).step(system, state, 0.1)
-    assert caught.value.atoms == (0, 1) and caught.value.step == 1
-
-
-@pytest.mark.parametrize("stepper", PROJECTED, ids=repr)
-def test_check_refuses_schemes_that_are_not_reversible(stepper) -> None:
-    with pytest.raises(UnsupportedError, match="use Rattle, Geodesic, a Composition or a RungeKuttaNystrom"):
-        ReversibilityCheck(stepper)
-
-
-@pytest.mark.parametrize("tolerance", [0.0, -1.0, np.nan])
-def test_check_needs_a_tolerance(tolerance) -> None:
-    with pytest.raises(InputError, match="tolerance"):
-        ReversibilityCheck(Rattle(), tolerance)
-
-
-def test_check_works_far_from_the_origin_and_at_rest() -> None:
-    system, state = rotor(omega=1.0, offset=1e6)
-    run(system, state, 0.05, 20, stepper=ReversibilityCheck(Geodesic(2)))
-    system, state = rotor(omega=0.0)
-    run(system, state, 0.05, 3, stepper=ReversibilityCheck(Rattle()))
 
 
 def test_reprs_build_the_stepper_again() -> None:

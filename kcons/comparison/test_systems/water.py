@@ -135,9 +135,7 @@ def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Po
 
 
 def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Potential:
-    from kcons.comparison.test_systems import openmm_potential
-
-    potential = openmm_potential.of_system(_system(box, cutoff, masses))
+    potential = OpenMMHost(lambda: _system(box, cutoff, masses), platform="CPU").potential()
     potential.name = f"PME, {potential.name}"
     return potential
 

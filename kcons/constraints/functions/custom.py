@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANY, lent, numbers
 from kcons.constraints.constraint import Constraint, RowKind
-from kcons.constraints.target import FloatArray, Target, first_derivative, first_derivative_4, second_derivative
+from kcons.constraints.target import (
+    FIRST_4,
+    FloatArray,
+    Target,
+    first_derivative,
+    first_derivative_4,
+    second_derivative,
+)
 from kcons.errors import InputError
 
 _FLOAT = np.dtype(np.float64)
@@ -100,9 +107,23 @@ class FunctionRows(Constraint):
         args = (here, time) if self.time_dependent else (here,)
         value = self._checked(self.function(*args), k, "function", ())
         if self.gradient_function is None:
-            only = self if self.n_rows == 1 else self.select([k])
-            return float(value), only.gradient(r[None], time)[0]
+            return float(value), self._differenced_row(k, r, args[1:])
         return float(value), self._checked(self.gradient_function(*args), k, "gradient", r.shape)
+
+    def _differenced_row(self, k: int, r: FloatArray, time: tuple[float, ...]) -> FloatArray:
+        """`_differenced_gradient` of one row, without arrays of rows, whose price would be that of the function."""
+        step = 1e-3 * float(self._length(r[None])[0])
+        slope, x = np.empty(r.shape), r.copy()
+        for place in np.ndindex(r.shape):
+            middle, total = x[place], 0.0
+            for turn, weight in enumerate(FIRST_4, start=1):
+                for sign in (turn, -turn):
+                    x[place] = middle + sign * step
+                    value = self._checked(self.function(lent(x.copy()), *time), k, "function", ())
+                    total += weight * value if sign > 0 else -weight * value
+            x[place] = middle
+            slope[place] = total / step
+        return slope
 
     def _checked(self, found: Any, k: int, name: str, shape: tuple[int, ...]) -> Any:
         """What a function returned for row `k`, as float64 of that shape."""

@@ -4,6 +4,7 @@
 - `forecast`: pushes that are foreseen
 - `clock`: the time of targets that move
 - `row_forces`: values and gradients of rows by OpenMM's forces
+- `formula_rows`: formulas as forces
 - `plain_rows`: rows that are internal coordinates, as constraints of kcons
 - `context_rows`: the rows in a Context
 - `row_program`: the part of the program that holds them

@@ -11,6 +11,7 @@ import openmm
 from numpy.typing import ArrayLike
 from openmm import unit
 
+from kcons.constraints import Formula
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -22,6 +23,7 @@ from kcons.errors import (
     UnsupportedError,
 )
 from kcons.openmm.collective.context_rows import ContextRows, variables_of
+from kcons.openmm.collective.formula_rows import as_rows
 from kcons.openmm.collective.row_forces import (
     Rigid,
     Row,
@@ -65,9 +67,9 @@ class CollectiveRows(GroupRows):
     ----------
     system : openmm.System
         The Forces that are not part of it are added, each in a free group. Make the Simulation or Context afterwards.
-    rows : sequence of Row or openmm.Force
+    rows : sequence of Row, openmm.Force or Formula
         What to hold. A Force alone is held at the value found at `positions`; `each_term` makes one Force of each
-        term or variable of a larger one.
+        term or variable of a larger one; a `kcons.constraints.Formula` is one of each of its rows.
     positions : array_like or Quantity, shape (n_particles, 3), optional
         In nm if without unit. Needed where a target is to be found.
     box : sequence of three vectors, optional
@@ -98,7 +100,7 @@ class CollectiveRows(GroupRows):
     def __init__(
         self,
         system: openmm.System,
-        rows: Sequence[Row | openmm.Force | int],
+        rows: Sequence[Row | openmm.Force | int | Formula],
         *,
         positions: object | None = None,
         box: Sequence | None = None,
@@ -106,7 +108,7 @@ class CollectiveRows(GroupRows):
         max_iterations: int = 20,
         meets_system: bool | None = None,
     ) -> None:
-        given = [row if isinstance(row, Row) else Row(row) for row in rows]
+        given = as_rows(rows)
         if not given:
             raise InputError("no rows to hold", item="rows")
         self.asked_tolerance = tolerance

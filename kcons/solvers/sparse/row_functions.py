@@ -63,6 +63,11 @@ def call_row(typingctx, numbers, function, r, p, time, out):
 # -- families -----------------------------------------------------------------------------------------------
 
 
+def _plane(r, p, t, out):
+    """p . r."""
+    out[0], out[1], out[2], out[3] = p[0] * r[0] + p[1] * r[1] + p[2] * r[2], p[0], p[1], p[2]
+
+
 def _sphere(r, p, t, out):
     """Distance from the point p."""
     x, y, z = r[0] - p[0], r[1] - p[1], r[2] - p[2]
@@ -145,6 +150,7 @@ def _radius_of_gyration(r, p, t, out):
 
 
 FAMILIES: dict[str, Callable[..., None]] = {
+    "Plane": _plane,
     "Sphere": _sphere,
     "Cylinder": _cylinder,
     "Ellipsoid": _ellipsoid,

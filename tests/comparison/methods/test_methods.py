@@ -146,26 +146,6 @@ def test_registered_stepper_is_compared(monkeypatch, pendulum, tmp_path):
     report.figure(result).savefig(tmp_path / "x.png")
 
 
-def test_onlookers_do_not_save_a_stepper_its_evaluations(monkeypatch, pendulum):
-    registered(monkeypatch, Euler)
-    result = measure.compare(pendulum, methods=["euler"])
-    for m in result.of("euler"):
-        # The forces at the start are in place; between steps the energy is written down, which must not help.
-        assert m.evaluations_per_time * result.scene["horizon"] == pytest.approx(m.steps - 1)
-
-
-def test_energies_are_read_without_being_counted(pendulum):
-    potential = test_systems.build("butane").potential
-    x = test_systems.build("butane").positions
-    potential.forget()
-    potential.forces(x)
-    assert potential.watched_energy(x) == potential.energy(x)
-    assert potential.watched_energy(x + 0.1 * np.eye(4, 3)) != potential.energy(x)
-    assert potential.evaluations == 1
-    potential.forces(x)
-    assert potential.evaluations == 1
-
-
 def test_what_a_stepper_does_not_support_is_not_run(monkeypatch, pendulum):
     registered(monkeypatch, Unable)
     (only,) = measure.compare(pendulum, methods=["unable"]).measurements

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from kcons.cli import main
 from kcons.comparison.stability import fuzz, put_into, report, run
 from kcons.comparison.study import json_files
 from kcons.errors import InputError
@@ -25,13 +24,6 @@ def test_study_goes_on(tmp_path, monkeypatch):
     assert run(only=["fuzz"], quick=True, kept=kept)["pieces"] == first["pieces"]
     with pytest.raises(InputError, match="there is no part 'fuz'"):
         run(only=["fuz"])
-
-
-def test_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(fuzz, "trial", lambda seed: fuzz.Trial(seed, "tree", "solved"))
-    assert main.main(["stability", "--quick", "--only", "fuzz", "--out", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
-    assert "300 random molecules" in shown and "stability.html" in shown
 
 
 def test_a_system_that_is_added_goes_into_results_and_page(tmp_path):

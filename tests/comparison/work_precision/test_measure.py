@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from kcons.comparison import test_systems
-from kcons.comparison.methods import method as runs
 from kcons.comparison.methods import methods
 from kcons.comparison.work_precision import measure
 from kcons.errors import ConvergenceError, InputError
@@ -294,22 +293,6 @@ def test_kernels_are_looked_for_where_they_are_cached(monkeypatch, tmp_path):
     (tmp_path / "deeper").mkdir()
     (tmp_path / "deeper" / "kernel.nbi").touch()
     assert measure.kernels_cached()
-
-
-def test_stopwatch_counts_nested_calls_once():
-    class Object:
-        def outer(self):
-            self.inner()
-
-        def inner(self):
-            time.sleep(0.01)
-
-    watch, thing = runs.Stopwatch(), Object()
-    watch.watch(thing, ("outer", "inner", "absent"))
-    start = time.perf_counter()
-    thing.outer()
-    elapsed = time.perf_counter() - start
-    assert 0.01 <= watch.seconds <= elapsed
 
 
 def test_watcher_hears_of_everything(chain):

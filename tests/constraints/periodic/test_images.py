@@ -183,36 +183,6 @@ def test_a_molecule_across_the_boundary_held_by_its_centre():
     assert np.abs(out - there - (right - x)).max() < 1e-13
 
 
-def test_a_first_cell_is_refused_where_images_have_to_be_found():
-    rows = ConstraintSet(ROWS["relation"], CHAIN, MASSES)
-    motion = Motion(rows, CHAIN)
-    with pytest.raises(InputError, match="make a new ConstraintSet"):
-        motion.set_cell(np.diag([9.0] * 3))
-    assert rows.lattice is None
-    plain = Motion(ConstraintSet(Distance([[0, 1]]), CHAIN, MASSES), CHAIN)
-    plain.set_cell(np.diag([9.0] * 3))
-    assert plain.lattice is not None
-
-
-def test_a_cell_that_shrinks_onto_loose_atoms_is_refused():
-    rows = ConstraintSet(CenterDistance([0], [5]), CHAIN[:, [0, 1, 2]], MASSES, cell=np.diag([12.0] * 3))
-    motion = Motion(rows, CHAIN)
-    before = motion.lattice
-    with pytest.raises(InputError, match="more than a tenth"):
-        motion.set_cell(np.diag([12.0, 6.9, 12.0]), positions=CHAIN)
-    assert motion.lattice is before
-    for width in (11.0, 10.0, 9.1, 8.3, 7.6):
-        motion.set_cell(np.diag([12.0, width, 12.0]), positions=CHAIN)
-    before = motion.lattice
-    with pytest.raises(ImageError):
-        motion.set_cell(np.diag([12.0, 6.9, 12.0]), positions=CHAIN)
-    assert motion.lattice is before
-    # Without positions it is found out when these come.
-    motion.set_cell(np.diag([12.0, 6.9, 12.0]))
-    with pytest.raises(ImageError):
-        motion.project_positions(CHAIN, CHAIN)
-
-
 def test_rows_between_fixed_atoms_that_begin_to_move():
     """They are fulfilled at set-up, and asked for what the fixed atoms do not do later."""
     x = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
@@ -236,15 +206,6 @@ def test_conversions_are_visible():
     assert str(body) == "atoms 0, 1, 2 on a line: 1 distance and 3 linear rows in place of 3 rows"
     assert f"converted: {body}" in str(motion.report(x))
     assert Motion(ConstraintSet(Distance([[0, 1]]), x, np.ones(4)), x).conversions == ()
-
-
-def test_directions_without_periodicity_do_not_count_as_a_change_of_the_cell():
-    """The vectors that stand for them are any two normals, which jump where the periodic one turns a little."""
-    rng = np.random.default_rng(4)
-    for _ in range(200):
-        cell = rng.normal(size=(3, 3)) + 9 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        rows = ConstraintSet(ROWS["relation"], CHAIN, MASSES, cell=cell, pbc=(True, False, False))
-        rows.with_cell(cell @ (np.eye(3) + 0.02 * rng.uniform(-1, 1, (3, 3))), (True, False, False))
 
 
 def far_body(images):

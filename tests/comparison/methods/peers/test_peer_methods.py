@@ -10,7 +10,6 @@ import pytest
 from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods.peers import PEERS, dae, lammps_shake, mici_leapfrog
-from kcons.comparison.methods.peers.smallness import dense_rows
 from kcons.comparison.work_precision import measure
 
 PACKAGES = {"mici": "mici", "mici-tight": "mici", "dae-radau": "scipy_dae", "dae-ida": "sksundae"}
@@ -56,65 +55,6 @@ def test_order_two(name, scene):
         assert theirs.evaluations_per_time == pytest.approx(mine.evaluations_per_time)
 
 
-@pytest.mark.parametrize("name", ["dae-radau", "dae-ida"])
-@pytest.mark.parametrize("scene", ["rotor", "double-pendulum", "butane", "sphere-pendulum"])
-def test_dae_solvers_follow_their_tolerance(name, scene):
-    built = test_systems.build(scene, 2 if scene == "sphere-pendulum" else None).shortened(2)
-    found = measured(built, name)
-    errors = [m.error for m in found.measurements]
-    assert errors[0] > 10 * errors[1] > 100 * errors[2]
-    assert errors[-1] < 1e-5
-    last = found.measurements[-1]
-    # The stabilised formulation: positions and velocities stay on the constraints.
-    assert last.constraint_residual < 1e-9
-    assert last.velocity_residual < 1e-9
-
-
-@pytest.mark.parametrize("name", ["lammps-shake-1e-10", "lammps-rattle-1e-10"])
-def test_lammps_holds_rigid_water(name):
-    need(name)
-    scene = test_systems.build("water", 8, forces="ase").shortened(2)
-    held = lammps_shake.clusters(scene.bonds, scene.positions, scene.n_atoms)
-    assert held is not None
-    assert len(held.angles) == 8
-    assert held.degrees == pytest.approx([104.52])
-    last = measured(scene.with_time_steps([1.0]), name).measurements[-1]
-    (ours,) = measure.compare(scene.with_time_steps([1.0]), methods=["rattle"]).of("rattle")
-    assert last.error == pytest.approx(ours.error, rel=1e-5)
-    assert last.constraint_residual < 1e-9
-    assert (last.velocity_residual < 1e-9) == (name == "lammps-rattle-1e-10")
-
-
-def test_clusters_of_lammps():
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.2], [2.0, 0, 0]])
-    star = lammps_shake.clusters(np.array([[0, 1], [2, 0], [0, 3]]), x, 5)
-    assert len(star.bonds) == 3
-    np.testing.assert_allclose(star.lengths[star.bond_types], [1.0, 1.0, 1.2])
-    triangle = lammps_shake.clusters(np.array([[0, 1], [1, 2], [0, 2]]), x, 5)
-    assert triangle.angles.tolist() == [[1, 0, 2]]
-    assert triangle.degrees == pytest.approx([90.0])
-    for refused in (
-        [[0, 1], [1, 4], [0, 2]],  # a chain of four
-        [[0, 1], [1, 3], [0, 3]],  # a triangle with three different sides
-        [[0, 1], [0, 2], [0, 3], [0, 4]],  # four partners
-        [[0, 1], [0, 2], [1, 2], [0, 3]],
-    ):
-        assert lammps_shake.clusters(np.array(refused), x * [1.0, 1.0, 1.1], 5) is None
-
-
-def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
-    need("lammps")
-    scene = test_systems.build("dumbbells")
-
-    def broken(x):
-        raise ZeroDivisionError("no forces today")
-
-    monkeypatch.setattr(scene.potential, "_evaluate", broken)
-    scene.potential.forget()
-    with pytest.raises(ZeroDivisionError, match="no forces today"):
-        methods.METHODS["lammps-rattle-1e-8"].start(scene, scene.time_steps[0])
-
-
 @pytest.mark.parametrize("name", ["rattle", "blanes-moan4", "dop853", "mici-tight", "dae-radau", "dae-ida"])
 def test_friction_ends_at_the_optimum(name):
     need(name)
@@ -127,16 +67,6 @@ def test_friction_ends_at_the_optimum(name):
     energy = scene.potential.energy(run.positions)
     # The octahedron: 12 edges of sqrt(2), 3 diagonals of 2.
     assert energy == pytest.approx(12 / np.sqrt(2) + 3 / 2, abs=2e-4 if name == "dop853" else 1e-9)
-
-
-def test_dense_rows_are_those_of_the_set():
-    rng = np.random.default_rng(0)
-    for name in ("triple-pendulum", "rotor", "sphere", "butane"):
-        scene = test_systems.build(name)
-        value, jacobian = dense_rows(scene.constraint_set)
-        x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
-        np.testing.assert_allclose(value(x.ravel()), scene.constraint_set.value(x), rtol=0, atol=1e-15)
-        np.testing.assert_allclose(jacobian(x.ravel()), scene.constraint_set.jacobian(x).toarray(), rtol=0, atol=1e-15)
 
 
 def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):

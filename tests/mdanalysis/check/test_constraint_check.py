@@ -1,6 +1,5 @@
 """Deviations against computations that share nothing with kcons; verdicts, targets, backends, temperature."""
 
-import pickle
 import warnings
 
 import numpy as np
@@ -11,7 +10,6 @@ from water_files import mda
 from kcons.constraints import Angle, CenterOfMass, Dihedral, Distance, LinearRelation
 from kcons.errors import InputError
 from kcons.mdanalysis import ConstraintCheck, load_trajectory
-from kcons.mdanalysis.check import workers
 
 N, SIDE = 40, 12.0
 
@@ -248,102 +246,6 @@ def test_triangles_and_single_rows_say_the_same(water, n):
         np.testing.assert_allclose(together.series["rms Å"], apart.series["rms Å"], rtol=1e-12)
         means = {r.name: r.mean for r in apart.worst}
         assert all(r.mean == pytest.approx(means[r.name], abs=1e-13) for r in together.worst)
-
-
-@pytest.mark.parametrize("backend", ["multiprocessing", "dask"])
-def test_backends_agree(water, backend):
-    if backend == "dask":
-        pytest.importorskip("dask")
-    rows = [Distance(files.pairs(N), files.targets(N)), Angle([[1, 0, 2]])]
-    serial = checked(water["xtc"], rows)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the backends themselves
-        parallel = checked(water["xtc"], rows, run={"backend": backend, "n_workers": 2, "n_parts": 3})
-    assert serial.verdict == parallel.verdict and serial.frames == parallel.frames
-    np.testing.assert_array_equal(serial.series["largest Å"], parallel.series["largest Å"])
-    assert [row.largest for row in serial.worst] == [row.largest for row in parallel.worst]
-    assert serial.times == parallel.times
-
-
-@pytest.mark.parametrize("backend", [None, "threads", "multiprocessing"])
-@pytest.mark.parametrize("targets", ["given", "mean"])
-def test_backends_agree_on_blocks_of_a_file(water, backend, targets):
-    rows = Distance(files.pairs(N), files.targets(N))
-    serial = checked(water["dcd"], rows, targets=targets)
-    parallel = checked(water["dcd"], rows, targets=targets, run={"backend": backend, "n_workers": 2, "n_parts": 3})
-    assert serial.verdict == parallel.verdict and serial.frames == parallel.frames
-    np.testing.assert_allclose(serial.series["largest Å"], parallel.series["largest Å"], rtol=0, atol=1e-14)
-    assert [row.largest for row in serial.worst] == pytest.approx([row.largest for row in parallel.worst], abs=1e-14)
-    assert serial.times == parallel.times
-
-
-def test_threads_are_refused_where_the_reader_keeps_the_lock(water):
-    with pytest.raises(InputError, match="threads need a DCD file") as error:
-        checked(water["xtc"], Distance(files.pairs(N), files.targets(N)), run={"backend": "threads", "n_workers": 2})
-    assert error.value.item == "backend"
-
-
-def test_processes_that_are_not_forked_get_all_of_it(water, monkeypatch):
-    """Where there is nothing to inherit, the analysis goes to the workers as a whole."""
-    monkeypatch.setattr(workers, "_RUNNING", {})
-    check = ConstraintCheck(loaded(water["dcd"]), Distance(files.pairs(N), files.targets(N)))
-    check.run(stop=3)
-    assert workers.short_pickle(check) is None
-    other = pickle.loads(pickle.dumps(check))
-    found = other.run().check
-    assert found.series == checked(water["dcd"], Distance(files.pairs(N), files.targets(N))).series
-
-
-def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
-    """Velocities drawn for rigid water: the mean over many molecules is the temperature, by 6 a molecule."""
-    from kcons.constraints.constraint_set import ConstraintSet
-    from kcons.motion import Motion
-
-    n, frames = 300, 8
-    x = files.water(n, frames, side=40.0, seed=5)
-    masses = np.tile([15.999, 1.008, 1.008], n)
-    rng = np.random.default_rng(6)
-    v = np.zeros_like(x)
-    for k in range(frames):
-        held = ConstraintSet(Distance(files.pairs(n), files.targets(n)), x[k], masses, cell=[40.0] * 3)
-        drawn = rng.normal(size=(3 * n, 3)) * np.sqrt(0.831446 * 300 / masses)[:, None]
-        v[k] = Motion(held, x[k]).project_velocities(x[k], drawn)
-        v[k] -= masses @ v[k] / masses.sum()
-    path = files.write(tmp_path / "t.trr", x, side=40.0, velocities=v)
-    result = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
-    assert result.rank == 3 * n
-    assert result.degrees_of_freedom == 6 * n - 3
-    expected = np.einsum("i,kij->k", masses, v**2) / (0.831446261815324 * (6 * n - 3))
-    np.testing.assert_allclose(result.series["temperature K"], expected, rtol=1e-6)
-    assert result.temperature is not None
-    assert abs(result.temperature["mean"] - 300) < 4 * 300 * np.sqrt(2 / (6 * n * frames))
-    # Tangent velocities leave A v at what rounding makes of directions; radial ones do not.
-    directions = 2 * np.spacing(np.float32(40.0)) / files.OH
-    assert result.units[0].rate_largest is not None and result.units[0].rate_largest < 2 * np.abs(v).max() * directions
-    v[2, 1] += 0.5
-    path = files.write(tmp_path / "r.trr", x, side=40.0, velocities=v)
-    moved = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
-    assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
-
-
-def test_a_moving_centre_of_mass_counts(tmp_path):
-    x = files.water(N, 3)
-    rng = np.random.default_rng(1)
-    v = rng.normal(size=x.shape) + 3.0
-    path = files.write(tmp_path / "m.trr", x, velocities=v)
-    rows = Distance(files.pairs(N), files.targets(N))
-    assert checked(path, rows).degrees_of_freedom == 6 * N
-    assert checked(path, rows, removed=3).degrees_of_freedom == 6 * N - 3
-
-
-def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
-    x = files.water(N, 3)
-    path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
-    result = checked(path, Distance(files.pairs(N), files.targets(N)), masses=False)
-    assert result.rank == 3 * N and result.temperature is None
-    assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
-    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
-        checked(path, CenterOfMass([0, 1, 2]), masses=False)
 
 
 def test_transformed_coordinates_are_taken_as_they_are(water):

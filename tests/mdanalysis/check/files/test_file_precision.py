@@ -1,5 +1,7 @@
 """Rounding is that of each row's own coordinates in each frame: nothing wild excuses anything else."""
 
+import struct
+
 import numpy as np
 import pytest
 import water_files as files
@@ -345,3 +347,38 @@ def test_targets_that_are_means_have_the_mean_rounding_of_their_frames(tmp_path)
     row = rows(result)[FAR]
     assert once[0] > 100 * once[1:].max()
     assert np.isclose(row.allowed, once.mean() + once, rtol=1e-4).any()
+
+
+@pytest.fixture(scope="module")
+def x():
+    return files.water(N, 8)
+
+
+def test_precision_is_read_from_the_file(tmp_path, x):
+    assert precision_of(files.write(tmp_path / "a.xtc", x, precision=4), "XTC").step == pytest.approx(1e-3)
+    assert precision_of(files.write(tmp_path / "b.xtc", x[:, :9]), "XTC").step == 0.0
+    assert precision_of(files.topology(tmp_path / "c.gro", N, x[0]), "GRO").step == pytest.approx(0.01)
+    single = precision_of("none.dcd", "DCD")
+    assert single.half_step([100.0]) == pytest.approx(2.0**-18)
+    assert precision_of("none.trr", "TRR").half_step([100.0]) > single.half_step([100.0])
+    assert precision_of("none.dcd", "DCD", 0.02).half_step([1.0]) == pytest.approx(0.01, rel=1e-4)
+
+
+def test_big_endian_dcd_and_fixed_layout(tmp_path, x):
+    """The end of a DCD file is found by its records, whatever the order of bytes."""
+    from kcons.mdanalysis.check.files.endings import leftover
+
+    path = files.write(tmp_path / "w.dcd", x)
+    data = path.read_bytes()
+    place, turned = 0, b""
+    while place < len(data):
+        (length,) = struct.unpack_from("<i", data, place)
+        turned += struct.pack(">i", length) + data[place + 4 : place + 4 + length] + struct.pack(">i", length)
+        place += length + 8
+    other = tmp_path / "b.dcd"
+    turned = turned[:8] + turned[8:12][::-1] + turned[12:]  # the number of frames
+    other.write_bytes(turned)
+    assert leftover(other, "DCD", 8, 3 * N, None) is leftover(path, "DCD", 8, 3 * N, None) is None
+    other.write_bytes(turned[:-4])
+    rest = leftover(other, "DCD", 7, 3 * N, None)
+    assert rest is not None and rest.frame == 7 and "bytes follow" in rest.reason

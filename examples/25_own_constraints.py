@@ -1,0 +1,118 @@
+"""What a step costs with constraints of one's own, beside the families of kcons.
+
+    python examples/25_own_constraints.py           a few seconds
+    python examples/25_own_constraints.py --full    a minute: longer blocks, 100,000 particles
+
+One particle, a step of RATTLE without forces; then many, the projection of positions and of velocities, for each row.
+Processor time of blocks that are taken in turn in one process; medians, and ratios to the sphere.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+
+import numba
+import numpy as np
+
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Constraint, Custom, Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
+
+AXES = np.array([1.0, 2.0, 3.0])
+TORUS = "sqrt((sqrt(x1**2 + y1**2) - R)**2 + z1**2)"
+
+
+@numba.njit
+def quartic(r):
+    return r[0, 0] ** 4 + r[0, 1] ** 4 + r[0, 2] ** 4
+
+
+@numba.njit
+def quartic_gradient(r):
+    return 4.0 * r**3
+
+
+#: Name -> what holds these atoms, each on a surface of its own through where it is.
+HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
+    "Sphere": lambda atoms: Sphere(atoms, [0, 0, 0]),
+    "Cylinder": lambda atoms: Cylinder(atoms, [0, 0, 0], [0, 0, 1.0]),
+    "Plane": lambda atoms: Plane(atoms, [0, 0, 1.0]),
+    "Ellipsoid": lambda atoms: Ellipsoid(atoms, [0, 0, 0], AXES, target=None),
+    "Torus": lambda atoms: Torus(atoms, [0, 0, 0], [0, 0, 1.0], 0.5),
+    "Formula, a sphere": lambda atoms: Formula("sqrt(x1**2 + y1**2 + z1**2)", atoms, target=None),
+    "Formula, a torus": lambda atoms: Formula(TORUS, atoms, {"R": 0.5}, None),
+    "Formula, a wave": lambda atoms: Formula("z1 - a*sin(k*x1)*cos(y1)", atoms, {"a": 0.1, "k": 2.0}, None),
+    "Custom, Numba": lambda atoms: Custom(atoms[:, None], quartic, quartic_gradient),
+    "Custom, Python": lambda atoms: Custom(atoms[:, None], quartic.py_func, quartic_gradient.py_func),
+    "Custom, no gradient": lambda atoms: Custom(atoms[:, None], quartic.py_func),
+}
+
+
+def start(name: str, n: int) -> tuple[Motion, np.ndarray, np.ndarray]:
+    """A motion of n particles on their surfaces, positions and velocities along them."""
+    rng = np.random.default_rng(0)
+    around = rng.uniform(0, 2 * np.pi, n)
+    x = np.stack([np.cos(around), np.sin(around), rng.uniform(-0.4, 0.4, n)], axis=1) * rng.uniform(0.9, 1.1, (n, 1))
+    motion = Motion(ConstraintSet(HELD[name](np.arange(n)), x, np.ones(n)), x)
+    return motion, x, motion.project_velocities(x, rng.normal(size=(n, 3)))
+
+
+def one_particle(name: str) -> Callable[[int], float]:
+    """Microseconds of a step, over so many steps."""
+    motion, x, v = start(name, 1)
+    system, state = System(motion, lambda x, t: np.zeros_like(x)), State(x, v)
+
+    def block(steps: int) -> float:
+        begin = time.process_time()
+        run(system, state, 0.001, steps)
+        return (time.process_time() - begin) / steps * 1e6
+
+    return block
+
+
+def many_particles(name: str, n: int) -> Callable[[int], float]:
+    """Nanoseconds a row of one projection of the positions and one of the velocities."""
+    motion, x, v = start(name, n)
+
+    def block(turns: int) -> float:
+        spent = 0.0
+        for _ in range(turns):
+            new, speeds = x + 0.003 * v, v.copy()
+            begin = time.process_time()
+            motion.project_positions(new, x, velocities=speeds, dt=0.003, out=new)
+            motion.project_velocities(new, speeds, out=speeds)
+            spent += time.process_time() - begin
+        return spent / turns / n * 1e9
+
+    return block
+
+
+def medians(blocks: dict[str, Callable[[int], float]], size: int, turns: int) -> dict[str, float]:
+    """The median of blocks taken in turn; the first, which may compile, does not count."""
+    found: dict[str, list[float]] = {name: [] for name in blocks}
+    for turn in range(turns + 1):
+        for name, block in blocks.items():
+            took = block(size)
+            if turn:
+                found[name].append(took)
+    return {name: float(np.median(values)) for name, values in found.items()}
+
+
+def show(title: str, unit: str, found: dict[str, float]) -> None:
+    print(f"{title}\n{'':22}{unit:>12}{'Sphere = 1':>14}")
+    for name, value in found.items():
+        print(f"{name:22}{value:12.1f}{value / found['Sphere']:14.2f}")
+    print()
+
+
+def main() -> None:
+    full = "--full" in sys.argv[1:]
+    n, turns = (100_000, 7) if full else (1_000, 3)
+    show("One particle", "µs a step", medians({name: one_particle(name) for name in HELD}, 1000 if full else 50, turns))
+    compiled = [name for name in HELD if name not in ("Custom, Python", "Custom, no gradient")]
+    show(f"{n:,} particles", "ns a row", medians({name: many_particles(name, n) for name in compiled}, 3, turns))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Atoms as molecules with names, residues, bonds and elements, and back."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import molecule
+
+from kcons.ase import constraints_of
+from kcons.ase.topology import atoms_of, bonds_of, mend_elements, snapshot_of
+from kcons.errors import InputError
+
+
+def peptide():
+    """A residue with names, as ASE reads them from a PDB file: mercury for HG, calcium for CA."""
+    atoms = Atoms("NCaCHg", positions=[[0, 0, 0], [1.45, 0, 0], [2.0, 1.4, 0], [1.8, -1.0, 0.3]])
+    atoms.new_array("atomtypes", np.array(["N", "CA", "C", "HG"]))
+    atoms.new_array("residuenames", np.array(["SER"] * 4))
+    atoms.new_array("residuenumbers", np.array([4] * 4))
+    return atoms
+
+
+def test_bonds_are_guessed_where_none_are_given():
+    assert bonds_of(molecule("CH3CH2OH")).shape == (8, 2)
+    atoms = molecule("H2O")
+    atoms.info["bonds"] = [[0, 2]]
+    assert bonds_of(atoms).tolist() == [[0, 2]]
+    assert bonds_of(Atoms("X2", positions=[[0, 0, 0], [1, 0, 0]])).shape == (0, 2)
+
+
+def test_atoms_without_a_place_have_no_bonds():
+    atoms = molecule("CH3OH") + molecule("H2O")
+    atoms.positions[-3:] += 20.0
+    atoms.positions[-1] = np.nan
+    expected = len(bonds_of(molecule("CH3OH"))) + 1
+    assert len(bonds_of(atoms)) == expected and bonds_of(atoms).max() == len(atoms) - 2
+
+
+@pytest.mark.parametrize("pair", [[0, 3], [-1, 0]])
+def test_bonds_that_name_no_atoms_are_refused(pair):
+    atoms = molecule("H2O")
+    atoms.info["bonds"] = [pair]
+    for asked in (bonds_of, snapshot_of, constraints_of):
+        with pytest.raises(InputError, match=r"atoms.info\['bonds'\] names atoms beyond 0 to 2"):
+            asked(atoms)
+
+
+def test_names_say_what_elements_are():
+    atoms = peptide()
+    with pytest.warns(UserWarning, match="2 atoms have elements that their names contradict, such as CA of SER"):
+        topology = snapshot_of(atoms).topology
+    assert topology.elements.tolist() == ["N", "C", "C", "H"]
+    assert topology.masses[1] == pytest.approx(12.011) and topology.masses[3] == pytest.approx(1.008)
+    assert atoms.symbols[1] == "Ca"  # until they are mended
+    assert mend_elements(atoms) == 2 and str(atoms.symbols) == "NC2H"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert mend_elements(atoms) == 0
+    other = peptide()
+    other.set_masses([14.0, 99.0, 12.0, 98.0])
+    with pytest.warns(UserWarning):
+        assert snapshot_of(other).topology.masses.tolist() == [14.0, 99.0, 12.0, 98.0]
+
+
+def test_there_and_back():
+    atoms = peptide()
+    mend_elements(atoms)
+    atoms.new_array("chainids", np.array(["B"] * 4))
+    atoms.info["bonds"] = np.array([[0, 1], [1, 2]])
+    atoms.set_initial_charges([0.1, 0.2, -0.3, 0.0])
+    atoms.set_cell([10.0, 11.0, 12.0])
+    atoms.pbc = [True, False, True]
+    atoms.set_velocities(np.random.default_rng(1).normal(size=(4, 3)))
+    back = atoms_of(snapshot_of(atoms))
+    assert str(back.symbols) == str(atoms.symbols) and back.pbc.tolist() == [True, False, True]
+    for name in ("atomtypes", "residuenames", "residuenumbers", "chainids"):
+        assert back.arrays[name].tolist() == atoms.arrays[name].tolist()
+    for found, given in (
+        (back.positions, atoms.positions),
+        (back.cell.array, atoms.cell.array),
+        (back.get_velocities(), atoms.get_velocities()),
+        (back.get_initial_charges(), atoms.get_initial_charges()),
+        (back.get_masses(), atoms.get_masses()),
+        (back.info["bonds"], atoms.info["bonds"]),
+    ):
+        np.testing.assert_allclose(found, given, rtol=1e-14)
+
+
+def test_sites_without_a_number_have_no_mass():
+    atoms = Atoms("OH2X", positions=[[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0], [0.1, 0.1, 0]])
+    topology = snapshot_of(atoms).topology
+    assert topology.masses[3] == 0.0 and topology.elements[3] == ""
+    atoms.set_masses([16.0, 1.0, 1.0, 2.0])
+    assert snapshot_of(atoms).topology.masses[3] == 2.0

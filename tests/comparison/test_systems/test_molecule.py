@@ -1,0 +1,31 @@
+"""Ethanol: its rows and its forces."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from small_test_systems import small
+
+from kcons.comparison.test_systems import molecule
+from kcons.motion import Motion
+
+
+def test_ethanol_topology():
+    scene = small("ethanol")
+    bonds = scene.angle_bonds
+    assert len(bonds) == 8
+    assert len(scene.angles) == 13
+    symbols = np.array(scene.symbols)
+    assert sorted("".join(sorted(symbols[pair])) for pair in bonds) == ["CC"] + ["CH"] * 5 + ["CO"] + ["HO"]
+    assert scene.motion.rank == 19
+    assert scene.motion.degrees_of_freedom == 8
+    # The same set by distances alone.
+    assert Motion(scene.constraint_set, scene.positions).rank == 19
+    assert len(scene.bonds) == 21
+
+
+@pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
+def test_ethanol_prefers_xtb():
+    assert "xTB" in molecule.build().potential.name

@@ -1,0 +1,73 @@
+"""Temperatures with the right number of degrees of freedom."""
+
+import numpy as np
+import pytest
+import water_files as files
+
+from kcons.constraints import CenterOfMass, Distance
+from kcons.errors import InputError
+from kcons.mdanalysis import ConstraintCheck, load_trajectory
+
+N, SIDE = 40, 12.0
+
+
+def loaded(path, n=N, masses=True):
+    made = files.universe(n, masses)
+    load_trajectory(made, path)
+    return made
+
+
+def checked(path, constraints, n=N, masses=True, run=None, **options):
+    return ConstraintCheck(loaded(path, n, masses), constraints, **options).run(**(run or {})).check
+
+
+def test_temperature_counts_the_right_degrees_of_freedom(tmp_path):
+    """Velocities drawn for rigid water: the mean over many molecules is the temperature, by 6 a molecule."""
+    from kcons.constraints.constraint_set import ConstraintSet
+    from kcons.motion import Motion
+
+    n, frames = 300, 8
+    x = files.water(n, frames, side=40.0, seed=5)
+    masses = np.tile([15.999, 1.008, 1.008], n)
+    rng = np.random.default_rng(6)
+    v = np.zeros_like(x)
+    for k in range(frames):
+        held = ConstraintSet(Distance(files.pairs(n), files.targets(n)), x[k], masses, cell=[40.0] * 3)
+        drawn = rng.normal(size=(3 * n, 3)) * np.sqrt(0.831446 * 300 / masses)[:, None]
+        v[k] = Motion(held, x[k]).project_velocities(x[k], drawn)
+        v[k] -= masses @ v[k] / masses.sum()
+    path = files.write(tmp_path / "t.trr", x, side=40.0, velocities=v)
+    result = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
+    assert result.rank == 3 * n
+    assert result.degrees_of_freedom == 6 * n - 3
+    expected = np.einsum("i,kij->k", masses, v**2) / (0.831446261815324 * (6 * n - 3))
+    np.testing.assert_allclose(result.series["temperature K"], expected, rtol=1e-6)
+    assert result.temperature is not None
+    assert abs(result.temperature["mean"] - 300) < 4 * 300 * np.sqrt(2 / (6 * n * frames))
+    # Tangent velocities leave A v at what rounding makes of directions; radial ones do not.
+    directions = 2 * np.spacing(np.float32(40.0)) / files.OH
+    assert result.units[0].rate_largest is not None and result.units[0].rate_largest < 2 * np.abs(v).max() * directions
+    v[2, 1] += 0.5
+    path = files.write(tmp_path / "r.trr", x, side=40.0, velocities=v)
+    moved = checked(path, Distance(files.pairs(n), files.targets(n)), n=n)
+    assert moved.units[0].rate_largest is not None and moved.units[0].rate_largest > 0.1
+
+
+def test_a_moving_centre_of_mass_counts(tmp_path):
+    x = files.water(N, 3)
+    rng = np.random.default_rng(1)
+    v = rng.normal(size=x.shape) + 3.0
+    path = files.write(tmp_path / "m.trr", x, velocities=v)
+    rows = Distance(files.pairs(N), files.targets(N))
+    assert checked(path, rows).degrees_of_freedom == 6 * N
+    assert checked(path, rows, removed=3).degrees_of_freedom == 6 * N - 3
+
+
+def test_without_masses_there_is_a_rank_but_no_temperature(tmp_path):
+    x = files.water(N, 3)
+    path = files.write(tmp_path / "m.trr", x, velocities=np.ones_like(x))
+    result = checked(path, Distance(files.pairs(N), files.targets(N)), masses=False)
+    assert result.rank == 3 * N and result.temperature is None
+    assert any("no masses" in remark and "give a topology with masses" in remark for remark in result.remarks)
+    with pytest.raises(InputError, match=r"CenterOfMass.*needs masses.*give a topology with masses"):
+        checked(path, CenterOfMass([0, 1, 2]), masses=False)

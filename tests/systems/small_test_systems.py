@@ -1,0 +1,38 @@
+"""Test systems of the comparison at small sizes."""
+
+from importlib.util import find_spec
+
+from kcons.comparison import test_systems
+from kcons.steppers import State, System, run
+
+#: Test systems that are stored reference cases, solved with 45 digits in minimal coordinates or closed form.
+STORED = {
+    "butane": "A07_butane_bonds_angles_fixed",
+    "dumbbells": "A05_two_dumbbells_lj",
+    "rotor": "A06_asymmetric_top4",
+    "tennis-racket": "A06_tennis_racket4",
+    "pendulum": "A03_planar_pendulum_179p9deg",
+    "double-pendulum": "A04_double_pendulum",
+    "triple-pendulum": "A04_triple_pendulum",
+    "bead-ellipse": "A08_bead_vertical_ellipse",
+    "bead-rotating": "A08_bead_rotating_ellipse",
+    "bead-torus": "A08_torus_geodesic",
+}
+
+SMALL = {"water": 8, "chain": 5, "chain-straight": 5, "chain-175": 5, "chain-free": 5, "sphere": 2, "ethanol": 1}
+SMALL.update({"sphere-pendulum": 2, "sphere-pendulum-top": 2, "fekete": 12})
+SMALL.update(dict.fromkeys(STORED, 1), dumbbells=2, slab=1)
+if find_spec("openmm") is not None:
+    SMALL["alanine"] = 1
+
+
+def small(name, **options):
+    if name in ("water", "ethanol"):
+        # Forces that come with ASE: these tests do not need the extras.
+        options = {"forces": {"water": "ase", "ethanol": "emt"}[name], **options}
+    return test_systems.build(name, SMALL[name], **options)
+
+
+def end(scene, dt):
+    system = System(scene.motion, scene.potential.forces)
+    return run(system, State(scene.positions, scene.velocities), dt, round(scene.horizon / dt))
