@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -134,29 +133,34 @@ def compiling(name: str):
 
 
 def test_announced_after_a_second_in_all(monkeypatch, caplog):
-    monkeypatch.setattr(compilation, "PATIENCE", 0.2)
+    monkeypatch.setattr(compilation, "PATIENCE", 0.5)
     announcer = Announcer()
+    counted = 0.0
+
+    def compiled(*kernels, until):
+        begun = time.perf_counter()
+        for kernel in kernels:
+            announcer.on_start(kernel)
+        while not until():
+            time.sleep(0.01)
+        for kernel in reversed(kernels):
+            announcer.on_end(kernel)
+        return time.perf_counter() - begun
+
+    def passed(seconds):
+        end = time.perf_counter() + seconds
+        return lambda: time.perf_counter() > end
+
     kernel, other = compiling("kcons.solvers.chains"), compiling("numpy.linalg")
-    pause = threading.Event()
     with caplog.at_level(logging.WARNING, "kcons"):
-        announcer.on_start(other)  # nobody's business
-        pause.wait(0.3)
-        announcer.on_end(other)
-        announcer.on_start(kernel)
-        announcer.on_end(kernel)
-        assert announcer.seconds < 0.2 and not caplog.messages
-        pause.wait(0.3)  # between kernels no time is counted
-        announcer.on_start(kernel)
-        announcer.on_start(other)  # a part of it
-        pause.wait(0.3)
-        announcer.on_end(other)
-        assert len(caplog.messages) == 1
-        pause.wait(0.1)
-        announcer.on_end(kernel)
-        assert announcer.seconds == pytest.approx(0.4, abs=0.15)
-        announcer.on_start(kernel)
-        pause.wait(0.3)
-        announcer.on_end(kernel)
+        compiled(other, until=passed(0.6))  # nobody's business
+        assert announcer.seconds == 0.0 and not announcer.compiling
+        counted += compiled(kernel, until=lambda: True)
+        time.sleep(0.6)  # between kernels no time is counted
+        assert not caplog.messages
+        counted += compiled(kernel, other, until=lambda: caplog.messages)  # one is a part of the other
+        counted += compiled(kernel, until=passed(0.6))
+    assert announcer.seconds == pytest.approx(counted, abs=0.05)
     assert len(caplog.messages) == 1 and "once on a machine" in caplog.messages[0]
 
 
