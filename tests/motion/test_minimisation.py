@@ -94,7 +94,7 @@ def test_what_stops_it():
     with pytest.raises(ConvergenceError, match="no gradient, or not so exact") as stopped:
         minimise(
             motion,
-            lambda y, t: back if np.allclose(y, x, rtol=0, atol=1e-12) else -back,
+            lambda y, t: back if np.allclose(y, x, rtol=0, atol=1e-12) else -3 * back,
             x,
             tolerance=1e-12,
             longest=0.1,
