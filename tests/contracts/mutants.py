@@ -149,6 +149,31 @@ MUTANTS = [
         "y -= a * cell[0][1] + b * cell[1][1]",
         "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",
     ),
+    # -- solvers: functions --
+    (
+        "solvers/sparse/row_functions.py",
+        "f, g = h / (rho * q), up / q",
+        "f, g = h / rho, up / q",
+        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Torus-open]",
+    ),
+    (
+        "solvers/sparse/row_functions.py",
+        "if np.all(table == table[0]):",
+        "if np.any(table == table[0]):",
+        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Sphere-open]",
+    ),
+    (
+        "solvers/single_rows.py",
+        "put(solution, k, last + 0.5 * (lam - last))",
+        "put(solution, k, lam)",
+        "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
+    ),
+    (
+        "constraints/functions/expressions.py",
+        "second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]",
+        "second = [bend, value.diff(t), along.diff(t) + value.diff(t, 2)]",
+        "tests/constraints/test_constraint_set.py::test_acceleration_target_is_the_second_derivative_along_any_curve",
+    ),
     # -- solvers: numbers several doubles wide --
     (
         "solvers/kernels/eight_wide.py",

@@ -95,7 +95,7 @@ class SparseRows:
         self._links = links.ravel()
         self._made_of = constraint_set, rows, inverse_masses, late
         self._given = GivenRows(constraint_set, self.rows, int(widths.max(initial=0)))
-        links[:, 3] = self._given.starts
+        links[:-1, 3] = self._given.starts
         self._tables = (
             pattern.clusters, self._atoms, atom_start, slot_atoms, self._given.kinds, self._given.numbers, self._links,
             pattern.columns, pattern.targets, triple, sides, masses,

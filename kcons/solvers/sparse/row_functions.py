@@ -243,39 +243,43 @@ class GivenRows:
         Of each row, `RELATIVE_FUNCTION` included.
     numbers : ndarray of float64
         All parameters, as the module says.
-    starts : ndarray of int64, shape (n + 1,)
-        First parameter of each row, and the end.
+    starts : ndarray of int64, shape (n,)
+        First parameter of each row.
     """
 
     def __init__(self, constraint_set: ConstraintSet, rows: IntArray, widest: int) -> None:
         """`rows` of the set in the order of the kernels; `widest` is the most atoms that one of them has."""
-        items = list(zip(constraint_set.constraints, constraint_set.starts, strict=False))
-        kinds, sizes = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
-        tables: list[FloatArray] = []
-        for item, start in items:
-            mine = slice(start, start + item.n_rows)
-            table = item.parameters().reshape(item.n_rows, -1) if item.kind else np.zeros((item.n_rows, 0))
+        kinds, starts = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
+        order = np.full(constraint_set.n_rows, -1)
+        order[rows] = np.arange(len(rows))
+        end = ROOM + 6 * widest + 1
+        tables: list[tuple[Constraint, int, FloatArray]] = []
+        for item, first in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+            mine = slice(first, first + item.n_rows)
+            here = np.flatnonzero(order[mine] >= 0)
+            if not len(here):
+                continue
+            here = here[np.argsort(order[mine][here])]
+            table = item.parameters().reshape(item.n_rows, -1)[here]
             kinds[mine] = item.kind
             if item.kind == FUNCTION:
                 kinds[mine] += item.relative
-                numbered = [np.arange(item.n_rows)[:, None]] if item.functions else []
-                table = np.hstack([np.tile([0.0, item.period or 0.0], (item.n_rows, 1)), table, *numbered])
-            sizes[mine] = table.shape[1]
-            tables.append(table)
-        self.kinds = kinds[rows]
-        self.starts = ROOM + 6 * widest + 1 + np.concatenate([[0], np.cumsum(sizes[rows])])
-        self.numbers = np.zeros(int(self.starts[-1]))
-        place = np.full(constraint_set.n_rows, -1)
-        place[rows] = self.starts[:-1]
+                numbered = [here[:, None]] if item.functions else []
+                table = np.hstack([np.tile([0.0, item.period or 0.0], (len(here), 1)), table, *numbered])
+            if np.all(table == table[0]):
+                table = table[:1]  # rows that are alike read the same numbers
+            count, size = table.shape
+            starts[first + here] = end + (np.arange(len(here)) * size if count > 1 else 0)
+            tables.append((item, end, table))
+            end += table.size
+        self.kinds, self.starts = kinds[rows], starts[rows]
+        self.numbers = np.zeros(end)
         self.functions = []
-        for (item, start), table in zip(items, tables, strict=True):
-            at = place[start : start + item.n_rows]
-            here = at >= 0
-            at = at[here]
-            self.numbers[at[:, None] + np.arange(table.shape[1])] = table[here]
-            if item.kind == FUNCTION and len(at):
+        for item, first, table in tables:
+            self.numbers[first : first + table.size] = table.ravel()
+            if item.kind == FUNCTION:
                 self.functions.append(row_function(item, self.numbers))
-                self.numbers.view(np.int64)[at] = self.functions[-1].address
+                self.numbers.view(np.int64)[first : first + table.size : table.shape[1]] = self.functions[-1].address
 
     @property
     def python(self) -> list[PythonRows]:
