@@ -192,7 +192,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 for i in range(count):
                     rolled()
                     slope += number(numbers, out + 1 + i) * number(pushes, 3 * slot + i)
-                off = miss(FUNCTION, number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
+                off = miss(number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
                 whole, error, previous = number(scale, k), abs(off), number(state, at + PREVIOUS)
                 if not (error < np.inf):
                     return False, np.inf, iteration, k

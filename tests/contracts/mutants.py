@@ -133,12 +133,12 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/row_values.py",
-        "difference -= 2 * np.pi * np.rint(difference / (2 * np.pi))",
-        "difference -= np.pi * np.rint(difference / np.pi)",
-        "tests/solvers/sparse/test_row_values.py::test_dihedrals_miss_by_the_shorter_way",
+        "difference -= period * np.rint(difference / period)",
+        "difference -= 0.5 * period * np.rint(2 * difference / period)",
+        "tests/solvers/sparse/test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",
     ),
     (
-        "solvers/sparse/row_values.py",
+        "solvers/sparse/row_functions.py",
         "hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "hb = -(hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",

@@ -309,10 +309,10 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, floor, values
     error, total, excess = 0.0, 0.0, 0.0
     bad = first
     for k in range(first, last):
-        kind, period = entry(kinds, k), 0.0
-        if kind >= FUNCTION:
+        period = 0.0
+        if entry(kinds, k) >= FUNCTION:
             period = number(parameters, entry(links, 4 * k + 3) + 1)
-        off = miss(kind, number(values, k), number(wanted, k), period)
+        off = miss(number(values, k), number(wanted, k), period)
         put(state, 2 * k + 1, off)
         e = abs(off) / number(scale, k)
         total += e

@@ -63,6 +63,28 @@ def call_row(typingctx, numbers, function, r, p, time, out):
 # -- families -----------------------------------------------------------------------------------------------
 
 
+def _dihedral(r, p, t, out):
+    """Of i, j, k, l from f = i - j, g = j - k, h = l - k. Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996)."""
+    fx, fy, fz = r[0] - r[3], r[1] - r[4], r[2] - r[5]
+    gx, gy, gz = r[3] - r[6], r[4] - r[7], r[5] - r[8]
+    hx, hy, hz = r[9] - r[6], r[10] - r[7], r[11] - r[8]
+    ax, ay, az = fy * gz - fz * gy, fz * gx - fx * gz, fx * gy - fy * gx
+    bx, by, bz = hy * gz - hz * gy, hz * gx - hx * gz, hx * gy - hy * gx
+    size = math.sqrt(gx * gx + gy * gy + gz * gz)
+    a2 = ax * ax + ay * ay + az * az
+    b2 = bx * bx + by * by + bz * bz
+    sx, sy, sz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+    out[0] = math.atan2((sx * gx + sy * gy + sz * gz) / size, ax * bx + ay * by + az * bz)
+    ga, gb = size / a2, size / b2
+    fa = (fx * gx + fy * gy + fz * gz) / (a2 * size)
+    hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)
+    tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
+    out[1], out[2], out[3] = -ga * ax, -ga * ay, -ga * az
+    out[4], out[5], out[6] = tx + ga * ax, ty + ga * ay, tz + ga * az
+    out[7], out[8], out[9] = -tx - gb * bx, -ty - gb * by, -tz - gb * bz
+    out[10], out[11], out[12] = gb * bx, gb * by, gb * bz
+
+
 def _plane(r, p, t, out):
     """p . r."""
     out[0], out[1], out[2], out[3] = p[0] * r[0] + p[1] * r[1] + p[2] * r[2], p[0], p[1], p[2]
@@ -150,6 +172,7 @@ def _radius_of_gyration(r, p, t, out):
 
 
 FAMILIES: dict[str, Callable[..., None]] = {
+    "Dihedral": _dihedral,
     "Plane": _plane,
     "Sphere": _sphere,
     "Cylinder": _cylinder,
