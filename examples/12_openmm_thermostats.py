@@ -1,6 +1,6 @@
 """Constant temperature in OpenMM with kcons: what it costs, and how the time step changes what is sampled.
 
-    python examples/12_openmm_thermostats.py                  short runs, half a minute
+    python examples/12_openmm_thermostats.py                  short runs, ten seconds
     python examples/12_openmm_thermostats.py --full --out F   the committed results; F receives JSON after each run
     python examples/12_openmm_thermostats.py --show F         the tables of an earlier run
 
@@ -124,13 +124,15 @@ def speed(full: bool) -> dict[str, Any]:
     return {"title": f"Rigid water, {system.getNumParticles()} atoms, PME, 2 fs", "rows": rows}
 
 
-def mean_energy(make: Make, fs: float, picoseconds: float, system: openmm.System, positions: Any) -> dict[str, float]:
-    """Mean potential energy in kJ/mol, with the standard error from twenty blocks."""
+def mean_energy(
+    make: Make, fs: float, picoseconds: float, interval: float, system: openmm.System, positions: Any
+) -> dict[str, float]:
+    """Mean potential energy in kJ/mol, with the standard error from twenty blocks; a sample in so many fs."""
     integrator = make(fs * 1e-3)
     integrator.setRandomNumberSeed(1)  # type: ignore[attr-defined]
     context = started(system, positions, integrator)
     context.setVelocitiesToTemperature(TEMPERATURE, 2)
-    every = max(1, round(100 / fs))
+    every = max(1, round(interval / fs))
     samples = round(picoseconds * 1e3 / fs / every)
     integrator.step(round(min(20.0, 0.1 * picoseconds) * 1e3 / fs))
     values = []
@@ -150,7 +152,7 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
     openmm.LocalEnergyMinimizer.minimize(context, 10, 200)
     relax.step(50_000 if full else 200)
     positions = context.getState(positions=True).getPositions(asNumpy=True)
-    length = 1000.0 if full else 2.5
+    length, interval = (1000.0, 100.0) if full else (0.5, 20.0)
     plan: list[tuple[str, Make, float, float]] = [
         ("LangevinMiddleIntegrator", middle, 1.0, 1.0),
         *[("kcons Langevin", langevin, fs, 1.0) for fs in (1.0, 2.0, 3.0, 4.0)],
@@ -163,7 +165,7 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
         "sampling": rows,
     }
     for name, make, fs, share in plan:
-        rows.setdefault(name, []).append(mean_energy(make, fs, share * length, system, positions))
+        rows.setdefault(name, []).append(mean_energy(make, fs, share * length, interval, system, positions))
         keep(result)
     reference = [row for points in rows.values() for row in points if row["fs"] == 1.0]
     weights = np.array([row["error"] ** -2 for row in reference])
@@ -178,7 +180,7 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
 def kinetic(full: bool) -> dict[str, Any]:
     """Twice the kinetic energy of rigid water in kT: mean and variance, beside g and 2 g."""
     system, positions = water(1.0)
-    picoseconds = 100.0 if full else 2.0
+    picoseconds = 100.0 if full else 0.5
     rows = {}
     for dt in (0.001, 0.002):
         integrator = nose_hoover(dt)

@@ -27,6 +27,13 @@ FILES = list(HERE.rglob("*.py"))
 OWN = sorted({"kcons", "tests"} | {path.parent.name if path.stem == "__init__" else path.stem for path in FILES})
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Workers take files one after another, not turns in each: what a module shares is made once."""
+    if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
+        config.option.dist = "worksteal"
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # What other packages warn of in their own modules, a newer Python or NumPy in most cases, is for them to mend.
     for kind in ("DeprecationWarning", "PendingDeprecationWarning", "FutureWarning", "SyntaxWarning"):

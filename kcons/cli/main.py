@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, studies
+from kcons.cli import check, studies, warmup
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError
 
@@ -137,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.set_defaults(run=_plan)
     check.add(commands)
     studies.add(commands)
+    warmup.add(commands)
 
     return parser
 

@@ -91,6 +91,11 @@ class Announcer(event.Listener):  # type: ignore[misc]
         self._begun = 0.0
         self._timer: threading.Timer | None = None
 
+    @property
+    def compiling(self) -> bool:
+        """Whether a kernel is being compiled."""
+        return bool(self._depth)
+
     def on_start(self, event: Any) -> None:
         kernel = event.data["dispatcher"].py_func
         with self._lock:
@@ -136,6 +141,11 @@ class Announcer(event.Listener):  # type: ignore[misc]
                 "kcons compiles the kernels that this system needs, and can keep them nowhere: neither its own folder "
                 "nor your home can be written to. Set NUMBA_CACHE_DIR to a folder of yours, and it happens only once"
             )
+
+
+def clock() -> float:
+    """`time.perf_counter` without the time that compiling has taken: what is timed by it is what later runs take."""
+    return time.perf_counter() - announcer.seconds
 
 
 announcer = Announcer(keep_somewhere())

@@ -8,7 +8,6 @@ from typing import Literal
 
 import numba as nb
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import plain_if_small
@@ -57,8 +56,6 @@ class Shape:
 
 def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows: IntArray) -> IntArray:
     """Cluster number of each row: rows that share a movable atom belong together; -1 for rows without one."""
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
     incidence = constraint_set.incidence
     n_rows, n_atoms = incidence.shape
     free = np.ones(n_atoms)
@@ -66,17 +63,51 @@ def cluster_labels(constraint_set: ConstraintSet, pinned: IntArray, pinned_rows:
     links = incidence.copy()
     links.data = free[links.indices]
     links.eliminate_zeros()
-    graph = sp.block_array([[None, links], [links.T, None]], format="csr") if n_rows else sp.csr_array((0, 0))
     labels = np.full(n_rows, -1, dtype=np.int64)
     if n_rows == 0:
         return labels
-    found = connected_components(graph, directed=False)[1][:n_rows]
+    begins, atoms = links.indptr.astype(np.int64), links.indices.astype(np.int64)
+    found = plain_if_small(_joined, len(atoms))(begins, atoms, n_atoms)
     movable = np.diff(links.indptr) > 0
     movable[pinned_rows] = False
     if movable.any():
         used = np.zeros(int(found.max()) + 1, dtype=bool)
         used[found[movable]] = True
         labels[movable] = (np.cumsum(used) - 1)[found[movable]]
+    return labels
+
+
+@nb.njit(cache=True)
+def _joined(begins, atoms, n_atoms):  # type: ignore[no-untyped-def]
+    """Number of the cluster of each row, by its first row (union-find with path halving)."""
+    n = len(begins) - 1
+    first = np.full(n_atoms, -1, np.int64)
+    parent = np.arange(n)
+    for k in range(n):
+        for p in range(begins[k], begins[k + 1]):
+            a = atoms[p]
+            if first[a] < 0:
+                first[a] = k
+                continue
+            one, two = k, first[a]
+            while parent[one] != one:
+                parent[one] = parent[parent[one]]
+                one = parent[one]
+            while parent[two] != two:
+                parent[two] = parent[parent[two]]
+                two = parent[two]
+            parent[max(one, two)] = min(one, two)
+    labels = np.empty(n, np.int64)
+    count = 0
+    for k in range(n):
+        root = parent[k]
+        while parent[root] != root:
+            root = parent[root]
+        if root == k:
+            labels[k] = count
+            count += 1
+        else:
+            labels[k] = labels[root]
     return labels
 
 

@@ -21,7 +21,7 @@ from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, Projec
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.reversibility_check import ReversibilityCheck
 from kcons.steppers.runge_kutta_nystrom import BlanesMoan4, BlanesMoan6, BlanesMoan6a, RungeKuttaNystrom
-from kcons.steppers.running import Observer, run
+from kcons.steppers.running import Observer, Trajectory, run
 from kcons.steppers.splitting import Splitting
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper
@@ -46,6 +46,7 @@ __all__ = [
     "Stepper",
     "Suzuki4",
     "System",
+    "Trajectory",
     "Yoshida4",
     "run",
 ]

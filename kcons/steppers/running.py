@@ -1,11 +1,14 @@
-"""Steps made one after another, with observers."""
+"""Steps made one after another, with observers, and what is kept of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, overload
+
+import numpy as np
 
 from kcons.constraints.arguments import refuse_units
+from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.rattle import Rattle
@@ -13,6 +16,95 @@ from kcons.steppers.state import State, System
 from kcons.steppers.stepper import Stepper
 
 Observer: TypeAlias = Callable[[State], Any]
+
+
+class Trajectory:
+    """States of a run, from the first on. An observer: it can be given to `run` as well.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n_frames,)
+    positions, velocities : ndarray, shape (n_frames, n_atoms, 3)
+        In the caller's units.
+    last : State
+        Where the run ended, or the last frame of a run that stopped; a run can go on from here.
+
+    Examples
+    --------
+    ``run(system, state, 0.01, 1000, record=10)`` returns one with 101 frames.
+    """
+
+    def __init__(self) -> None:
+        self.frames: list[State] = []
+        self._last: State | None = None
+
+    def __call__(self, state: State) -> None:
+        self.frames.append(state)
+        self._last = state
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, frame: int) -> State:
+        return self.frames[frame]
+
+    def __repr__(self) -> str:
+        if not self.frames:
+            return "Trajectory(no frames)"
+        return f"Trajectory({len(self)} frames, t = {self.frames[0].time:g} to {self.frames[-1].time:g})"
+
+    def end(self, state: State) -> Trajectory:
+        """Note where the run ended, which need not be a frame."""
+        self._last = state
+        return self
+
+    @property
+    def last(self) -> State:
+        if self._last is None:
+            raise IndexError("the trajectory has no frames yet")
+        return self._last
+
+    @property
+    def times(self) -> FloatArray:
+        return np.array([state.time for state in self.frames])
+
+    @property
+    def positions(self) -> FloatArray:
+        return np.array([state.positions for state in self.frames])
+
+    @property
+    def velocities(self) -> FloatArray:
+        return np.array([state.velocities for state in self.frames])
+
+
+@overload
+def run(
+    system: System,
+    state: State,
+    dt: float,
+    steps: int,
+    *,
+    stepper: Stepper | None = ...,
+    observers: Iterable[Observer] = ...,
+    every: int = ...,
+    check_every: int | None = ...,
+    record: None = None,
+) -> State: ...
+
+
+@overload
+def run(
+    system: System,
+    state: State,
+    dt: float,
+    steps: int,
+    *,
+    stepper: Stepper | None = ...,
+    observers: Iterable[Observer] = ...,
+    every: int = ...,
+    check_every: int | None = ...,
+    record: int,
+) -> Trajectory: ...
 
 
 def run(
@@ -25,8 +117,9 @@ def run(
     observers: Iterable[Observer] = (),
     every: int = 1,
     check_every: int | None = None,
-) -> State:
-    """Make `steps` steps of `dt` and return the last state.
+    record: int | None = None,
+) -> State | Trajectory:
+    """Make `steps` steps of `dt` and return the last state, or the trajectory.
 
     Parameters
     ----------
@@ -46,21 +139,25 @@ def run(
         The first state, and one in so many, is certified: sigma and A v evaluated by the constraint set itself, beside
         the solvers. The count goes on from one run of a `System` to the next. 0: never. By default one in 1000, or in
         a multiple of that where certificates would take more than 1 % of the time.
+    record : int, optional
+        Keep the first state and one in so many, and return a `Trajectory`, whose `last` is the last state.
 
     Raises
     ------
     InputError
-        Negative `steps` or `check_every`, or `every` below 1; a `dt` with units.
+        Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
         The stepper may not be used with this system.
     KconsError
         Whatever a step raises; `error.step` is its number. Observers have then seen all states that they were due, the
-        last one less than `every` steps before.
+        last one less than `every` steps before. Whatever is raised, `error.trajectory` has what was recorded.
     """
     if steps < 0 or every < 1:
         raise InputError(f"steps is {steps} and every {every}; give steps >= 0 and every >= 1", item="steps")
+    if record is not None and record < 1:
+        raise InputError(f"record is {record}; give the number of steps from one frame to the next", item="record")
     refuse_units(dt, "dt")
     if stepper is None:
         stepper = Rattle()
@@ -69,23 +166,29 @@ def run(
     if dt == 0 or not getattr(stepper, "holds", True):
         check_every = 0
     schedule = system.schedule
-    watching = tuple(observers)
-    for observer in watching:
+    kept = Trajectory()
+    rhythms = [(observer, every) for observer in observers] + ([(kept, record)] if record is not None else [])
+    for observer, _ in rhythms:
         observer(state.shown())
     march = getattr(stepper, "march", None)
     done = 0
-    while done < steps:
-        # Until somebody looks.
-        n = min(every - done % every, steps - done) if watching else steps - done
-        n = schedule.within(n, check_every)
-        if march is not None:
-            state = march(system, state, dt, n, check_every=0)
-        else:
-            for _ in range(n):
-                state = stepper.step(system, state, dt)
-        done += n
-        schedule.made(n, check_every, state, dt, spare=spare)
-        if done % every == 0:
-            for observer in watching:
-                observer(state.shown())
-    return state
+    try:
+        while done < steps:
+            # Until somebody looks.
+            n = min([steps - done, *(rhythm - done % rhythm for _, rhythm in rhythms)])
+            n = schedule.within(n, check_every)
+            if march is not None:
+                state = march(system, state, dt, n, check_every=0)
+            else:
+                for _ in range(n):
+                    state = stepper.step(system, state, dt)
+            done += n
+            schedule.made(n, check_every, state, dt, spare=spare)
+            for observer, rhythm in rhythms:
+                if done % rhythm == 0:
+                    observer(state.shown())
+    except BaseException as error:  # also one of the forces, or of the keyboard: nothing recorded is lost
+        if record is not None:
+            error.trajectory = kept  # type: ignore[attr-defined]
+        raise
+    return state if record is None else kept.end(state)

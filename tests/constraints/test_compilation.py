@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -100,26 +100,25 @@ def test_little_work_is_left_to_python():
     assert plain_if_small(twice, 1) is twice  # it is there
 
 
-def test_a_small_molecule_compiles_its_numerics_only(tmp_path):
-    """What orders its rows is left to Python; one kernel for positions, one for tangents, each once."""
+def test_a_small_molecule_needs_its_numerics_only():
+    """What orders its rows is left to Python; kernels are made for one kind of arguments."""
     code = """
 import numpy as np
-from numba.core import event
-class Names(event.Listener):
-    def on_start(self, event): names.append(event.data["dispatcher"].py_func)
-    def on_end(self, event): pass
-names = []
-event.register("numba:compile", Names())
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Angle, Distance
 x = np.array([[0, 0, 0], [1.5, 0, 0], [2, 1.4, 0], [3.5, 1.4, 0.5]])
 Motion(ConstraintSet([Distance([[0, 1], [1, 2], [2, 3]]), Angle([[0, 1, 2], [1, 2, 3]])], x, np.ones(4)), x)
-print(*(f"{f.__module__}.{f.__name__}" for f in names if f.__module__.startswith("kcons")))
+import numba, sys
+for module in [module for name, module in sys.modules.items() if name.startswith("kcons.")]:
+    for name, kernel in vars(module).items():
+        if isinstance(kernel, numba.core.registry.CPUDispatcher) and kernel.py_func.__module__ == module.__name__:
+            print(f"{module.__name__}.{name}", len(kernel.signatures))
 """
-    names = ended(started(code, NUMBA_CACHE_DIR=str(tmp_path)))[0].split()
-    assert "kcons.solvers.sparse.mixed_rows._tangents" in names
-    assert not [name for name in names if ".plan." in name or ".elimination." in name]
-    assert len(names) == len(set(names)), "each is compiled for one kind of arguments"
+    counts = dict(line.split() for line in ended(started(code))[0].splitlines())
+    assert counts.pop("kcons.solvers.sparse.mixed_rows._tangents") == "1"
+    assert {counts[f"kcons.solvers.sparse.elimination.{name}"] for name in ("_minimum_degree", "_finish")} == {"0"}
+    assert {counts[f"kcons.plan.independent_blocks.{name}"] for name in ("_is_forest", "_edge_blocks")} == {"0"}
+    assert set(counts.values()) <= {"0", "1"}
 
 
 # -- the announcement -------------------------------------------------------------------------------
@@ -134,29 +133,34 @@ def compiling(name: str):
 
 
 def test_announced_after_a_second_in_all(monkeypatch, caplog):
-    monkeypatch.setattr(compilation, "PATIENCE", 0.2)
+    monkeypatch.setattr(compilation, "PATIENCE", 0.5)
     announcer = Announcer()
+    counted = 0.0
+
+    def compiled(*kernels, until):
+        begun = time.perf_counter()
+        for kernel in kernels:
+            announcer.on_start(kernel)
+        while not until():
+            time.sleep(0.01)
+        for kernel in reversed(kernels):
+            announcer.on_end(kernel)
+        return time.perf_counter() - begun
+
+    def passed(seconds):
+        end = time.perf_counter() + seconds
+        return lambda: time.perf_counter() > end
+
     kernel, other = compiling("kcons.solvers.chains"), compiling("numpy.linalg")
-    pause = threading.Event()
     with caplog.at_level(logging.WARNING, "kcons"):
-        announcer.on_start(other)  # nobody's business
-        pause.wait(0.3)
-        announcer.on_end(other)
-        announcer.on_start(kernel)
-        announcer.on_end(kernel)
-        assert announcer.seconds < 0.2 and not caplog.messages
-        pause.wait(0.3)  # between kernels no time is counted
-        announcer.on_start(kernel)
-        announcer.on_start(other)  # a part of it
-        pause.wait(0.3)
-        announcer.on_end(other)
-        assert len(caplog.messages) == 1
-        pause.wait(0.1)
-        announcer.on_end(kernel)
-        assert announcer.seconds == pytest.approx(0.4, abs=0.15)
-        announcer.on_start(kernel)
-        pause.wait(0.3)
-        announcer.on_end(kernel)
+        compiled(other, until=passed(0.6))  # nobody's business
+        assert announcer.seconds == 0.0 and not announcer.compiling
+        counted += compiled(kernel, until=lambda: True)
+        time.sleep(0.6)  # between kernels no time is counted
+        assert not caplog.messages
+        counted += compiled(kernel, other, until=lambda: caplog.messages)  # one is a part of the other
+        counted += compiled(kernel, until=passed(0.6))
+    assert announcer.seconds == pytest.approx(counted, abs=0.05)
     assert len(caplog.messages) == 1 and "once on a machine" in caplog.messages[0]
 
 
@@ -166,3 +170,16 @@ def test_kernels_here_are_watched():
     kernel.py_func.__module__ = "kcons.here"
     assert kernel(np.float32(1)) == 2
     assert compilation.announcer.seconds > before
+
+
+def test_the_clock_stands_still_while_kernels_are_compiled():
+    kernel = compiling("kcons.solvers.chains")
+    whole, timed = time.perf_counter(), compilation.clock()
+    for pause in (0.3, 0.1):
+        if pause == 0.3:
+            compilation.announcer.on_start(kernel)
+        time.sleep(pause)
+        if pause == 0.3:
+            compilation.announcer.on_end(kernel)
+    whole, timed = time.perf_counter() - whole, compilation.clock() - timed
+    assert 0.1 <= timed < whole - 0.29

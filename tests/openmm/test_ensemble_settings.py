@@ -12,7 +12,16 @@ from openmm_systems import alanine, context_of, dumbbell, loose_alanine, masses_
 
 from kcons.constraints import Distance
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row, hold
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    Row,
+    hold,
+)
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
@@ -104,7 +113,14 @@ def test_moving_targets_are_refused_and_held_by_langevin():
 
 
 @pytest.mark.parametrize(
-    "ensemble", [Isokinetic(300.0, convention="notes"), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0)], ids=repr
+    "ensemble",
+    [
+        Isokinetic(300.0, convention="notes"),
+        Langevin(300.0, 1.0),
+        NoseHoover(300.0, 20.0),
+        NoseHooverMiddle(300.0, 20.0),
+    ],
+    ids=repr,
 )
 def test_copies_files_and_temperatures(ensemble):
     system, x, v = alanine()
@@ -130,7 +146,9 @@ def test_copies_files_and_temperatures(ensemble):
 
 def test_checkpoints_continue_bit_for_bit():
     system, x, v = alanine()
-    for ensemble in (Isokinetic(300.0), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0)):
+    for ensemble in (
+        Isokinetic(300.0), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0), NoseHooverMiddle(300.0, 20.0),
+    ):  # fmt: skip
         integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
         integrator.setRandomNumberSeed(3)
         context = run(system, integrator, x, v, 10)

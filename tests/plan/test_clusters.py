@@ -6,10 +6,12 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from kcons import constraints as held
 from kcons.constraints.constraint_set import ConstraintSet
-from kcons.plan import make_plan
+from kcons.plan import clusters, make_plan
 from kcons.plan.clusters import LANES_CLUSTERS, LANES_ROWS, Shape, classify, cluster_labels
 
 NONE = np.zeros(0, np.int64)
@@ -200,3 +202,15 @@ def test_every_row_goes_to_exactly_one_shape(seed: int) -> None:
     taken = np.concatenate([s.rows.ravel() for s in classify(constraint_set, plan.labels, plan.inverse_masses)])
     np.testing.assert_array_equal(np.sort(taken), np.flatnonzero(plan.labels >= 0))
     assert sum(k.clusters for k in plan.kinds) == plan.labels.max() + 1
+
+
+def test_clusters_are_those_of_a_graph_by_python_and_compiled() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        n, n_atoms = int(rng.integers(1, 30)), int(rng.integers(2, 40))
+        rows = [rng.choice(n_atoms, size=int(rng.integers(0, min(4, n_atoms) + 1)), replace=False) for _ in range(n)]
+        begins, atoms = np.cumsum([0, *map(len, rows)]), np.concatenate(rows).astype(np.int64)
+        incidence = sp.csr_array((np.ones(len(atoms)), atoms, begins), shape=(n, n_atoms))
+        expected = connected_components(incidence @ incidence.T, directed=False)[1]
+        for joined in (clusters._joined, clusters._joined.py_func):
+            np.testing.assert_array_equal(joined(begins, atoms, n_atoms), expected)

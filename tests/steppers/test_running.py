@@ -13,10 +13,12 @@ from stepper_systems import (
 from kcons.constraints import Angle, Distance
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import (
+    BlanesMoan4,
     Rattle,
     ReversibilityCheck,
     State,
     System,
+    Trajectory,
     run,
 )
 
@@ -68,3 +70,54 @@ def test_unsupported_forces_are_refused_before_the_first_observer(stepper) -> No
         with pytest.raises(UnsupportedError, match="use Suzuki4 or KahanLi6"):
             attempt()
     assert not seen
+
+
+# -- trajectories -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stepper", [None, BlanesMoan4()], ids=repr)
+def test_frames_are_states_of_the_run(stepper):
+    system, state = rotor()
+    seen: list = []
+    found = run(system, state, 0.01, 10, stepper=stepper, observers=[seen.append], every=2, record=4)
+    assert [frame.step for frame in found.frames] == [0, 4, 8]
+    np.testing.assert_array_equal(found.times, [seen[k].time for k in (0, 2, 4)])
+    np.testing.assert_array_equal(found.positions, [seen[k].positions for k in (0, 2, 4)])
+    np.testing.assert_array_equal(found.velocities, [seen[k].velocities for k in (0, 2, 4)])
+    assert found.positions.shape == (3, *state.positions.shape)
+    alone = run(system, state, 0.01, 10, stepper=stepper)
+    assert found.last.step == 10
+    np.testing.assert_array_equal(found.last.positions, alone.positions)
+    assert found[1] is found.frames[1] and len(found) == 3
+    assert repr(found) == "Trajectory(3 frames, t = 0 to 0.08)"
+
+
+def test_it_is_an_observer_as_well():
+    system, state = rotor()
+    mine = Trajectory()
+    assert repr(mine) == "Trajectory(no frames)"
+    with pytest.raises(IndexError, match="no frames"):
+        _ = mine.last
+    run(system, state, 0.01, 4, observers=[mine], every=2)
+    assert len(mine) == 3 and mine.last.step == 4
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_frames_of_a_run_that_stops_are_kept(error):
+    system, state = rotor()
+
+    def forces(x, t):
+        if t > 0.065:
+            raise error
+        return np.zeros_like(x)
+
+    with pytest.raises(error) as raised:
+        run(System(system.motion, forces), state, 0.01, 10, record=2)
+    assert [frame.step for frame in raised.value.trajectory.frames] == [0, 2, 4, 6]
+
+
+@pytest.mark.parametrize("record", [0, -1])
+def test_bad_rhythm(record):
+    system, state = rotor()
+    with pytest.raises(InputError, match=f"record is {record}; give the number of steps"):
+        run(system, state, 0.01, 10, record=record)

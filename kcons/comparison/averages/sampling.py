@@ -10,7 +10,6 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from kcons.comparison.study.machine import environment
 from kcons.comparison.study.study import Watcher, picked
 from kcons.comparison.test_systems.fluid import Fluid
+from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, Stepper
@@ -282,13 +282,13 @@ def _metropolis(
     """Mean energy, a configuration at equilibrium, and moves of each molecule."""
     moved = (fluid.shift, fluid.turn)
     _, x, _ = fluid.forces.metropolis(fluid.positions, fluid.thermal_energy, _WARM, _EVERY, seed, *moved)
-    begun = perf_counter()
+    begun = clock()
     energies: list[FloatArray] = []
     limit = math.inf if most is None else most * _EVERY
     while len(energies) * _BATCH < limit:
         part, x, _ = fluid.forces.metropolis(x, fluid.thermal_energy, _BATCH, _EVERY, (seed, len(energies)), *moved)
         energies.append(part)
-        used = perf_counter() - begun
+        used = clock() - begun
         watcher.advance(min(used, budget))
         if most is None and used > budget and len(energies) * len(part) >= FEWEST:
             break
@@ -325,12 +325,12 @@ def _measured(
         # The first step compiles, and starts the thermostat.
         state = stepper.step(system, State(start, _velocities(fluid, start, seed)), dt)
         counted.calls = 0
-        begun = perf_counter()
+        begun = clock()
         while most is None or len(log.seconds) < most:
-            then = perf_counter()
+            then = clock()
             for _ in range(log.every):
                 state = stepper.step(system, state, dt)
-            now = perf_counter()
+            now = clock()
             log.add(now - then, counted.calls, fluid, state.positions)
             if not all(map(math.isfinite, (log.squares[-1], log.curvatures[-1], log.energies[-1]))):
                 raise ArithmeticError("energies are not finite")

@@ -7,12 +7,12 @@ it evaluates. `PotentialCalculator` hands it to ASE.
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 
+from kcons.constraints.compilation import clock
 from kcons.constraints.target import FloatArray
 
 Evaluate = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -71,9 +71,9 @@ class Potential:
     def _update(self, x: FloatArray) -> None:
         if self._last is not None and np.array_equal(self._last, x):
             return
-        start = perf_counter()
+        start = clock()
         energy, forces = self._evaluate(x)
-        self.seconds += perf_counter() - start
+        self.seconds += clock() - start
         self.evaluations += 1
         self._last, self._energy, self._forces = np.array(x, dtype=float), float(energy), np.asarray(forces, float)
 

@@ -11,7 +11,6 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.work_precision import timing_rounds
 from kcons.comparison.work_precision.measurement import Comparison, Measurement, Status
 from kcons.comparison.work_precision.timing_rounds import Rounds
+from kcons.constraints.compilation import clock
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
 
@@ -144,9 +144,9 @@ def force_seconds(test_system: TestSystem) -> float:
     while len(found) < FORCE_POINTS and spent < FORCE_SECONDS:
         times = []
         for potential, x in both:
-            begun = perf_counter()
+            begun = clock()
             potential.watched_energy(x)
-            times.append(perf_counter() - begun)
+            times.append(clock() - begun)
         spent += sum(times)
         found.append(times[0] - times[1])
     return max(0.0, float(np.median(found)))
@@ -193,18 +193,18 @@ class Bench:
         if reason is not None:
             return [Measurement(method.name, method.title, 0.0, method.adaptive, "not run", reason)]
         found: list[Measurement] = []
-        budget, begun = self.budget, perf_counter()
+        budget, begun = self.budget, clock()
         given_up: Measurement | None = None
         for setting in method.settings(self.test_system):
             common = _about(self.test_system, method, setting)
-            if found and perf_counter() - begun > budget:
+            if found and clock() - begun > budget:
                 note = f"the budget of {budget:g} s is used up"
                 found.append(Measurement(status="not run", note=note, **common))
                 continue
             last = given_up or (found[-1] if found else None)
             if last is not None and last.step_seconds is not None:
                 # A tighter tolerance takes at least as many steps as a looser one.
-                left = budget - (perf_counter() - begun)
+                left = budget - (clock() - begun)
                 if given_up is not None or last.step_seconds * (common["steps_planned"] or last.steps) > left:
                     given_up = last
                     found.append(Measurement(status="not run", note=_too_slow(last.step_seconds, budget), **common))
@@ -248,7 +248,7 @@ class Bench:
         setting : float
             A time step in internal units, or a tolerance.
         begun : float, optional
-            When the budget began to run, on the clock of `perf_counter`; now by default.
+            When the budget began to run, on the clock of `clock`; now by default.
         watched : bool
             Whether the constraints' part is timed, which costs a little.
         """
@@ -259,7 +259,7 @@ class Bench:
         note = ""
         status: Status = "ok"
         run: Run | None = None
-        now = perf_counter()
+        now = clock()
         deadline = (now if begun is None else begun) + budget
         setup = None
         test_system.potential.forget()
@@ -270,14 +270,14 @@ class Bench:
                 np.errstate(all="ignore"),
             ):
                 run = method.start(test_system, setting)
-                setup = perf_counter() - now
+                setup = clock() - now
                 if not watched:
                     run.constraints.release()
                 note = _run_to_horizon(test_system, run, method.holds, log, budget, deadline, self.watcher)
                 status = "partial" if note else "ok"
         except OverBudgetError:
             status = "partial"
-            note = f"step {log.steps + 1} was not done after {duration(perf_counter() - now)}"
+            note = f"step {log.steps + 1} was not done after {duration(clock() - now)}"
         except UnsupportedError as error:
             return Measurement(status="not run", note=textwrap.shorten(str(error), 300), **dict(common, setting=0.0))
         except Exception as error:  # whatever a peer raises is a result, and is shown
@@ -371,9 +371,9 @@ def _run_to_horizon(
         if not holds:
             run.rewind()
         evaluations, held = evaluations_so_far(), run.constraints.seconds
-        start = perf_counter()
+        start = clock()
         run.advance()
-        now = perf_counter()
+        now = clock()
         log.seconds.append((now - start) / run.steps)
         log.constraints.append((run.constraints.seconds - held) / run.steps)
         log.evaluations += evaluations_so_far() - evaluations

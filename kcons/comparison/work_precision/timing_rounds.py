@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 
 import numpy as np
 
 from kcons.comparison.methods.method import Method, OverBudgetError, Run, first_line, interrupted_after
 from kcons.comparison.test_systems import TestSystem
 from kcons.comparison.work_precision.measurement import Measurement
+from kcons.constraints.compilation import clock
 from kcons.errors import KconsError
 
 #: Steps before the clock starts, of runs short enough.
@@ -166,12 +166,12 @@ def interleaved(
         if not due:
             break
         for task, mine in due:
-            begun = perf_counter()
+            begun = clock()
             try:
                 mine.steps.append(task())
             except Exception as error:  # whatever a peer raises is a result, and is shown
                 mine.failure = f"round {number}: {first_line(error)}"
-            mine.spent += perf_counter() - begun
+            mine.spent += clock() - begun
         told(number)
     return found
 
@@ -205,9 +205,9 @@ def _passes(run: Run, steps: int, pass_seconds: float) -> float:
     while sum(found) < pass_seconds:
         run.rewind()
         run.settle()
-        begun = perf_counter()
+        begun = clock()
         run.march(steps)
-        found.append(perf_counter() - begun)
+        found.append(clock() - begun)
     if not np.isfinite(run.positions).all():
         raise KconsError("positions are not finite")
     return float(np.median(found)) / steps

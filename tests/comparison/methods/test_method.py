@@ -1,16 +1,19 @@
-"""Time that is counted for a method."""
+"""Time that is counted for a method, and its end."""
 
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numba.core import event
 
 from kcons.comparison import test_systems
 from kcons.comparison.methods import method as runs
 from kcons.comparison.methods import methods
 from kcons.comparison.work_precision import measure
+from kcons.constraints.compilation import announcer
 from kcons.steppers import State
 
 
@@ -74,3 +77,36 @@ def test_energies_are_read_without_being_counted(pendulum):
     assert potential.evaluations == 1
     potential.forces(x)
     assert potential.evaluations == 1
+
+
+def kernel():
+    pass
+
+
+kernel.__module__ = "kcons.solvers.chains"
+COMPILING = event.Event("numba:compile", event.EventStatus.START, {"dispatcher": SimpleNamespace(py_func=kernel)})
+
+
+def test_interrupted_when_the_time_is_up():
+    begun = time.perf_counter()
+    with pytest.raises(runs.OverBudgetError, match=r"not done after 0\.1 s"), runs.interrupted_after(0.1):
+        time.sleep(20)
+    assert 0.1 <= time.perf_counter() - begun < 10
+    with runs.interrupted_after(0.1):
+        pass
+    time.sleep(0.2)  # nothing rings any more
+
+
+def test_a_kernel_that_is_being_compiled_is_waited_for():
+    """Interrupted, it would begin again with the next step, and never be done."""
+    done = []
+    with pytest.raises(runs.OverBudgetError), runs.interrupted_after(0.1):
+        announcer.on_start(COMPILING)
+        try:
+            for _ in range(10):
+                time.sleep(0.03)
+            done.append("compiled")
+        finally:
+            announcer.on_end(COMPILING)
+        time.sleep(20)
+    assert done == ["compiled"]

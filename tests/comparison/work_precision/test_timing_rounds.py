@@ -276,7 +276,7 @@ def test_rounds_take_turns():
 
 def test_long_ones_have_the_least_number_of_rounds(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr("kcons.comparison.work_precision.timing_rounds.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("kcons.comparison.work_precision.timing_rounds.clock", lambda: clock[0])
 
     def taking(seconds):
         def task():

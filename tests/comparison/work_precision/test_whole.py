@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
+from matplotlib.figure import Figure
 
 from kcons.cli import main
 from kcons.comparison import test_systems
@@ -58,6 +59,12 @@ def finished(tmp_path_factory):
         patch.setattr(machine, "code_digest", lambda: "digest")
         whole.run(TINY, folder)
     return folder
+
+
+@pytest.fixture
+def empty_pictures(monkeypatch):
+    """Drawing takes longer than measuring: for tests of what is measured when."""
+    monkeypatch.setattr(whole_page.report, "figure", lambda found: Figure(figsize=(1, 1)))
 
 
 def test_files_of_every_part(finished):
@@ -193,6 +200,7 @@ def test_close_calls_are_named(finished):
     assert "In 0 of 1 lines of this table no other" in told(0.9, 0.8, 0.3)
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         whole.run(TINY, tmp_path, watcher=Listener("Spheres"))
@@ -218,6 +226,7 @@ def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
     assert key != whole.key_of(item, False)
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_fresh_measures_again_and_half_a_file_is_no_result(tmp_path, monkeypatch):
     monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (["rattle"], {}))
     (tmp_path / "sphere.json").write_text('{"format": "kcons-rep')

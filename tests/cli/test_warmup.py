@@ -1,0 +1,71 @@
+"""`kcons warmup`: what it compiles is there afterwards."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import kcons
+from kcons.cli import main, warmup
+from kcons.constraints.compilation import announcer
+
+#: A small molecule with angles, as a user's first script has it; says what it compiled.
+MOLECULE = """
+import numpy as np
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Angle, Distance
+from kcons.constraints.compilation import announcer
+x = np.array([[0, 0, 0], [1.5, 0, 0], [2, 1.4, 0], [3.5, 1.4, 0.5], [-0.4, -1, 0.1]])
+rows = [Distance([[0, 1], [1, 2], [2, 3], [0, 4]]), Angle([[0, 1, 2], [1, 2, 3]])]
+motion = Motion(ConstraintSet(rows, x, [12, 12, 16, 1, 1]), x)
+v = motion.project_velocities(x, np.sin(np.arange(15)).reshape(5, 3))
+end = run(System(motion, lambda x, t: -x), State(x, v), 0.01, 5)
+assert motion.report(end.positions, end.velocities)
+print(announcer.seconds)
+"""
+
+
+def process(*arguments, **environment):
+    given = os.environ | {"PYTHONPATH": str(Path(kcons.__file__).parents[1])} | environment
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=given, check=True)
+
+
+def test_what_was_compiled_beforehand_is_there(tmp_path):
+    folder = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    told = process("-m", "kcons", "warmup", "molecules", **folder)
+    assert "molecules: compiled in" in told.stdout
+    assert "This happens once" not in told.stderr  # the command says it itself
+    told = process("-c", MOLECULE, **folder)
+    assert (float(told.stdout), told.stderr) == (0.0, "")
+    assert "molecules: is there" in process("-m", "kcons", "warmup", "molecules", **folder).stdout
+
+
+def test_all_kinds_can_be_had(capsys):
+    """With kernels of other tests, in most cases: nothing is compiled a second time."""
+    said = announcer.announced
+    for _ in range(2):
+        before = announcer.seconds
+        assert main.main(["warmup"]) == 0
+        printed = capsys.readouterr().out
+    assert announcer.seconds == before
+    assert [line.split(":")[0] for line in printed.splitlines()] == list(warmup.KINDS)
+    announcer.announced = said
+
+
+def test_list_and_unknown_kinds(capsys):
+    assert main.main(["warmup", "--list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in warmup.KINDS)
+    assert main.main(["warmup", "glue"]) == 2
+    assert "nothing here is called 'glue'; choose of molecules" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("package", ["MDAnalysis"])
+def test_what_is_not_installed_is_said(package, monkeypatch, capsys):
+    monkeypatch.setattr(warmup, "find_spec", lambda name: None)
+    assert main.main(["warmup", "check"]) == 0
+    assert f"check: {package} is not installed" in capsys.readouterr().out
