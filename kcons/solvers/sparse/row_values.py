@@ -83,32 +83,21 @@ def _function(  # type: ignore[no-untyped-def]
     kind, slot, end, slot_atoms, parameters, offset, base, moves, cell, inverse, periodic, lines, which
 ):
     """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots."""
-    at = ROOM
-    if kind == FUNCTION:
-        for p in range(slot, end):
-            rolled()
-            i = 4 * entry(slot_atoms, p)
-            r = load_quad(base, i) + load_quad(moves, i)
-            put(parameters, at, lane(r, 0))
-            put(parameters, at + 1, lane(r, 1))
-            put(parameters, at + 2, lane(r, 2))
-            at += 3
-    else:
-        x, y, z = 0.0, 0.0, 0.0
-        j = entry(slot_atoms, slot)
-        for p in range(slot + 1, end):
-            rolled()
-            i = entry(slot_atoms, p)
+    at, x, y, z = ROOM, 0.0, 0.0, 0.0
+    j = entry(slot_atoms, slot)
+    for p in range(slot, end):
+        rolled()
+        i = entry(slot_atoms, p)
+        if kind == FUNCTION:
+            r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
+            x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
+        else:
             dx, dy, dz = _difference(i, j, base, moves, cell, inverse, periodic)
             x, y, z = x + dx, y + dy, z + dz
             j = i
-            at += 3
-            put(parameters, at, x)
-            put(parameters, at + 1, y)
-            put(parameters, at + 2, z)
-        put(parameters, ROOM, 0.0)
-        put(parameters, ROOM + 1, 0.0)
-        put(parameters, ROOM + 2, 0.0)
+        put(parameters, at, x)
+        put(parameters, at + 1, y)
+        put(parameters, at + 2, z)
         at += 3
     call_row(parameters, offset, ROOM, offset + 2, number(parameters, which), at)
     value = number(parameters, at)
