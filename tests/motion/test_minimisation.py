@@ -92,7 +92,13 @@ def test_what_stops_it():
     assert np.abs(stopped.value.positions - x).max() > 0.01
     back = np.array([[0, 1.0, 0], [0, 0, 0]])  # where it has gone it is told to go back
     with pytest.raises(ConvergenceError, match="no gradient, or not so exact") as stopped:
-        minimise(motion, lambda y, t: back if np.allclose(y, x, atol=1e-12) else -back, x, tolerance=1e-12, longest=0.1)
+        minimise(
+            motion,
+            lambda y, t: back if np.allclose(y, x, rtol=0, atol=1e-12) else -3 * back,
+            x,
+            tolerance=1e-12,
+            longest=0.1,
+        )
     np.testing.assert_allclose(stopped.value.positions, x, atol=1e-12)
     for wrong in ({"tolerance": 0.0, "longest": 0.1}, {"tolerance": 1e-6, "longest": np.nan}):
         with pytest.raises(InputError, match="give a positive number"):
