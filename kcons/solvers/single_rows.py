@@ -26,9 +26,9 @@ from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWT
 _EPS = float(np.finfo(float).eps)
 #: Rows that take their iterations together.
 BLOCK = 32
-#: What is known of one of them: the error that rounding leaves, the last error, the multiplier that had it, and how
+#: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
 #: often the step from there was halved, -1 once it has arrived.
-WORDS, FLOOR, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
+WORDS, ROUNDING, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
 
 
 class SingleRows:
@@ -166,7 +166,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 reach += math.sqrt(size * far)
             _gather(x, slot, end, atoms, relative, lattice, periodic, base, 3 * (slot - first))
             at = WORDS * (k - begin)
-            put(state, at + FLOOR, max(1e-14 * number(scale, k), 2 * _EPS * reach))
+            put(state, at + ROUNDING, max(1e-14 * number(scale, k), 2 * _EPS * reach))
             put(state, at + PREVIOUS, np.inf)
             put(state, at + LAST, 0.0)
             put(state, at + HALVINGS, 0.0)
@@ -196,8 +196,8 @@ def _positions(  # type: ignore[no-untyped-def]
                 whole, error, previous = number(scale, k), abs(off), number(state, at + PREVIOUS)
                 if not (error < np.inf):
                     return False, np.inf, iteration, k
-                floor = number(state, at + FLOOR)
-                if error <= floor and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
+                rounding = number(state, at + ROUNDING)
+                if error <= rounding and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
                     # A gradient must not have turned by 90 degrees or more within the step.
                     if not (slope > 0.0):
                         return False, np.inf, iteration, k

@@ -177,14 +177,14 @@ MUTANTS = [
     # -- solvers: numbers several doubles wide --
     (
         "solvers/kernels/eight_wide.py",
-        'bits = _reduced(builder, builder.fcmp_ordered("<=", value, limit))',
-        'bits = _reduced(builder, builder.fcmp_unordered("<=", value, limit))',
+        '_EIGHT.all_true(builder, builder.fcmp_ordered("<=", value, limit))',
+        '_EIGHT.all_true(builder, builder.fcmp_unordered("<=", value, limit))',
         "tests/solvers/test_small_clusters.py::test_failure_changes_nothing_and_names_the_cluster[bond-nan]",
     ),
     (
         "solvers/kernels/two_and_four_wide.py",
-        "total = builder.fadd(builder.load(front, align=8), _shuffle(builder, args[2], args[2], [0, 1]), flags=_FLAGS)",
-        "total = builder.fadd(builder.load(front, align=8), _shuffle(builder, args[2], args[2], [0, 0]), flags=_FLAGS)",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 1]), flags=FLAGS)",
+        "total = builder.fadd(builder.load(front, align=8), shuffle(builder, args[2], args[2], [0, 0]), flags=FLAGS)",
         "tests/solvers/sparse/test_distances.py::test_matches_dense_newton[comb]",
     ),
     # -- programs for OpenMM --
