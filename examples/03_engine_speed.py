@@ -1,4 +1,4 @@
-"""How fast is the engine, and how exact? Every shape it has a solver for, against the hosts' own constraints.
+"""How fast is the engine, and how exact? Every shape it has a solver for, against the MD engines' own constraints.
 
     python examples/03_engine_speed.py                  small systems, a minute
     python examples/03_engine_speed.py --full --out F   all sizes and slow peers, twenty minutes; F receives JSON

@@ -37,25 +37,25 @@ TIME_STEP = 1e-3  # ps
 
 def steps_in_turn(test_system: TestSystem, steps: int, turns: int) -> dict[str, dict[str, float]]:
     """Milliseconds of processor time a step, and steps a second relative to VerletIntegrator at its own tolerance."""
-    host = test_system.openmm
-    assert host is not None
-    held = host.copy()
-    part = hold(held, [], test_system.positions * host.length, take="all")
+    md_engine = test_system.openmm
+    assert md_engine is not None
+    held = md_engine.copy()
+    part = hold(held, [], test_system.positions * md_engine.length, take="all")
     tight = openmm.VerletIntegrator(TIME_STEP)
     tight.setConstraintTolerance(1e-12)
     racers = {
-        "VerletIntegrator, 1e-5": (host.system, openmm.VerletIntegrator(TIME_STEP)),
-        "VerletIntegrator, 1e-12": (host.system, tight),
-        "LangevinMiddleIntegrator, 1e-5": (host.system, openmm.LangevinMiddleIntegrator(300, 1, TIME_STEP)),
-        "NoseHooverIntegrator, 1e-5": (host.system, openmm.NoseHooverIntegrator(300, 1, TIME_STEP)),
-        "kcons rattle, 1e-12": (host.system, ProjectedIntegrator(TIME_STEP, tolerance=1e-12)),
+        "VerletIntegrator, 1e-5": (md_engine.system, openmm.VerletIntegrator(TIME_STEP)),
+        "VerletIntegrator, 1e-12": (md_engine.system, tight),
+        "LangevinMiddleIntegrator, 1e-5": (md_engine.system, openmm.LangevinMiddleIntegrator(300, 1, TIME_STEP)),
+        "NoseHooverIntegrator, 1e-5": (md_engine.system, openmm.NoseHooverIntegrator(300, 1, TIME_STEP)),
+        "kcons rattle, 1e-12": (md_engine.system, ProjectedIntegrator(TIME_STEP, tolerance=1e-12)),
         "kcons rattle, own solver": (held, ProjectedIntegrator(TIME_STEP, parts=[part], tolerance=1e-12)),
     }
     contexts = {}
     for name, (system, integrator) in racers.items():
-        contexts[name] = host.context(system, integrator)
-        contexts[name].setPositions(test_system.positions * host.length)
-        contexts[name].setVelocities(test_system.velocities * host.speed)
+        contexts[name] = md_engine.context(system, integrator)
+        contexts[name].setPositions(test_system.positions * md_engine.length)
+        contexts[name].setVelocities(test_system.velocities * md_engine.speed)
         integrator.step(2)
     calls = {name: partial(integrator.step, steps) for name, (_, integrator) in racers.items()}
     return scripts.speeds(scripts.in_turn(calls, turns), steps)

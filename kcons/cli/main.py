@@ -406,4 +406,4 @@ def _when(method: Method) -> str:
     """When a method runs."""
     if not method.usual:
         return " (only when named)"
-    return "" if method.host != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"
+    return "" if method.md_engine != "openmm" or method.guest else " (in OpenMM's test systems, or when named)"

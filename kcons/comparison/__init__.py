@@ -27,7 +27,7 @@ _NAMES = {
     "test_systems.any_file": ("read",),
     "test_systems.fluid": ("Fluid",),
     "test_systems.lennard_jones": ("LennardJones",),
-    "test_systems.openmm_host": ("system_of",),
+    "test_systems.openmm_engine": ("system_of",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
     "study.machine": ("environment",),
     "study.study": ("work_off",),

@@ -29,6 +29,8 @@ logger = logging.getLogger("kcons")
 
 #: Elements of work that Python does in less time than a compiled kernel takes to be loaded from disk.
 SMALL = 3000
+#: Elements in all after which Python has spent a second or so.
+MUCH = 100_000
 #: Seconds of compiling, in all, before it is announced.
 PATIENCE = 1.0
 
@@ -41,10 +43,13 @@ if _config.DISABLE_JIT:
     )
 
 
+_in_python: dict[Any, int] = {}
+
+
 def plain_if_small(kernel: Any, size: int) -> Any:
     """A compiled function, or for little work the Python function that it was made of, unless it is loaded already.
 
-    For work on integers: both return the same.
+    For work on integers: both return the same. Where little comes again and again, it is loaded after all.
 
     Parameters
     ----------
@@ -53,7 +58,10 @@ def plain_if_small(kernel: Any, size: int) -> Any:
     size : int
         About how many elements are looked at; see `SMALL`.
     """
-    return kernel.py_func if size <= SMALL and not kernel.signatures else kernel
+    if size > SMALL or kernel.signatures or _in_python.get(kernel, 0) > MUCH:
+        return kernel
+    _in_python[kernel] = _in_python.get(kernel, 0) + size
+    return kernel.py_func
 
 
 def _nothing() -> None:

@@ -8,8 +8,10 @@
 - `report`: what is held, and how well
 - `condition`: condition numbers of clusters
 - `restoring`: positions that are off, brought onto the constraints
+- `minimisation`: statics
 """
 
+from kcons.motion.minimisation import Minimum, minimise
 from kcons.motion.motion import Motion
 
-__all__ = ["Motion"]
+__all__ = ["Minimum", "Motion", "minimise"]

@@ -18,7 +18,7 @@ from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.collective.row_forces import Row, each_term
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.ensembles.langevin_ensemble import Langevin
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover
+from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
 from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -37,6 +37,7 @@ __all__ = [
     "Isokinetic",
     "Langevin",
     "NoseHoover",
+    "NoseHooverMiddle",
     "Precision",
     "ProjectedIntegrator",
     "RattleIntegrator",

@@ -155,7 +155,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 put(pushes, 3 * p + i, g * number(masses, p))
                 size, far = size + g * g, far + r * r
             reach += math.sqrt(size * far)
-        floor = max(1e-14 * number(scale, k), 2 * _EPS * reach)
+        rounding = max(1e-14 * number(scale, k), 2 * _EPS * reach)
         _gather(x, slot, end, atoms, relative, lattice, periodic, base, 0)
         lam, last, previous, iteration, halvings = 0.0, 0.0, np.inf, 0, 0
         while True:
@@ -171,7 +171,7 @@ def _positions(  # type: ignore[no-untyped-def]
             error = abs(off)
             if not (error < np.inf):
                 return False, np.inf, iteration, k
-            if error <= floor and (error <= NEWTON_TOLERANCE * number(scale, k) or error > 0.1 * previous):
+            if error <= rounding and (error <= NEWTON_TOLERANCE * number(scale, k) or error > 0.1 * previous):
                 break
             if iteration == MAX_ITERATIONS:
                 return False, error / number(scale, k), iteration, k

@@ -76,7 +76,7 @@ class Damp(Timed):
 class Exchange(Timed):
     """Friction and noise of Langevin dynamics at fixed positions, along the constraints."""
 
-    verb, meaning = "exchange", "let friction and noise act on velocities along the constraints"
+    verb, meaning = "exchange", "let the heat bath act on velocities along the constraints"
 
 
 class Chain(Timed):

@@ -72,7 +72,7 @@ def test_plan_of_a_fluid(capsys):
     assert "27 rigid TIP3P waters" in text and "rank 81" in text
 
 
-def test_default_folder_is_named_after_the_scene(tmp_path, monkeypatch, capsys):
+def test_default_folder_is_named_after_the_system(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("compare", "sphere", "--quick", "--methods", "rattle") == 0
     assert (tmp_path / "compare-sphere" / "compare.json").exists()
@@ -168,7 +168,7 @@ def test_interrupt(monkeypatch, capsys):
     assert capsys.readouterr().err == "kcons: interrupted\n"
 
 
-def test_importing_the_command_imports_no_host():
+def test_importing_the_command_imports_no_md_engine():
     code = (
         "import sys, kcons.cli.main; "
         "print([m for m in ('ase', 'openmm', 'matplotlib', 'rich', 'tblite') if m in sys.modules])"

@@ -26,7 +26,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ContradictionError, ConvergenceError, InputError, KconsError
 from kcons.steppers import Rattle, State, System, run
 
-# -- forces, hosts' habits ----------------------------------------------------------------------------
+# -- forces, habits of MD engines ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [1e6, 1e9, 1e12])

@@ -109,20 +109,8 @@ TESTED_ELSEWHERE = {
     "comparison/methods/peers/mici_leapfrog.py": "comparison/methods/peers/test_peer_methods.py",
     "comparison/methods/peers/shake.py": "comparison/methods/peers/test_peer_methods.py",
     "comparison/work_precision/whole_page.py": "comparison/work_precision/test_whole.py",
-    "comparison/hard_cases/contract.py": "comparison/hard_cases/test_programs.py",
-    "openmm/ensembles/conserved_momenta.py": "openmm/ensembles/test_nose_hoover_ensemble.py",
-    "openmm/integrator/ensemble.py": "openmm/test_ensemble_settings.py",
     "openmm/integrator/interface.py": "openmm/integrator/test_projected.py",
     "openmm/integrator/states/states_on_constraints.py": "openmm/integrator/states/test_minimization.py",
-    "openmm/surfaces/compiled_quadrics.py": "openmm/surfaces/test_surface_step_writer.py",
-    "openmm/surfaces/formulas.py": "openmm/surfaces/test_surface_integrator.py",
-    "openmm/surfaces/quadrics.py": "openmm/surfaces/test_surface_step_writer.py",
-    "openmm/surfaces/surface_rows.py": "openmm/surfaces/test_surface_integrator.py",
-    "openmm/surfaces/tori.py": "openmm/surfaces/test_surface_step_writer.py",
-    "openmm/topology.py": "contracts/test_views_agree.py",
-    "solvers/kernels/eight_wide.py": "solvers/test_rigid_triangles.py",
-    "solvers/kernels/groups_of_eight.py": "solvers/test_small_clusters.py",
-    "solvers/kernels/two_and_four_wide.py": "solvers/sparse/test_distances.py",
 }
 
 
@@ -140,10 +128,8 @@ LINES, FUNCTION, CLASS, PARAMETERS = 500, 100, 300, 11
 KERNELS = ("solvers/", "steppers/stages/fused_stages.py", "thermostats/isokinetic/fused_step.py")
 #: What is larger: name -> size, one a line. Nothing is added and no size raised; what has become small is taken out.
 LARGER = {
-    "models/growth/integration.py: parameters of solve": 12,
     "openmm/carried/carried_constraints.py: lines of CarriedConstraints": 385,
     "openmm/collective/collective_rows.py: lines of CollectiveRows": 383,
-    "openmm/collective/context_rows.py: lines of ContextRows": 339,
     "openmm/ensembles/isokinetic_ensemble.py: lines of Isokinetic": 338,
     "openmm/integrator/guard.py: lines of Guard": 346,
     "openmm/integrator/projected.py: lines of ProjectedIntegrator": 443,

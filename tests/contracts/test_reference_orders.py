@@ -1,6 +1,6 @@
-"""Every stepper on every reference case: its order by slope, and the round-off floor at every stored time.
+"""Every stepper on every reference case: its order by slope, and the bound on round-off at every stored time.
 
-The slope is fitted where the error is 30 times above the floor max(1e-11, 100 cond eps) or more, cond being the
+The slope is fitted where the error is 30 times above the bound max(1e-11, 100 cond eps) or more, cond being the
 sensitivity of the solution to its start. Isokinetic cases are run with the thermostat as a force that depends on
 the velocities, (f.v / v.m v) m v.
 """
@@ -29,7 +29,7 @@ USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesM
 START = {2: 3e-4, 4: 4e-9, 6: 0.0}
 #: From there on, these many times more steps each.
 FINER = (1.0, 1.12, 1.25, 1.4)
-#: So accurate that the leading term shows only below 30 times the floor of all others: for these the floor is what
+#: So accurate that the leading term shows only below 30 times the bound of all others: for these the bound is what
 #: rounding really leaves, which is measured as well.
 FINEST = {
     ("A02_spherical_pendulum_near_planar", "BlanesMoan6a()"): 3e-13,
@@ -40,7 +40,7 @@ FINEST = {
     ("A05_two_dumbbells_lj", "BlanesMoan6a()"): 2e-13,
     ("A08_bead_vertical_ellipse", "BlanesMoan6()"): 3e-13,
 }
-#: The stored times where the leading term shows best: those that are later have higher floors.
+#: The stored times where the leading term shows best: those that are later have higher bounds.
 ORDER_TIMES = {
     ("A03_planar_pendulum_179deg", "BlanesMoan6()"): 2,
     ("A03_planar_pendulum_179deg", "BlanesMoan6a()"): 2,
@@ -92,8 +92,8 @@ LONG = {
     ("A10_isokinetic_lj4", "KahanLi6()"),
 }
 #: Later times are left to the long run.
-SLOW_FLOORS = SLOW | {"A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"}
-#: Steps with which the floor is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
+SLOW_AT_THE_BOUND = SLOW | {"A04_triple_pendulum", "A05_two_dumbbells_lj", "A06_water_free3"}
+#: Steps with which the bound is reached, and the stepper for it; 0.05 and BlanesMoan6 otherwise.
 FLOOR_STEPS = {
     "A02_spherical_pendulum_near_top": 0.025,
     "A02_spherical_pendulum_near_top_Lz": 0.025,
@@ -187,12 +187,12 @@ def disturbed(snapshot: Snapshot, size: float) -> list[tuple[np.ndarray, np.ndar
     return [(x + a, v + b) for a, b in some]
 
 
-def floor(name: str, index: int) -> float:
+def bound_of(name: str, index: int) -> float:
     return max(1e-11, 100 * sensitivities(name)[index] * EPS)
 
 
 def telling_time(name: str, latest: float = 20.0) -> int:
-    """Where errors stand highest above the floor: once the sensitivity sets it, or as late as can be."""
+    """Where errors stand highest above the bound: once the sensitivity sets it, or as late as can be."""
     times = [s.time for s in cases.load(name).solution]
     for k, sensitivity in enumerate(sensitivities(name)):
         if 100 * sensitivity * EPS >= 1e-11:
@@ -217,7 +217,7 @@ def deviations(end: State, reference: Snapshot) -> tuple[float, float]:
 def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tuple[int, float]]]:
     """Observed order at one stored time, and the numbers of steps and errors it was fitted to."""
     reference, rounding = cases.load(name).solution[index], FINEST.get((name, repr(stepper)))
-    lowest = 30 * (rounding or floor(name, index))
+    lowest = 30 * (rounding or bound_of(name, index))
     first = max(START[stepper.order], 8 * lowest)
     n = 1
     while True:
@@ -239,7 +239,7 @@ def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tupl
     points = [(n, e) for n, e in dict(points).items() if e >= lowest]
     assert len(points) >= 3, f"too few points above {lowest:.1e}: {points}"
     if rounding:
-        assert rounding < floor(name, index)
+        assert rounding < bound_of(name, index)
         assert error(name, stepper, reference, 4 * points[-1][0]) <= rounding
     counts, errors = np.array(points).T
     return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0]), points
@@ -248,7 +248,7 @@ def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tupl
 def check_order(name: str, stepper: Stepper, index: int) -> None:
     if (name, repr(stepper)) in EXACT:
         reference = cases.load(name).solution[index]
-        assert error(name, stepper, reference, 3) <= floor(name, index)
+        assert error(name, stepper, reference, 3) <= bound_of(name, index)
         return
     if isinstance(stepper, BlanesMoan4 | BlanesMoan6 | BlanesMoan6a) and depends_on_velocities(cases.load(name)):
         before = start(name)
@@ -303,7 +303,7 @@ def test_order_of_the_others(name: str, stepper: Stepper) -> None:
     check_order(name, stepper, order_time(name, stepper))
 
 
-def check_floor(name: str, latest: float) -> None:
+def check_bound(name: str, latest: float) -> None:
     case, setting, state = cases.load(name), system(name), start(name)
     stepper: Stepper = KahanLi6() if name in SLOW or depends_on_velocities(case) else BlanesMoan6()
     for k, reference in enumerate(case.solution):
@@ -311,17 +311,17 @@ def check_floor(name: str, latest: float) -> None:
             return
         n = int(np.ceil((reference.time - state.time) / FLOOR_STEPS.get(name, 0.05)))
         state = run(setting, state, (reference.time - state.time) / n, n, stepper=stepper)
-        allowed = floor(name, k)
+        allowed = bound_of(name, k)
         for item, off in zip(("positions", "velocities"), deviations(state, reference), strict=True):
             assert off <= allowed, f"{item} at t = {reference.time}: {off:.1e}, allowed {allowed:.1e}"
 
 
 @pytest.mark.parametrize("name", cases.NAMES)
-def test_round_off_floor(name: str) -> None:
-    check_floor(name, 1.0 if name in SLOW_FLOORS or depends_on_velocities(cases.load(name)) else 5.0)
+def test_round_off_bound(name: str) -> None:
+    check_bound(name, 1.0 if name in SLOW_AT_THE_BOUND or depends_on_velocities(cases.load(name)) else 5.0)
 
 
 @pytest.mark.validation
 @pytest.mark.parametrize("name", cases.NAMES)
-def test_round_off_floor_at_every_stored_time(name: str) -> None:
-    check_floor(name, np.inf)
+def test_round_off_bound_at_every_stored_time(name: str) -> None:
+    check_bound(name, np.inf)

@@ -112,9 +112,9 @@ def test_report_at_a_time() -> None:
     assert motion.report(x, v, 0.25).velocity_residual == pytest.approx(0.0, abs=1e-11)
 
 
-@pytest.mark.parametrize("scene", ["water", "chain", "sphere"])
-def test_plan_prints_the_report(scene: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", scene, "--size", "27"]) == 0
+@pytest.mark.parametrize("system", ["water", "chain", "sphere"])
+def test_plan_prints_the_report(system: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", system, "--size", "27"]) == 0
     page = capsys.readouterr().out
     for word in ("clusters", "rank", "degrees of freedom", "condition", "solver"):
         assert word in page

@@ -8,40 +8,26 @@ import openmm
 import pytest
 from ensemble_runs import run, twice_kinetic
 from openmm import unit
-from openmm_systems import alanine, context_of, dumbbell, loose_alanine, masses_of, state_of
+from openmm_systems import alanine, context_of, dumbbell, state_of
 
 from kcons.constraints import Distance
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
-from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row, hold
+from kcons.openmm import (
+    CollectiveRows,
+    Isokinetic,
+    Langevin,
+    NoseHoover,
+    NoseHooverMiddle,
+    ProjectedIntegrator,
+    Row,
+    hold,
+)
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
 pytestmark = pytest.mark.filterwarnings("ignore:the forces exert no torque")
 
 
 # -- isokinetic: g, refusals, settings -----------------------------------------------------------------
-
-
-def test_momenta_that_are_conserved_are_found():
-    system, x, v = dumbbell()
-    ensemble = Isokinetic(300.0)
-    context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
-    assert ensemble.count(integrator) == 5  # the field stands in space
-    field = system.getForce(0)
-    field.setEnergyFunction("k*x^2+c*0")
-    with pytest.warns(UserWarning, match="total momentum is not zero"):
-        context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=ensemble), x, v, 1)
-    assert ensemble.count(integrator) == 3  # along y and z nothing acts
-    free = Isokinetic(300.0, momentum="free")
-    context = run(system, integrator := ProjectedIntegrator(1e-4, ensemble=free), x, v, 1)
-    assert free.count(integrator) == 5
-    del context
-
-
-def test_a_free_cluster_is_warned_of():
-    system, x, v = loose_alanine()
-    masses = masses_of(system)
-    with pytest.warns(UserWarning, match="no torque"):
-        run(system, ProjectedIntegrator(1e-3, ensemble=Isokinetic(300.0)), x, v - masses @ v / masses.sum(), 1)
 
 
 @pytest.mark.filterwarnings("ignore:total momentum")
@@ -104,7 +90,14 @@ def test_moving_targets_are_refused_and_held_by_langevin():
 
 
 @pytest.mark.parametrize(
-    "ensemble", [Isokinetic(300.0, convention="notes"), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0)], ids=repr
+    "ensemble",
+    [
+        Isokinetic(300.0, convention="notes"),
+        Langevin(300.0, 1.0),
+        NoseHoover(300.0, 20.0),
+        NoseHooverMiddle(300.0, 20.0),
+    ],
+    ids=repr,
 )
 def test_copies_files_and_temperatures(ensemble):
     system, x, v = alanine()
@@ -130,7 +123,9 @@ def test_copies_files_and_temperatures(ensemble):
 
 def test_checkpoints_continue_bit_for_bit():
     system, x, v = alanine()
-    for ensemble in (Isokinetic(300.0), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0)):
+    for ensemble in (
+        Isokinetic(300.0), Langevin(300.0, 1.0), NoseHoover(300.0, 20.0), NoseHooverMiddle(300.0, 20.0),
+    ):  # fmt: skip
         integrator = ProjectedIntegrator(1e-3, ensemble=ensemble)
         integrator.setRandomNumberSeed(3)
         context = run(system, integrator, x, v, 10)

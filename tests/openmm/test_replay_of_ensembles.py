@@ -12,7 +12,7 @@ import pytest
 from openmm import unit
 from openmm_systems import GPUS, PLATFORMS, context_of, masses_of, rows_of, started, state_of, total_energy
 
-from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, RattleIntegrator
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, NoseHooverMiddle, ProjectedIntegrator, RattleIntegrator
 
 GAS = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
 T = 300.0
@@ -24,6 +24,7 @@ MADE = {
     "Langevin": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Langevin(T, FRICTION), **given),
     "Isokinetic": lambda dt, **given: ProjectedIntegrator(dt, ensemble=Isokinetic(T, momentum="free"), **given),
     "NoseHoover": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHoover(T, 10.0), **given),
+    "NoseHooverMiddle": lambda dt, **given: ProjectedIntegrator(dt, ensemble=NoseHooverMiddle(T, 10.0), **given),
 }
 AT_CONSTANT_ENERGY = ("RattleIntegrator", "rattle")
 made = pytest.mark.parametrize("name", MADE)

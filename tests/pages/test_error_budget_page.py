@@ -40,9 +40,9 @@ def test_the_figure_can_be_drawn_from_them(tmp_path):
     assert (ROOT / "docs" / "figures" / "error_budget.png").exists()
 
 
-@pytest.mark.parametrize("scene", SYSTEMS)
-def test_the_step_enters_with_the_order(scene):
-    found = RESULTS["scenes"][scene]
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_the_step_enters_with_the_order(system):
+    found = RESULTS["scenes"][system]
     assert slope(found["steps"]["kcons RATTLE"]) == pytest.approx(2.0, abs=0.1)
     best = {title: min(error for _, error in points) for title, points in found["steps"].items()}
     assert best["kcons BlanesMoan6"] < 0.05 * best["kcons RATTLE"]
@@ -57,9 +57,9 @@ def test_the_tolerance_enters_with_its_first_power():
         assert 0.05 * tolerance < distance < 20 * tolerance
 
 
-@pytest.mark.parametrize("scene", SYSTEMS)
-def test_kcons_has_none(scene):
-    ((_, distance, residual),) = RESULTS["scenes"][scene]["tolerances"]["solvers"]["kcons"]
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_kcons_has_none(system):
+    ((_, distance, residual),) = RESULTS["scenes"][system]["tolerances"]["solvers"]["kcons"]
     assert distance < 1e-10 and residual < 1e-13
 
 

@@ -19,7 +19,7 @@ def listed(name):
     return name in CODE or stem in CODE or f"{stem}-1e-4" in CODE or f"{name.rsplit('-', 1)[0]}-SCHEME" in families
 
 
-def test_every_scene_is_listed():
+def test_every_system_is_listed():
     assert {name for name in test_systems.SYSTEMS if name not in CODE} == set()
 
 

@@ -87,13 +87,13 @@ def test_readme_quotes_the_committed_ratios():
 @pytest.mark.parametrize("name", example.SYSTEMS)
 def test_ten_times_fewer_evaluations_here_and_now(name):
     # Where the best stepper is below the goal, RATTLE is still above it with ten times its force evaluations.
-    scene = test_systems.build(name)
-    curve = example.curve(scene, scene.reference(), "blanes-moan6", full=False)
+    system = test_systems.build(name)
+    curve = example.curve(system, system.reference(), "blanes-moan6", full=False)
     best = next(p for p in curve if p["error"] < example.GOAL)
     steps = 10 * int(best["evaluations"])
-    plain = measure.compare(scene.with_time_steps([scene.horizon / steps]), methods=["rattle"], budget=120)
+    plain = measure.compare(system.with_time_steps([system.horizon / steps]), methods=["rattle"], budget=120)
     (measured,) = plain.of("rattle")
-    assert measured.evaluations_per_time * scene.horizon == pytest.approx(steps, rel=1e-3)
+    assert measured.evaluations_per_time * system.horizon == pytest.approx(steps, rel=1e-3)
     assert measured.error > example.GOAL
 
 

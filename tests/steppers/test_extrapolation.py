@@ -62,13 +62,15 @@ def test_eight_orders_and_another_base() -> None:
     ("name", "most"), [("dumbbells", 300.0), ("triple-pendulum", 60.0), ("sphere-pendulum-top", 30.0)]
 )
 def test_errors_are_proportional_to_the_tolerance(name, most) -> None:
-    scene = test_systems.build(name)
-    exact = scene.reference().positions
-    system, times = scene_system(scene)
+    test_system = test_systems.build(name)
+    exact = test_system.reference().positions
+    system, times = scene_system(test_system)
     tolerances, errors, calls = np.array([1e-5, 1e-7, 1e-9, 1e-11]), [], []
     for tolerance in tolerances:
         times.clear()
-        end = end_of(Extrapolation(tolerance), system, State(scene.positions, scene.velocities), scene.horizon)
+        end = end_of(
+            Extrapolation(tolerance), system, State(test_system.positions, test_system.velocities), test_system.horizon
+        )
         errors.append(np.sqrt(np.mean(np.sum((end.positions - exact) ** 2, axis=1))))
         calls.append(len(times))
     assert np.all(errors <= most * tolerances)
@@ -111,16 +113,18 @@ def at_error(error: float, errors, evaluations) -> float:
 def test_fewer_evaluations_than_dop853(name) -> None:
     """As the page says."""
     tolerances = 10.0 ** -np.arange(6, 11)
-    scene = replace(test_systems.build(name), tolerances=tuple(tolerances))
-    theirs = measure.compare(scene, methods=["dop853"], budget=60.0).of("dop853")
-    exact = scene.reference().positions
-    system, times = scene_system(scene)
+    test_system = replace(test_systems.build(name), tolerances=tuple(tolerances))
+    theirs = measure.compare(test_system, methods=["dop853"], budget=60.0).of("dop853")
+    exact = test_system.reference().positions
+    system, times = scene_system(test_system)
     errors, calls = [], []
     for tolerance in [1e-5, *tolerances, 1e-11, 1e-12]:
         times.clear()
-        end = end_of(Extrapolation(tolerance), system, State(scene.positions, scene.velocities), scene.horizon)
+        end = end_of(
+            Extrapolation(tolerance), system, State(test_system.positions, test_system.velocities), test_system.horizon
+        )
         errors.append(np.sqrt(np.mean(np.sum((end.positions - exact) ** 2, axis=1))))
-        calls.append(len(times) / scene.horizon)
+        calls.append(len(times) / test_system.horizon)
     rows = re.findall(rf"^\| {name} \| 10⁻(.) \| (\d+) \| (\d+) \|", PAGE, re.MULTILINE)
     assert len(rows) == 4
     for power, told, told_of_dop853 in rows:
@@ -144,11 +148,15 @@ def test_what_is_held_holds_at_loose_tolerances(make) -> None:
 @pytest.mark.parametrize("tolerance", [1e-13, 1e-14])
 def test_rounding_is_no_reason_for_small_steps(tolerance) -> None:
     for name in ("triple-pendulum", "sphere-pendulum-top"):
-        scene = test_systems.build(name)
-        system, times = scene_system(scene)
-        states = list(Extrapolation(tolerance).states(system, State(scene.positions, scene.velocities), scene.horizon))
+        test_system = test_systems.build(name)
+        system, times = scene_system(test_system)
+        states = list(
+            Extrapolation(tolerance).states(
+                system, State(test_system.positions, test_system.velocities), test_system.horizon
+            )
+        )
         assert len(states) < 60 and len(times) < 2000
-        off = states[-1].positions - scene.reference().positions
+        off = states[-1].positions - test_system.reference().positions
         assert np.abs(off).max() < 3e-11
 
 

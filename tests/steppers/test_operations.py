@@ -61,9 +61,7 @@ def test_operations_are_values() -> None:
 
 
 def test_words() -> None:
-    assert (
-        str(Exchange(1.0)) == "exchange  1             let friction and noise act on velocities along the constraints"
-    )
+    assert str(Exchange(1.0)) == "exchange  1             let the heat bath act on velocities along the constraints"
     assert str(Evaluate()).split(maxsplit=1) == ["evaluate", "forces at the new positions"]
     assert str(Fly(0.5, (0.25, 0.25), (0.25, 0.5))).endswith("along the constraints, in 2 flights")
     assert str(Fly(0.5, (0.5,), (0.5,), True)).endswith("along great circles")

@@ -12,7 +12,7 @@ from kcons.errors import UnsupportedError
 from kcons.steppers import BlanesMoan4, BlanesMoan6, BlanesMoan6a, KahanLi6, Suzuki4, run
 
 SPLITTINGS = pytest.mark.parametrize("stepper", NYSTROM, ids=repr)
-#: Coarse, since these are so accurate that finer steps meet the round-off floor.
+#: Coarse, since these are so accurate that finer steps end in round-off.
 STEPS = {
     "spherical_pendulum": {4: [4, 6, 8], 6: [1, 2, 3]},
     "free_rotor": {4: [8, 12, 16], 6: [4, 5, 6, 8]},

@@ -33,6 +33,6 @@ def small(name, **options):
     return test_systems.build(name, SMALL[name], **options)
 
 
-def end(scene, dt):
-    system = System(scene.motion, scene.potential.forces)
-    return run(system, State(scene.positions, scene.velocities), dt, round(scene.horizon / dt))
+def end(test_system, dt):
+    system = System(test_system.motion, test_system.potential.forces)
+    return run(system, State(test_system.positions, test_system.velocities), dt, round(test_system.horizon / dt))

@@ -43,6 +43,6 @@ def attempts(monkeypatch) -> list[tuple[float, float, bool]]:
     return made
 
 
-def scene_system(scene, far: float = 8.0) -> tuple[System, list[float]]:
-    motion = Motion(scene.constraint_set, scene.positions)
-    return counted(System(motion, scene.potential.forces), far=far)
+def scene_system(system, far: float = 8.0) -> tuple[System, list[float]]:
+    motion = Motion(system.constraint_set, system.positions)
+    return counted(System(motion, system.potential.forces), far=far)

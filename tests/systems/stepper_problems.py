@@ -71,5 +71,5 @@ def observed_order(stepper: Stepper, problem: GlobalError, steps: list[int]) -> 
     """Slope over steps of 1/n, on errors that are far above rounding."""
     dts = 1.0 / np.array(steps)
     errors = [problem(stepper, dt) for dt in dts]
-    assert min(errors) >= 30e-13, f"{errors} reach the round-off floor"
+    assert min(errors) >= 30e-13, f"{errors} end in round-off"
     return slope(dts, errors)

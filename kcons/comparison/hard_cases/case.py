@@ -148,7 +148,7 @@ _NAMES = {
     "peers": ("ASE", "OpenMM"),
     "in_ase": ("kcons in ASE",),
     "in_openmm": ("kcons in OpenMM",),
-    "hosts": SYSTEMS[1:],
+    "md_engines": SYSTEMS[1:],
 }
 
 

@@ -38,7 +38,7 @@ def _excess(log_x: Array, total: float = 1.0) -> float:
     "H33",
     "Hypercycle near equilibrium, to t = 900",
     "g - g_eq by its law, to 1 % of 3e-14",
-    hosts=NONE,
+    md_engines=NONE,
 )
 def near_equilibrium(program: Program, quick: bool) -> Outcome:
     from kcons.models.growth import Hypercycle, solve
@@ -52,7 +52,13 @@ def near_equilibrium(program: Program, quick: bool) -> Outcome:
     return outcome(*checks)
 
 
-@case("H34", "Entropy budget 10 % and 50 % too large, 10 % too small", "refused before the start", "raise", hosts=NONE)
+@case(
+    "H34",
+    "Entropy budget 10 % and 50 % too large, 10 % too small",
+    "refused before the start",
+    "raise",
+    md_engines=NONE,
+)
 def wrong_budget(program: Program, quick: bool) -> Outcome:
     from kcons.models.growth import Hypercycle, solve
 
@@ -67,7 +73,7 @@ def wrong_budget(program: Program, quick: bool) -> Outcome:
     "H35",
     "Near-extinction: ln x down to -2.6e4, and back",
     "ln x as with 20 digits, to 1e-6",
-    hosts=NONE,
+    md_engines=NONE,
 )
 def near_extinction(program: Program, quick: bool) -> Outcome:
     from kcons.models.growth import Hypercycle, solve
@@ -93,7 +99,7 @@ def near_extinction(program: Program, quick: bool) -> Outcome:
     "Start at equilibrium, entropy production asked for",
     "refused: already at equilibrium",
     "raise",
-    hosts=NONE,
+    md_engines=NONE,
 )
 def at_equilibrium(program: Program, quick: bool) -> Outcome:
     from kcons.models.growth import Hypercycle, solve
@@ -103,7 +109,7 @@ def at_equilibrium(program: Program, quick: bool) -> Outcome:
     return outcome(("moved by", np.abs(found.y[:, -1] - x_eq).max(), 1e-12))
 
 
-@case("H37", "Populations that sum to 2", "x at t = 10 as found with 45 digits, to 1e-7", hosts=NONE)
+@case("H37", "Populations that sum to 2", "x at t = 10 as found with 45 digits, to 1e-7", md_engines=NONE)
 def sum_of_two(program: Program, quick: bool) -> Outcome:
     from kcons.models.growth import Hypercycle, solve
 
@@ -115,7 +121,7 @@ def sum_of_two(program: Program, quick: bool) -> Outcome:
     return outcome(("x off by", np.abs(found.y[:, -1] - known).max(), 1e-7))
 
 
-@case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", hosts=NONE)
+@case("H38", "Critical damping, 1 +- 1e-9 of it; Jordan block of 3", "closed forms to 1e-12", md_engines=NONE)
 def defective(program: Program, quick: bool) -> Outcome:
     from kcons.models.flows import LinearFlow
 

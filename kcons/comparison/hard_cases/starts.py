@@ -233,7 +233,7 @@ def nothing_held(program: Program, quick: bool) -> Outcome:
                 1e-14 if isinstance(program, Core) else 1e-12,
             )
         )
-    return outcome(*found, remark="" if isinstance(program, Core) else "hosts round in another order: 1e-12")
+    return outcome(*found, remark="" if isinstance(program, Core) else "MD engines round in another order: 1e-12")
 
 
 def _leapfrog(problem: Problem, dt: float, steps: int) -> Array:

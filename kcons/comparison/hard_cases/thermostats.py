@@ -31,7 +31,7 @@ def _step(program: Program, problem: Problem, kt: float | None = None, momentum:
         from kcons.ase import IsokineticDynamics
 
         kelvin = None if kt is None else kt / units.kB
-        host: Program = KconsInAse(
+        md_engine: Program = KconsInAse(
             thermostat=lambda atoms, dt: IsokineticDynamics(atoms, dt, kelvin, momentum=momentum)
         )
     else:
@@ -40,8 +40,8 @@ def _step(program: Program, problem: Problem, kt: float | None = None, momentum:
         from kcons.openmm import Isokinetic as InOpenMM
 
         given = None if kt is None else kt / unit.MOLAR_GAS_CONSTANT_R._value * 1e3
-        host = KconsInOpenMM(InOpenMM(given, momentum=momentum))
-    return host.run(problem, DT, 1).v
+        md_engine = KconsInOpenMM(InOpenMM(given, momentum=momentum))
+    return md_engine.run(problem, DT, 1).v
 
 
 @case("H22", "Isokinetic with no kinetic energy, and with 2K that underflows", "refused", "raise", peers=NONE)

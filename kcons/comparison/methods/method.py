@@ -197,7 +197,7 @@ class Method(ABC):
         Whether its setting is a tolerance instead of a time step.
     usual : bool
         Whether it runs unless methods are named.
-    host : str
+    md_engine : str
         Whose it is: 'kcons', 'ase', 'scipy', 'openmm' or 'peer'.
     guest : bool
         Whether it also runs, unless methods are named, with test systems of other MD engines. Where it cannot
@@ -220,7 +220,7 @@ class Method(ABC):
     holds: bool = True
     adaptive: bool = False
     usual: bool = True
-    host: str = "kcons"
+    md_engine: str = "kcons"
     guest: bool = False
     follows: bool = True
     remark: str = ""

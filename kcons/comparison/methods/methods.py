@@ -341,13 +341,13 @@ METHODS: Mapping[str, Method] = {
     for method in (
         *of_steppers(STEPPERS),
         Extrapolated("extrapolation", "kcons Extrapolation", adaptive=True, damps=True),
-        AseKcons("ase-kcons", "ASE Verlet + kcons", host="ase"),
-        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", host="ase"),
-        AseInternals("ase-internals", "ASE Verlet + FixInternals", host="ase"),
-        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, host="scipy", damps=True),
+        AseKcons("ase-kcons", "ASE Verlet + kcons", md_engine="ase"),
+        AseBonds("ase-bonds", "ASE Verlet + FixBondLengths", md_engine="ase"),
+        AseInternals("ase-internals", "ASE Verlet + FixInternals", md_engine="ase"),
+        ProjectedOde("dop853", "SciPy DOP853 on eq. 105", adaptive=True, md_engine="scipy", damps=True),
         ProjectedOde("dop853-projected", "kcons + DOP853, projected", adaptive=True, damps=True, project=True),
         CoreVerlet("verlet", "baseline: Verlet, nothing held", holds=False),
-        AseVerlet("ase-verlet", "baseline: ASE Verlet, nothing held", holds=False, host="ase"),
+        AseVerlet("ase-verlet", "baseline: ASE Verlet, nothing held", holds=False, md_engine="ase"),
         *OPENMM_METHODS,
         *PEERS,
     )
@@ -372,7 +372,7 @@ def chosen(names: Iterable[str] | None = None, test_system: TestSystem | None = 
     picked: dict[str, Method] = {}
     for name in wanted:
         if name == "openmm":
-            group = [m for m in METHODS.values() if m.usual and m.host == name]
+            group = [m for m in METHODS.values() if m.usual and m.md_engine == name]
             able = [m for m in group if test_system is None or m.refuses(test_system) is None]
             picked |= {m.name: m for m in able or group}
         elif name in METHODS:
@@ -392,6 +392,6 @@ def usual(test_system: TestSystem | None = None) -> list[Method]:
     """
     found = [method for method in METHODS.values() if method.usual]
     if test_system is not None and test_system.openmm is not None and test_system.openmm.home:
-        return [method for method in found if method.host == "openmm" and method.refuses(test_system) is None]
-    hosts = [m for m in found if m.host != "openmm" or m.guest]
-    return [m for m in hosts if not m.guest or (test_system is not None and m.refuses(test_system) is None)]
+        return [method for method in found if method.md_engine == "openmm" and method.refuses(test_system) is None]
+    md_engines = [m for m in found if m.md_engine != "openmm" or m.guest]
+    return [m for m in md_engines if not m.guest or (test_system is not None and m.refuses(test_system) is None)]

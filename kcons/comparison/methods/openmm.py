@@ -17,7 +17,7 @@ import numpy as np
 from kcons.comparison.methods.engines import InOpenMM
 from kcons.comparison.methods.method import ENGINE_CALLS, Method, Run, exponent, matched_steps
 from kcons.comparison.test_systems import TestSystem
-from kcons.comparison.test_systems.openmm_host import OpenMMHost
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.constraints.target import FloatArray
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ NO_TRAJECTORY = "thermostat: a trajectory of its own, so that no error can be st
 SETTLE = "SETTLE stores its distances in single precision: water is off by up to 6e-8 of them at any tolerance."
 
 
-class _HostRun(InOpenMM):
+class _EngineRun(InOpenMM):
     """A Context that is stepped to the horizon.
 
     Parameters
@@ -72,19 +72,19 @@ class _HostRun(InOpenMM):
         half_step: bool = False,
         records: int | None = RECORDS,
     ) -> None:
-        host = test_system.openmm
-        assert host is not None
-        super().__init__(context, integrator, dt, round(test_system.horizon / dt), host.length, host.speed)
+        md_engine = test_system.openmm
+        assert md_engine is not None
+        super().__init__(context, integrator, dt, round(test_system.horizon / dt), md_engine.length, md_engine.speed)
         self._evaluations, self._half_step = evaluations, half_step
         self._stride = 1 if records is None else max(1, self._planned // records)
         self._groups = integrator.getIntegrationForceGroups()
         self._end: tuple[FloatArray, FloatArray] | None = None
         self._spent = 0.0
-        self._x, self._v = test_system.positions * host.length, test_system.velocities * host.speed
+        self._x, self._v = test_system.positions * md_engine.length, test_system.velocities * md_engine.speed
         context.setPositions(self._x)
         if half_step:
             # Then the first position is the one that RATTLE reaches.
-            self._v = self._v - 0.5 * dt * host.time * self._forces() / test_system.masses[:, None]
+            self._v = self._v - 0.5 * dt * md_engine.time * self._forces() / test_system.masses[:, None]
         context.setVelocities(self._v)
 
     def advance(self) -> None:
@@ -154,7 +154,7 @@ def _block(step_seconds: float, seconds: float) -> int:
     return int(max(min(wanted, LONG_BLOCK / step_seconds), LEAST_STEPS))
 
 
-class _CarriedRun(_HostRun):
+class _CarriedRun(_EngineRun):
     """Rows carried to kcons' engine, which is asked through Python and can be timed."""
 
     divided = True
@@ -166,7 +166,7 @@ class OpenMMMethod(Method):
 
     marches: ClassVar[bool] = True
 
-    host: str = "openmm"
+    md_engine: str = "openmm"
 
     def refuses(self, test_system: TestSystem) -> str | None:
         reason = super().refuses(test_system)
@@ -183,7 +183,7 @@ class OpenMMMethod(Method):
         return None if test_system.bonds is not None else "a System holds distances only"
 
 
-def _host(test_system: TestSystem) -> OpenMMHost:
+def _openmm(test_system: TestSystem) -> OpenMMEngine:
     assert test_system.openmm is not None
     return test_system.openmm
 
@@ -192,8 +192,8 @@ def only_water(test_system: TestSystem) -> bool:
     """Whether OpenMM's System holds nothing but rigid water."""
     from kcons.openmm.carried.hold import take_constraints
 
-    host = _host(test_system)
-    return not host.surfaces and not take_constraints(host.copy())
+    md_engine = _openmm(test_system)
+    return not md_engine.surfaces and not take_constraints(md_engine.copy())
 
 
 # -- OpenMM's own -----------------------------------------------------------------------------------
@@ -247,12 +247,12 @@ class BuiltIn(OpenMMMethod):
     tolerance: float = DEFAULT
 
     def start(self, test_system: TestSystem, setting: float) -> Run:
-        host, integrator = _host(test_system), self.make()
-        integrator.setStepSize(setting * host.time)
+        md_engine, integrator = _openmm(test_system), self.make()
+        integrator.setStepSize(setting * md_engine.time)
         integrator.setConstraintTolerance(self.tolerance)
-        context = host.context(host.system if self.holds else host.copy(constraints=False), integrator)
+        context = md_engine.context(md_engine.system if self.holds else md_engine.copy(constraints=False), integrator)
         records = RECORDS if self.holds else None
-        return _HostRun(test_system, context, integrator, setting, half_step=True, records=records)
+        return _EngineRun(test_system, context, integrator, setting, half_step=True, records=records)
 
     def _lacks(self, test_system: TestSystem) -> str | None:
         if not self.follows and test_system.units.energy != "eV":
@@ -287,14 +287,14 @@ class Projected(OpenMMMethod):
     def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator
 
-        host = _host(test_system)
-        integrator = ProjectedIntegrator(setting * host.time, self.scheme, tolerance=TIGHT)
-        context = host.context(host.system, integrator)
-        return self._run(_HostRun, test_system, context, integrator, setting)
+        md_engine = _openmm(test_system)
+        integrator = ProjectedIntegrator(setting * md_engine.time, self.scheme, tolerance=TIGHT)
+        context = md_engine.context(md_engine.system, integrator)
+        return self._run(_EngineRun, test_system, context, integrator, setting)
 
     def _run(
-        self, kind: type[_HostRun], test_system: TestSystem, context: openmm.Context, integrator: Any, dt: float
-    ) -> _HostRun:
+        self, kind: type[_EngineRun], test_system: TestSystem, context: openmm.Context, integrator: Any, dt: float
+    ) -> _EngineRun:
         return kind(
             test_system, context, integrator, dt, evaluations=self._evaluations, half_step=integrator.scheme is None
         )
@@ -314,11 +314,11 @@ class Compiled(OpenMMMethod):
     def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import RattleIntegrator
 
-        host = _host(test_system)
-        integrator = RattleIntegrator(setting * host.time, tolerance=self.tolerance)
-        context = host.context(host.system, integrator)
+        md_engine = _openmm(test_system)
+        integrator = RattleIntegrator(setting * md_engine.time, tolerance=self.tolerance)
+        context = md_engine.context(md_engine.system, integrator)
         # Each time somebody looks costs a force evaluation: only the end is looked at.
-        return _HostRun(test_system, context, integrator, setting, records=1)
+        return _EngineRun(test_system, context, integrator, setting, records=1)
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,7 @@ class Held(Projected):
     """
 
     def _lacks(self, test_system: TestSystem) -> str | None:
-        return None if _host(test_system).surfaces else super()._lacks(test_system)
+        return None if _openmm(test_system).surfaces else super()._lacks(test_system)
 
     def warm_up(self, test_system: TestSystem) -> None:
         self.start(test_system, min(test_system.time_steps)).advance()
@@ -337,13 +337,13 @@ class Held(Projected):
     def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import ProjectedIntegrator, hold
 
-        host, system = _host(test_system), _host(test_system).copy()
-        rows: Sequence[Any] = host.surfaces
+        md_engine, system = _openmm(test_system), _openmm(test_system).copy()
+        rows: Sequence[Any] = md_engine.surfaces
         part = hold(
-            system, rows, test_system.positions * host.length, take="all", keep_water=not only_water(test_system)
+            system, rows, test_system.positions * md_engine.length, take="all", keep_water=not only_water(test_system)
         )
-        integrator = ProjectedIntegrator(setting * host.time, self.scheme, parts=[part], tolerance=TIGHT)
-        context = host.context(system, integrator)
+        integrator = ProjectedIntegrator(setting * md_engine.time, self.scheme, parts=[part], tolerance=TIGHT)
+        context = md_engine.context(system, integrator)
         run = self._run(_CarriedRun, test_system, context, integrator, setting)
         run.constraints.watch(part.motion, ENGINE_CALLS)
         return run
@@ -354,16 +354,16 @@ class OnSurfaces(Projected):
     """`SurfaceIntegrator`: surfaces computed by OpenMM itself."""
 
     def _lacks(self, test_system: TestSystem) -> str | None:
-        return None if _host(test_system).surfaces else "no particle is held on a surface"
+        return None if _openmm(test_system).surfaces else "no particle is held on a surface"
 
     def start(self, test_system: TestSystem, setting: float) -> Run:
         from kcons.openmm import SurfaceIntegrator
 
-        host, system = _host(test_system), _host(test_system).copy()
+        md_engine, system = _openmm(test_system), _openmm(test_system).copy()
         integrator = SurfaceIntegrator(
-            setting * host.time, self.scheme, surfaces=host.surfaces, system=system, tolerance=TIGHT
+            setting * md_engine.time, self.scheme, surfaces=md_engine.surfaces, system=system, tolerance=TIGHT
         )
-        return self._run(_HostRun, test_system, host.context(system, integrator), integrator, setting)
+        return self._run(_EngineRun, test_system, md_engine.context(system, integrator), integrator, setting)
 
 
 # -- by name ----------------------------------------------------------------------------------------

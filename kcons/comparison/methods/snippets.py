@@ -172,7 +172,11 @@ def _scipy(rtol: float) -> list[str]:
 
 def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str]:
     lines = ["from kcons.comparison import test_systems"]
-    made = ["test_system = MADE_BY", "host = test_system.openmm", "system = host.system  # yours, with its constraints"]
+    made = [
+        "test_system = MADE_BY",
+        "md_engine = test_system.openmm",
+        "system = md_engine.system  # yours, with its constraints",
+    ]
     if isinstance(found, BuiltIn):
         lines = ["import openmm", "", *lines]
         made += [
@@ -181,10 +185,10 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
         ]
     elif isinstance(found, Held):
         lines += ["from kcons.openmm import ProjectedIntegrator, hold"]
-        made[-1] = "system = host.copy()  # yours; its constraints move to kcons"
+        made[-1] = "system = md_engine.copy()  # yours; its constraints move to kcons"
         made += [
-            "x = test_system.positions * host.length",
-            f'part = hold(system, host.surfaces, x, take="all", keep_water={keep_water})',
+            "x = test_system.positions * md_engine.length",
+            f'part = hold(system, md_engine.surfaces, x, take="all", keep_water={keep_water})',
             f'integrator = ProjectedIntegrator({dt}, "{found.scheme}", parts=[part], tolerance={TIGHT:g})',
         ]
     elif isinstance(found, Compiled):
@@ -197,9 +201,9 @@ def _openmm(found: Method, dt: str, steps: int, *, keep_water: bool) -> list[str
         *lines,
         "",
         *made,
-        "context = host.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
-        "context.setPositions(test_system.positions * host.length)",
-        "context.setVelocities(test_system.velocities * host.speed)",
+        "context = md_engine.context(system, integrator)  # or openmm.Context(system, integrator), app.Simulation(...)",
+        "context.setPositions(test_system.positions * md_engine.length)",
+        "context.setVelocities(test_system.velocities * md_engine.speed)",
         f"integrator.step({steps})",
     ]
 

@@ -129,8 +129,8 @@ def protein(constrain: str) -> BareSystem:
 
     test_system = test_systems.build("dhfr", constrain=constrain)
     (item,) = test_system.constraint_set.constraints
-    host = test_system.openmm
-    assert host is not None and test_system.bonds is not None
+    md_engine = test_system.openmm
+    assert md_engine is not None and test_system.bonds is not None
     name = f"DHFR, {CONSTRAIN[constrain]}"
     return BareSystem(
         name,
@@ -138,7 +138,7 @@ def protein(constrain: str) -> BareSystem:
         test_system.masses,
         test_system.bonds,
         np.asarray(item.target_at(0.0)),
-        system=lambda: host.system,
+        system=lambda: md_engine.system,
     )
 
 

@@ -4,7 +4,7 @@
 - `sphere`, `fekete`, `bead`, `pendulums`, `rotor`: particles, beads, pendulums and tops
 - `chain`, `butane`, `molecule`, `slab`: chains and molecules
 - `lennard_jones`, `dumbbells`, `water`, `fluid`: fluids
-- `openmm_host`, `structure`, `any_file`: OpenMM's forces, PDB files, any file
+- `openmm_engine`, `structure`, `any_file`: OpenMM's forces, PDB files, any file
 """
 
 from __future__ import annotations

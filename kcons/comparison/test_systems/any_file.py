@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost, place
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, place
 from kcons.comparison.test_systems.potential import Potential, of_calculator
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
@@ -191,15 +191,15 @@ def from_file(
         )
     snapshot = whole_molecules(replace(snapshot, positions=found.positions))
     x = snapshot.positions
-    host: OpenMMHost | None = None
+    md_engine: OpenMMEngine | None = None
     if named is not None or forces.lower() == "openmm":
-        host = _openmm_host(snapshot, found.rows, named or force_field or FORCE_FIELD, platform)
-        potential = host.potential()
+        md_engine = _openmm_engine(snapshot, found.rows, named or force_field or FORCE_FIELD, platform)
+        potential = md_engine.potential()
     else:
         potential = _of_ase(snapshot, forces)
     masses, cell = snapshot.topology.masses, snapshot.cell
-    if host is not None:
-        system = host.system
+    if md_engine is not None:
+        system = md_engine.system
         masses = np.array([system.getParticleMass(k)._value for k in range(len(x))])
     held = ConstraintSet(list(found.rows), x, masses, cell=cell, pbc=snapshot.pbc.tolist())
     motion = Motion(held, x)
@@ -219,7 +219,7 @@ def from_file(
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=_distances(found.rows),
         cell=cell,
-        openmm=host,
+        openmm=md_engine,
         reference_pace=1.0 if few else 2.0,
     )
 
@@ -249,7 +249,7 @@ def _has_force_field(file: str) -> bool:
     return (Path(found.origin).parent / "app" / "data" / file).is_file()
 
 
-def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMHost:
+def _openmm_engine(snapshot: Any, rows: HeldRows, force_field: Sequence[str], platform: str) -> OpenMMEngine:
     if find_spec("openmm") is None:
         raise UnsupportedError("these forces need OpenMM; python -m pip install openmm, or --forces emt, gfn2, ...")
     from kcons.comparison.test_systems.structure import force_field_of, system_of
@@ -268,7 +268,7 @@ def _openmm_host(snapshot: Any, rows: HeldRows, force_field: Sequence[str], plat
         lengths = (np.asarray(item.target) * ASE_LENGTH).tolist()
         for (i, j), length in zip(item.atoms.tolist(), lengths, strict=True):
             system.addConstraint(i, j, length)
-    return OpenMMHost(lambda: system, platform=platform, home=True)
+    return OpenMMEngine(lambda: system, platform=platform, home=True)
 
 
 def _of_ase(snapshot: Any, name: str) -> Potential:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from ase import units
 
-from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, ASE_TIME, OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, ASE_TIME, OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Evaluate, Potential
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
@@ -74,7 +74,7 @@ def build(size: int = 100, seed: int = 1, *, shape: str = "zigzag") -> TestSyste
         horizon=pace * horizon * units.fs,
         time_steps=tuple(pace * dt * units.fs for dt in steps),
         bonds=pairs,
-        openmm=OpenMMHost(lambda: _system(x, pairs, masses)),
+        openmm=OpenMMEngine(lambda: _system(x, pairs, masses)),
     )
 
 

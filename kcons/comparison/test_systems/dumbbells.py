@@ -13,7 +13,7 @@ from ase import units
 from scipy.spatial import cKDTree
 
 from kcons.comparison.test_systems.minimal import integrated
-from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Evaluate, Potential
 from kcons.comparison.test_systems.system import Reference, TestSystem, Units, thermal_velocities
 from kcons.constraints import Distance
@@ -102,7 +102,7 @@ def _collision() -> TestSystem:
         units=REDUCED,
         bonds=_pairs(2),
         solution=encounter,
-        openmm=OpenMMHost(_collision_system, length=1.0, time=1.0),
+        openmm=OpenMMEngine(_collision_system, length=1.0, time=1.0),
     )
 
 
@@ -191,7 +191,7 @@ def _box(size: int, seed: int) -> TestSystem:
         units=REDUCED,
         bonds=_pairs(size),
         cell=np.full(3, side),
-        openmm=OpenMMHost(lambda: _box_system(masses, side, cutoff), length=1.0, time=1.0),
+        openmm=OpenMMEngine(lambda: _box_system(masses, side, cutoff), length=1.0, time=1.0),
     )
 
 

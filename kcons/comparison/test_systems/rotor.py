@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcons.comparison.test_systems.minimal import integrated, single, spin, turned
-from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential
 from kcons.comparison.test_systems.system import BARE, Reference, TestSystem
 from kcons.constraints import Distance
@@ -82,7 +82,7 @@ def build(size: int = 1, seed: int = 1, *, start: str = "rotor") -> TestSystem:
         units=BARE,
         bonds=PAIRS,
         solution=lambda time: flight(POSITIONS, v, MASSES, time),
-        openmm=OpenMMHost(lambda: system_of(MASSES, pairs=PAIRS, lengths=lengths), length=1.0, time=1.0),
+        openmm=OpenMMEngine(lambda: system_of(MASSES, pairs=PAIRS, lengths=lengths), length=1.0, time=1.0),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.test_systems.potential import Potential, uniform_field
 from kcons.comparison.test_systems.system import REDUCED, Reference, TestSystem
 from kcons.constraints import Sphere
@@ -91,7 +91,7 @@ def build(size: int = 10, seed: int = 1, *, gravity: float = 0.0, near_top: bool
         units=REDUCED,
         refusals={"ase-bonds": NO_SPHERE, "ase-internals": NO_SPHERE},
         solution=pendulums if gravity else great_circles,
-        openmm=OpenMMHost(lambda: _system(masses, gravity), length=1.0, time=1.0, surfaces=[spheres]),
+        openmm=OpenMMEngine(lambda: _system(masses, gravity), length=1.0, time=1.0, surfaces=[spheres]),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ase import units
 
 from kcons.comparison.test_systems.minimal import single
-from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost, place, properties
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine, place, properties
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
 from kcons.constraints.constraint_set import ConstraintSet
@@ -302,8 +302,8 @@ def _test_system(
     held = ConstraintSet(Distance(rows.pairs, rows.lengths / ASE_LENGTH), x / ASE_LENGTH, rows.masses)
     motion = Motion(held, x / ASE_LENGTH)
     on = motion.restore_positions(x / ASE_LENGTH)
-    host = OpenMMHost(lambda: system, platform=platform, home=True)
-    potential = host.potential()
+    md_engine = OpenMMEngine(lambda: system, platform=platform, home=True)
+    potential = md_engine.potential()
     many = len(x) > MANY_ATOMS
     steps = (4.0, 2.0, 1.0) if many else (4.0, 2.0, 1.0, 0.5)
     what = f"{text}, {len(x)} atoms, {CONSTRAIN[constrain]}: {rows.n_rows} distances, {TEMPERATURE:g} K"
@@ -320,7 +320,7 @@ def _test_system(
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=rows.pairs,
         cell=None if box is None else box / ASE_LENGTH,
-        openmm=host,
+        openmm=md_engine,
         reference_pace=1.0 if few else 2.0,
     )
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from ase import Atoms, units
 
-from kcons.comparison.test_systems.openmm_host import OpenMMHost
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, PotentialCalculator
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -98,7 +98,7 @@ class TestSystem:
         The reference at a given time, in closed form or by an independent integrator; without it the test system is
         converged at a step far below those compared.
     cell : ndarray, shape (3,) or (3, 3), or None
-    openmm : OpenMMHost, optional
+    openmm : OpenMMEngine, optional
         How OpenMM runs it: the same masses and forces as a System.
     reference_pace : float
         The finest step compared, times this, decides about the work of a converged reference.
@@ -129,7 +129,7 @@ class TestSystem:
     refusals: Mapping[str, str] = field(default_factory=dict)
     solution: Callable[[float], Reference] | None = None
     cell: FloatArray | None = None
-    openmm: OpenMMHost | None = None
+    openmm: OpenMMEngine | None = None
     reference_pace: float = 1.0
     friction: float = 0.0
     shortfall: Callable[[FloatArray], float] | None = None

@@ -11,7 +11,7 @@ import numpy as np
 from ase import Atoms, units
 from ase.calculators.tip3p import TIP3P
 
-from kcons.comparison.test_systems.openmm_host import ASE_LENGTH, OpenMMHost
+from kcons.comparison.test_systems.openmm_engine import ASE_LENGTH, OpenMMEngine
 from kcons.comparison.test_systems.potential import Potential, of_calculator
 from kcons.comparison.test_systems.system import TestSystem, thermal_velocities
 from kcons.constraints import Distance
@@ -83,7 +83,7 @@ def build(size: int = 64, seed: int = 1, *, forces: str = "") -> TestSystem:
         tolerances=(1e-3, 1e-4, 1e-5),
         bonds=pairs,
         cell=cell,
-        openmm=None if forces == "ase" else OpenMMHost(lambda: _held(box, masses, pairs, lengths), platform="CPU"),
+        openmm=None if forces == "ase" else OpenMMEngine(lambda: _held(box, masses, pairs, lengths), platform="CPU"),
     )
 
 
@@ -135,7 +135,7 @@ def _potential(forces: str, x: FloatArray, box: float, masses: FloatArray) -> Po
 
 
 def _particle_mesh_ewald(box: float, cutoff: float, masses: FloatArray) -> Potential:
-    potential = OpenMMHost(lambda: _system(box, cutoff, masses), platform="CPU").potential()
+    potential = OpenMMEngine(lambda: _system(box, cutoff, masses), platform="CPU").potential()
     potential.name = f"PME, {potential.name}"
     return potential
 

@@ -28,9 +28,9 @@ COSTS: dict[Cost, tuple[str, str]] = {
 }
 
 #: MD engines with forces or overhead of their own; all others call the forces of the test system on plain arrays.
-HOSTS = {"openmm": "OpenMM", "ase": "ASE"}
+MD_ENGINES = {"openmm": "OpenMM", "ase": "ASE"}
 ARRAYS = "arrays"
-EVERY_HOST = "all MD engines"
+EVERY_MD_ENGINE = "all MD engines"
 
 #: Forces that take less, beyond the call itself, do not count in a step: evaluations decide, in seconds.
 NO_FORCE = 1e-6
@@ -51,7 +51,7 @@ class Loss:
 
     Attributes
     ----------
-    host, method, title : str
+    md_engine, method, title : str
     cost : {'wall', 'evaluations'}
     errors : tuple of float
         Smallest and largest error at which it is.
@@ -59,7 +59,7 @@ class Loss:
         How many times cheaper at most; inf where no method of kcons was measured at so small an error.
     """
 
-    host: str
+    md_engine: str
     cost: Cost
     method: str
     title: str
@@ -73,7 +73,7 @@ class Standing:
 
     Attributes
     ----------
-    host : str
+    md_engine : str
     cost : {'wall', 'evaluations'}
     front : list of Measurement
         Cheapest first.
@@ -91,7 +91,7 @@ class Standing:
         Title of the method of kcons that is.
     """
 
-    host: str
+    md_engine: str
     cost: Cost
     front: Sequence[Measurement]
     rivals: bool
@@ -122,9 +122,9 @@ class Verdict:
     standings: Sequence[Standing]
     without_forces: frozenset[str] = frozenset()
 
-    def decides_on(self, host: str) -> Cost:
+    def decides_on(self, md_engine: str) -> Cost:
         """What decides among the methods of one MD engine."""
-        return "evaluations" if host == EVERY_HOST or host in self.without_forces else self.decides
+        return "evaluations" if md_engine == EVERY_MD_ENGINE or md_engine in self.without_forces else self.decides
 
     @property
     def losses(self) -> list[Loss]:
@@ -132,7 +132,7 @@ class Verdict:
         return [
             loss
             for standing in self.standings
-            if standing.cost in (self.decides_on(standing.host), "evaluations")
+            if standing.cost in (self.decides_on(standing.md_engine), "evaluations")
             for loss in standing.losses
         ]
 
@@ -142,9 +142,9 @@ def is_ours(m: Measurement) -> bool:
     return "kcons" in m.title
 
 
-def host_of(method: str) -> str:
+def md_engine_of(method: str) -> str:
     """Whose loop and forces a method runs on."""
-    return HOSTS.get(METHODS[method].host, ARRAYS) if method in METHODS else ARRAYS
+    return MD_ENGINES.get(METHODS[method].md_engine, ARRAYS) if method in METHODS else ARRAYS
 
 
 def cost_of(m: Measurement, cost: Cost) -> float:
@@ -158,7 +158,7 @@ def resolution_of(comparison: Comparison) -> float:
     return max(RESOLVED * float(comparison.reference["error"]), ROUNDING)
 
 
-def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[Measurement]:
+def points(comparison: Comparison, cost: Cost, md_engine: str | None = None) -> list[Measurement]:
     """Measurements with an error and a cost, of one MD engine or of all."""
     return [
         m
@@ -167,7 +167,7 @@ def points(comparison: Comparison, cost: Cost, host: str | None = None) -> list[
         and m.error is not None
         and math.isfinite(m.error)
         and cost_of(m, cost) > 0
-        and (host is None or host_of(m.method) == host)
+        and (md_engine is None or md_engine_of(m.method) == md_engine)
     ]
 
 
@@ -221,28 +221,28 @@ def verdict(comparison: Comparison) -> Verdict:
     no_force = timing.get("force_seconds") is not None and timing["force_seconds"] < NO_FORCE
     margin = max(LEAST_MARGIN, float(timing.get("margin") or 0.0))
     standings: list[Standing] = []
-    hosts = list(dict.fromkeys(host_of(m.method) for m in points(comparison, "evaluations")))
-    for host in hosts:
+    md_engines = list(dict.fromkeys(md_engine_of(m.method) for m in points(comparison, "evaluations")))
+    for md_engine in md_engines:
         for cost in COSTS:
-            standings.append(_standing(comparison, host, cost, margin))
-    if len(hosts) > 1:
-        standings.append(_standing(comparison, EVERY_HOST, "evaluations", margin))
-    return Verdict("evaluations" if no_force else "wall", margin, standings, _hosts_without_forces(comparison))
+            standings.append(_standing(comparison, md_engine, cost, margin))
+    if len(md_engines) > 1:
+        standings.append(_standing(comparison, EVERY_MD_ENGINE, "evaluations", margin))
+    return Verdict("evaluations" if no_force else "wall", margin, standings, _md_engines_without_forces(comparison))
 
 
-def _hosts_without_forces(comparison: Comparison) -> frozenset[str]:
-    """Hosts whose steps with nothing held take less than `NO_FORCE`, forces and all."""
+def _md_engines_without_forces(comparison: Comparison) -> frozenset[str]:
+    """MD engines whose steps with nothing held take less than `NO_FORCE`, forces and all."""
     baselines = [
-        (host_of(m.method), m.step_seconds)
+        (md_engine_of(m.method), m.step_seconds)
         for m in comparison.measurements
-        if m.status == "baseline" and m.step_seconds is not None and host_of(m.method) == HOSTS["openmm"]
+        if m.status == "baseline" and m.step_seconds is not None and md_engine_of(m.method) == MD_ENGINES["openmm"]
     ]
-    return frozenset(host for host, seconds in baselines if seconds < NO_FORCE)
+    return frozenset(md_engine for md_engine, seconds in baselines if seconds < NO_FORCE)
 
 
-def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> Standing:
+def _standing(comparison: Comparison, md_engine: str, cost: Cost, margin: float) -> Standing:
     resolution = resolution_of(comparison)
-    here = points(comparison, cost, None if host == EVERY_HOST else host)
+    here = points(comparison, cost, None if md_engine == EVERY_MD_ENGINE else md_engine)
     curves: dict[str, list[Measurement]] = {}
     for m in here:
         curves.setdefault(m.method, []).append(m)
@@ -250,7 +250,7 @@ def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> S
     theirs = [curve for curve in curves.values() if not is_ours(curve[0])]
     on_front = front(here, cost, resolution)
     if not ours or not theirs:
-        return Standing(host, cost, on_front, False, [])
+        return Standing(md_engine, cost, on_front, False, [])
     allowed = 1 + (margin if cost == "wall" else SAME_EVALUATIONS)
     losses: list[Loss] = []
     gain: tuple[float, float, str, str] | None = None
@@ -269,8 +269,8 @@ def _standing(comparison: Comparison, host: str, cost: Cost, margin: float) -> S
         if lost:
             errors = [error for error, _ in lost]
             worst = max(factor for _, factor in lost)
-            losses.append(Loss(host, cost, curve[0].method, curve[0].title, (min(errors), max(errors)), worst))
-    return Standing(host, cost, on_front, True, losses, *(gain or (None, None, None, None)))
+            losses.append(Loss(md_engine, cost, curve[0].method, curve[0].title, (min(errors), max(errors)), worst))
+    return Standing(md_engine, cost, on_front, True, losses, *(gain or (None, None, None, None)))
 
 
 def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measurement]]]:
@@ -282,12 +282,12 @@ def overtaken(comparison: Comparison) -> dict[str, list[tuple[Measurement, Measu
     judged, least = verdict(comparison), resolution_of(comparison)
     found: dict[str, list[tuple[Measurement, Measurement]]] = {}
     for standing in judged.standings:
-        host, cost = standing.host, standing.cost
-        if not standing.rivals or cost != judged.decides_on(host):
+        md_engine, cost = standing.md_engine, standing.cost
+        if not standing.rivals or cost != judged.decides_on(md_engine):
             continue
-        here = points(comparison, cost, None if host == EVERY_HOST else host)
+        here = points(comparison, cost, None if md_engine == EVERY_MD_ENGINE else md_engine)
         cheaper = 1 + (LEAST_MARGIN if cost == "wall" else SAME_EVALUATIONS)
-        found[host] = [
+        found[md_engine] = [
             (mine, other)
             for mine in front([m for m in here if is_ours(m)], cost, least)
             for other in here
@@ -311,7 +311,7 @@ def sentence(loss: Loss, length: str) -> str:
         much = f"up to {100 * (1 - 1 / loss.factor):.0f} % cheaper"
     else:
         much = f"up to {loss.factor:.2g} times cheaper"
-    return f"{loss.title} {where} {length}: {much} ({COSTS[loss.cost][1]}, {loss.host})"
+    return f"{loss.title} {where} {length}: {much} ({COSTS[loss.cost][1]}, {loss.md_engine})"
 
 
 def together(losses: Sequence[Loss], length: str) -> str:
@@ -331,12 +331,14 @@ def summary(comparison: Comparison) -> list[dict[str, Any]]:
     length = comparison.scene["units"]["length"]
     rows = []
     for standing in found.standings:
-        if standing.cost != found.decides_on(standing.host):
+        if standing.cost != found.decides_on(standing.md_engine):
             continue
-        beside = next((s for s in found.standings if s.host == standing.host and s.cost != standing.cost), None)
+        beside = next(
+            (s for s in found.standings if s.md_engine == standing.md_engine and s.cost != standing.cost), None
+        )
         rows.append(
             {
-                "host": standing.host,
+                "md_engine": standing.md_engine,
                 "cost": COSTS[standing.cost][1],
                 "front": list(dict.fromkeys(m.title for m in standing.front)),
                 "rivals": standing.rivals,

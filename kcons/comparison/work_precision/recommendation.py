@@ -20,11 +20,11 @@ from kcons.comparison.study.tables import duration
 from kcons.comparison.test_systems import Reference, TestSystem
 from kcons.comparison.work_precision.fronts import (
     COSTS,
-    EVERY_HOST,
+    EVERY_MD_ENGINE,
     Cost,
     cost_of,
-    host_of,
     is_ours,
+    md_engine_of,
     resolution_of,
     verdict,
 )
@@ -207,8 +207,12 @@ def sharpen(bench: Bench, comparison: Comparison) -> Comparison:
     found: list[Measurement] = []
     tried: set[tuple[str, float]] = set()
     for standing in judged.standings:
-        ours = [c for c in curves.values() if is_ours(c[0]) and standing.host in (host_of(c[0].method), EVERY_HOST)]
-        if standing.cost not in (judged.decides_on(standing.host), "evaluations") or not ours:
+        ours = [
+            c
+            for c in curves.values()
+            if is_ours(c[0]) and standing.md_engine in (md_engine_of(c[0].method), EVERY_MD_ENGINE)
+        ]
+        if standing.cost not in (judged.decides_on(standing.md_engine), "evaluations") or not ours:
             continue
         for target in sorted({max(error, resolution) for loss in standing.losses for error in loss.errors}):
             predictions = [p for c in ours if (p := predicted(c, SAFETY * target, resolution)) is not None]
@@ -301,7 +305,7 @@ def _default(
 ) -> tuple[dict[str, Any] | None, list[Measurement]]:
     """What the MD engine of the best method does unless told otherwise: at its usual step, and at this error."""
     test_system = bench.test_system
-    name = default_method(test_system, METHODS[best.method].host)
+    name = default_method(test_system, METHODS[best.method].md_engine)
     if name is None:
         return None, []
     method = METHODS[name]
@@ -344,9 +348,9 @@ def _default(
     return entry, found
 
 
-def default_method(test_system: TestSystem, host: str) -> str | None:
+def default_method(test_system: TestSystem, md_engine: str) -> str | None:
     """What a user of this MD engine takes who has not thought about it; None if it cannot run the test system."""
-    names = ("openmm-verlet",) if host == "openmm" else ("ase-bonds", "dop853")
+    names = ("openmm-verlet",) if md_engine == "openmm" else ("ase-bonds", "dop853")
     return next((name for name in names if METHODS[name].refuses(test_system) is None), None)
 
 

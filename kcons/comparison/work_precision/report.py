@@ -14,7 +14,7 @@ from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw, say
 from kcons.comparison.study.tables import Table, duration, footnotes, numbered, verdict
-from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_HOST, Cost, Standing, cost_of
+from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_MD_ENGINE, Cost, Standing, cost_of
 from kcons.comparison.work_precision.fronts import verdict as judge
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
 
@@ -260,9 +260,9 @@ def _errors(comparison: Comparison, standings: Sequence[Standing], cost: Cost) -
         at = comparison.reference["error"]
         found.append(Curve([0, 1], [at, at], style={"color": "black", "linewidth": 0.8, "linestyle": ":"}, along="y"))
     for standing in standings:
-        if standing.cost == cost and standing.host != EVERY_HOST and standing.front:
-            look = {**BAND, "color": FRONT_STYLES.get(standing.host, "#999999"), "markeredgewidth": 0}
-            found.append(_curve(standing.front, cost, f"front, {standing.host}", look))
+        if standing.cost == cost and standing.md_engine != EVERY_MD_ENGINE and standing.front:
+            look = {**BAND, "color": FRONT_STYLES.get(standing.md_engine, "#999999"), "markeredgewidth": 0}
+            found.append(_curve(standing.front, cost, f"front, {standing.md_engine}", look))
     return found
 
 
@@ -322,7 +322,7 @@ def page_table(comparison: Comparison) -> Table:
     ]
     on_front: dict[int, list[str]] = {}
     for standing in judge(comparison).standings:
-        for m in standing.front if standing.host != EVERY_HOST else ():
+        for m in standing.front if standing.md_engine != EVERY_MD_ENGINE else ():
             on_front.setdefault(id(m), []).append("wall" if standing.cost == "wall" else "forces")
     rows, marks = [], []
     for m in comparison.measurements:

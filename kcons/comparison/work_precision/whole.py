@@ -191,8 +191,8 @@ def methods_of(item: Item, test_system: TestSystem, quick: bool) -> tuple[list[s
     kept: list[str] = []
     out: dict[str, str] = {}
     for method in METHODS.values():
-        usual = method.usual or (not quick and method.host == "kcons")
-        guest = method.guest or method.host == "openmm"
+        usual = method.usual or (not quick and method.md_engine == "kcons")
+        guest = method.guest or method.md_engine == "openmm"
         if not usual or not method.follows or (guest and method.refuses(test_system) is not None):
             continue
         why = next((why for beginning, why in item.without.items() if method.name.startswith(beginning)), None)

@@ -16,7 +16,7 @@ from kcons.comparison.study.tables import Table, duration, markdown, plain_text
 from kcons.comparison.work_precision import report
 from kcons.comparison.work_precision.fronts import (
     COSTS,
-    EVERY_HOST,
+    EVERY_MD_ENGINE,
     LEAST_MARGIN,
     NO_FORCE,
     overtaken,
@@ -121,9 +121,9 @@ def _notes(found: Comparison) -> list[str]:
         + (f"; times of short runs repeat to within {100 * margin:.0f} %" if margin is not None else "")
         + ".",
         *(
-            f"{host} has forces of its own, and takes less than a microsecond for a step with nothing held: there "
+            f"{md_engine} has forces of its own, and takes less than a microsecond for a step with nothing held: there "
             "force evaluations decide."
-            for host in sorted(judged.without_forces)
+            for md_engine in sorted(judged.without_forces)
         ),
     ]
     for row in summary(found):
@@ -131,7 +131,7 @@ def _notes(found: Comparison) -> list[str]:
             continue
         lost = "; ".join(row["losses"])
         beside = "; ".join(row["beside"])
-        text = f"{row['host'].capitalize() if row['host'] == 'arrays' else row['host']}, {row['cost']}: "
+        text = f"{row['md_engine'].capitalize() if row['md_engine'] == 'arrays' else row['md_engine']}, {row['cost']}: "
         text += f"ahead of kcons: {lost}." if lost else "no other method is ahead of kcons at any error."
         lines.append(text + (f" Beside, in the other cost: {beside}." if beside else ""))
     return lines
@@ -184,13 +184,13 @@ def winners(parts: Sequence[Part]) -> Table:
             by_time = row["cost"] == COSTS["wall"][1]
             rows.append(
                 [
-                    *(part.heading, row["host"], row["cost"]),
+                    *(part.heading, row["md_engine"], row["cost"]),
                     f"{100 * margin:.0f} %" if by_time and margin is not None else "",
                     "" if gain is None else factor(gain),
                     "" if gain is None else f"{row['gain_error']:.0e} {length}",
                     row["lost"] or "none",
                     *(row["ours"] or "", row["rival"] or ""),
-                    row["lost_beside"] or ("" if row["host"] == EVERY_HOST else "none"),
+                    row["lost_beside"] or ("" if row["md_engine"] == EVERY_MD_ENGINE else "none"),
                     ", ".join(row["front"]),
                 ]
             )

@@ -127,8 +127,6 @@ def solve(
     dense_output: bool = False,
     events: Event | Sequence[Event] | None = None,
     *,
-    rtol: float = 1e-9,
-    atol: float = 1e-11,
     log_x0: ArrayLike | None = None,
     project: bool = True,
     **options: Any,
@@ -145,14 +143,13 @@ def solve(
         'RK23', 'RK45', 'DOP853', 'Radau' or 'BDF'.
     t_eval, dense_output, events
         As in ``solve_ivp``; events are functions (t, x), with attributes `terminal` and `direction`.
-    rtol, atol : float
-        Of ln x: atol is a relative error of x.
     log_x0 : array_like, shape (n,), optional
         Start as logarithms, in place of x0.
     project : bool
         Whether the state is put back on the rows; False shows what that is good for.
     options
-        max_step, first_step, jac and what else the method takes.
+        rtol (by default 1e-9) and atol (1e-11) of ln x, so that atol is a relative error of x; max_step, first_step,
+        jac and what else the method takes.
 
     Raises
     ------
@@ -173,7 +170,8 @@ def solve(
     p0 = Populations.from_logarithms(t0, log_start)
     bound = system.bind(p0)
     log_start = bound.project(t0, log_start) if project else log_start
-    tolerance = max(atol + rtol, 1e-13)
+    options = {"rtol": 1e-9, "atol": 1e-11} | options
+    tolerance = max(options["atol"] + options["rtol"], 1e-13)
     holder: dict[str, Any] = {}
 
     def slope(t: float, y: FloatArray) -> FloatArray:
@@ -200,8 +198,6 @@ def solve(
             t_eval=None,
             dense_output=dense_output or wanted is not None,
             events=_event_list(events),
-            rtol=rtol,
-            atol=atol,
             **options,
         )
         if ode.status == 1:

@@ -6,7 +6,7 @@
 - `row_forces`: values and gradients of rows by OpenMM's forces
 - `formula_rows`: formulas as forces
 - `plain_rows`: rows that are internal coordinates, as constraints of kcons
-- `context_rows`: the rows in a Context
+- `measured_rows`, `context_rows`: the rows in a Context, and what can be done to them
 - `row_program`: the part of the program that holds them
 - `collective_rows`: `CollectiveRows`, what users make
 """

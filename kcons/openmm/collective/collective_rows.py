@@ -22,8 +22,9 @@ from kcons.errors import (
     SingularGeometryError,
     UnsupportedError,
 )
-from kcons.openmm.collective.context_rows import ContextRows, variables_of
+from kcons.openmm.collective.context_rows import ContextRows
 from kcons.openmm.collective.formula_rows import as_rows
+from kcons.openmm.collective.measured_rows import variables_of
 from kcons.openmm.collective.row_forces import (
     Rigid,
     Row,

@@ -1,222 +1,33 @@
-"""Rows at the state of a context, seen from Python: Gram matrix, projections, multipliers, checks."""
+"""Rows at the state of a context, seen from Python: projections, multipliers, checks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import openmm
 from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConstraintError, ConvergenceError, InputError, SingularGeometryError
+from kcons.errors import ConstraintError, ConvergenceError, InputError
 from kcons.openmm.collective.plain_rows import near_targets
-from kcons.openmm.collective.row_forces import energy, forces_in
-from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.collective.row_forces import forces_in
+from kcons.openmm.integrator.guard import positions_of
 from kcons.openmm.integrator.part import BOND, NEAR, Miss
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.integrator.system_checks import refuse_barostat, refuse_motion_remover
-from kcons.openmm.quantities import masses_of
 from kcons.openmm.topology import bonds_of
 
 if TYPE_CHECKING:
-    from kcons.openmm.collective.row_program import GroupRows
+    pass
 
-#: Rows whose part beside the others is smaller than this (of their own norm) are dependent.
-DEPENDENT = 1e-5
+from kcons.openmm.collective.measured_rows import MeasuredRows, applied_groups
+
 #: Off the rows by more than this (relative to the scale of a row, or to its rate): not on them.
 START_TOLERANCE = 1e-9
 _MAX_NEWTON = 60
-#: Tolerance of the System's constraints where differences are taken, in double precision.
-_TIGHT = 1e-13
 
 
-class ContextRows:
-    """Gradients and projections of rows at the state of a context; make a new one when that changes.
-
-    Parameters
-    ----------
-    rows : GroupRows
-    context : openmm.Context
-        Its integrator need not be the one that holds the rows, but then targets are those the rows were made with.
-    """
-
-    def __init__(self, rows: GroupRows, context: openmm.Context) -> None:
-        self.rows = rows
-        self.context = context
-        self._numbers = range(rows.n_rows)
-
-    # -- the state ------------------------------------------------------------------------------
-
-    @cached_property
-    def masses(self) -> FloatArray:
-        return masses_of(self.context.getSystem())
-
-    @cached_property
-    def _inverse_masses(self) -> FloatArray:
-        with np.errstate(divide="ignore"):
-            return np.where(self.masses > 0, 1.0 / self.masses, 0.0)[:, None]
-
-    @cached_property
-    def positions(self) -> FloatArray:
-        return positions_of(self.context)
-
-    @cached_property
-    def velocities(self) -> FloatArray:
-        return velocities_of(self.context)
-
-    @cached_property
-    def _owner(self) -> openmm.CustomIntegrator | None:
-        return owner(self.rows, self.context)
-
-    @cached_property
-    def _settings(self) -> dict[str, float]:
-        """What the integrator was made with or told; its variables are copies for the program."""
-        if self._owner is None:
-            return {}
-        program = getattr(self._owner, "program", None)
-        return variables_of(self._owner) if program is None else program.settings
-
-    @cached_property
-    def _clock(self) -> float:
-        return 0.0 if self._owner is None else self.rows._clock(variables_of(self._owner))
-
-    def targets(self) -> FloatArray:
-        """Where each target is now, shape (n_rows,)."""
-        rows, found = self.rows, []
-        for k, target in enumerate(rows._targets):
-            if isinstance(target, str):
-                found.append(self.context.getParameter(target))
-            elif self._settings:
-                moved = self.target_rates()[k] * self._clock if rows._rates[k] != 0.0 else 0.0
-                found.append(self._settings[rows._of("target", k)] + moved)
-            else:
-                assert target is not None
-                found.append(target)
-        return np.array(found)
-
-    def target_rates(self) -> FloatArray:
-        rows, found = self.rows, []
-        for k, rate in enumerate(rows._rates):
-            if isinstance(rate, str):
-                found.append(self.context.getParameter(rate))
-            else:
-                found.append(self._settings.get(rows._of("rate", k), rate))
-        return np.array(found)
-
-    # -- the rows -------------------------------------------------------------------------------
-
-    def values(self) -> FloatArray:
-        """q, shape (n_rows,)."""
-        return np.array([energy(self.context, group) for group in self.rows._groups])
-
-    def sigma(self) -> FloatArray:
-        """q - target, shape (n_rows,), to the nearest image."""
-        off = self.values() - self.targets()
-        period = np.array(self.rows.periods)
-        safe = np.where(period > 0, period, 1.0)
-        return np.where(period > 0, off - safe * np.floor(off / safe + 0.5), off)
-
-    def gradients(self) -> FloatArray:
-        """grad q, shape (n_rows, n_particles, 3)."""
-        return np.array([-self._force({group}) for group in self.rows._groups])
-
-    def _force(self, groups: set[int]) -> FloatArray:
-        return np.array(self.context.getState(getForces=True, groups=groups).getForces(asNumpy=True)._value)
-
-    def slopes(self) -> FloatArray:
-        """A v less the rates of the targets, shape (n_rows,)."""
-        return np.einsum("kai,ai->k", self.gradients(), self.velocities) - self.target_rates()
-
-    def directions(self, gradients: FloatArray) -> FloatArray:
-        """M_par^+ A^T, M_par^+ that of the System's constraints, shape (n_rows, n_particles, 3)."""
-        pushed = gradients * self._inverse_masses
-        if self.rows.meets_system:
-            with self._kept(positions=False):
-                for k in self._numbers:
-                    pushed[k] = self._tangent(pushed[k])
-        return pushed
-
-    def _tangent(self, v: FloatArray) -> FloatArray:
-        """v along the System's constraints at the context's positions; its velocities are overwritten."""
-        self.context.setVelocities(v)
-        self.context.applyVelocityConstraints(self._tight)
-        return velocities_of(self.context)
-
-    @contextmanager
-    def _kept(self, positions: bool = True) -> Iterator[None]:
-        """Put the state of the context back afterwards."""
-        state = self.context.getState(getPositions=True, getVelocities=True)
-        try:
-            yield
-        finally:
-            if positions:
-                self.context.setPositions(state.getPositions())
-            self.context.setVelocities(state.getVelocities())
-
-    def gram(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(A, M_par^+ A^T, A M_par^+ A^T).
-
-        Raises
-        ------
-        SingularGeometryError
-            Rows that vanish, or depend on others or on the System's constraints.
-        """
-        gradients = self.gradients()
-        directions = self.directions(gradients)
-        gram = np.einsum("jai,kai->jk", gradients, directions)
-        gram = 0.5 * (gram + gram.T)
-        row = self._dependent(gradients, gram)
-        if row is not None:
-            raise SingularGeometryError(
-                f"row {row} ({self.rows.names[row]}) vanishes, or depends on the rows before it or on the constraints "
-                "of the System. Leave out a row that others imply; a dihedral over a straight angle or an RMSD of 0 "
-                "has no direction",
-                rows=[row],
-            )
-        return gradients, directions, gram
-
-    def _dependent(self, gradients: FloatArray, gram: FloatArray) -> int | None:
-        """The first row that adds nothing, None if all do."""
-        own = np.einsum("kai,kai->k", gradients**2, np.broadcast_to(self._inverse_masses, gradients.shape))
-        for k in self._numbers:
-            if not (np.isfinite(own[k]) and own[k] > 0):
-                return k
-        scaled = gram / np.sqrt(own[:, None] * own)
-        for k in self._numbers:
-            left = scaled[k, k]
-            if k:
-                left -= scaled[k, :k] @ np.linalg.lstsq(scaled[:k, :k], scaled[:k, k], rcond=None)[0]
-            if not left > self._small:
-                return k
-        return None
-
-    def rank(self) -> int:
-        """Number of rows that are independent of one another and of the System's constraints."""
-        gradients = self.gradients()
-        gram = np.einsum("jai,kai->jk", gradients, self.directions(gradients))
-        own = np.einsum("kai,kai->k", gradients**2, np.broadcast_to(self._inverse_masses, gradients.shape))
-        size = np.sqrt(np.where(own > 0, own, 1.0))
-        return int(np.sum(np.linalg.eigvalsh(0.5 * (gram + gram.T) / (size[:, None] * size)) > self._small))
-
-    @cached_property
-    def precision(self) -> Precision:
-        """That of the platform."""
-        return Precision.of(self.context)
-
-    @property
-    def _small(self) -> float:
-        """Squares of parts beside other rows that are rounding."""
-        return max(DEPENDENT**2, 10 * self.precision.forces)
-
-    @property
-    def _tight(self) -> float:
-        """Tolerance of the System's constraints where differences are taken."""
-        return max(_TIGHT, self.precision.solvers) if self.precision.name != "double" else _TIGHT
+class ContextRows(MeasuredRows):
+    """What can be done to rows at the state of a context."""
 
     # -- projections ----------------------------------------------------------------------------
 
@@ -370,35 +181,3 @@ class ContextRows:
 
     def _name(self, row: int) -> str:
         return f"{row} ({self.rows.names[row]})"
-
-
-def owner(rows: GroupRows, context: openmm.Context) -> openmm.CustomIntegrator | None:
-    """The integrator of the context that holds the rows, None if it has none."""
-    for ours in listeners(context):
-        if rows._of("push", 0) in ours.program.numbers:
-            return ours
-    integrator = context.getIntegrator()
-    found = [integrator]
-    if isinstance(integrator, openmm.CompoundIntegrator):
-        found = [integrator.getIntegrator(k) for k in range(integrator.getNumIntegrators())]
-    name = rows._of("push", 0)
-    for one in found:
-        if isinstance(one, openmm.CustomIntegrator) and name in _names(one):
-            return one
-    return None
-
-
-def _names(integrator: openmm.CustomIntegrator) -> list[str]:
-    return [integrator.getGlobalVariableName(k) for k in range(integrator.getNumGlobalVariables())]
-
-
-def variables_of(integrator: openmm.CustomIntegrator) -> dict[str, float]:
-    """All global variables of the integrator by name."""
-    return {name: integrator.getGlobalVariable(k) for k, name in enumerate(_names(integrator))}
-
-
-def applied_groups(rows: GroupRows, context: openmm.Context) -> set[int]:
-    """The force groups that move the System."""
-    groups = context.getIntegrator().getIntegrationForceGroups()
-    chosen = groups if isinstance(groups, set | frozenset) else {g for g in range(32) if int(groups) >> g & 1}
-    return set(chosen) - rows.groups

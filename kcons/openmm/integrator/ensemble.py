@@ -32,12 +32,15 @@ class Ensemble(Protocol):
         Whether what `kick` returns has no forces in it: then it holds after a drift as well, and v need not be written.
     owes : bool
         Whether the end of a step may be left to the next step if the state is not read between; see `open`.
+    measures : bool
+        Whether `middle` needs v tangent to the constraints, since it measures K.
     """
 
     stays_tangent: bool
     adds_up: bool
     forceless: bool
     owes: bool
+    measures: bool
 
     def check(self, scheme: Splitting | None) -> None:
         """Raise `UnsupportedError` for schemes that lose their order, or cannot be used, with these kicks."""
@@ -137,6 +140,7 @@ class Value:
 
     forceless = False
     owes = False
+    measures = False
 
     def open(self, program: Program) -> None:
         pass

@@ -82,7 +82,9 @@ class StepWriter:
             if kicks[0]:
                 self._kick(_of_dt(kicks[0]), tangent=True)
             if self.halves:
-                self.ensemble.middle(p, f"v+{self._drift(h)}", lambda: None)  # the second half absorbs what is across
+                # The second half absorbs what is across the constraints.
+                project = self._project if self.ensemble.measures else lambda: None
+                self.ensemble.middle(p, f"v+{self._drift(h)}", project)
             impulse = self._drift(h)
         with p.when("phase != 1", "with the forces there"):
             if kicks[-1]:

@@ -107,7 +107,7 @@ class SparseRows:
         self._lines[6::8] = w[slot_atoms]
         # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
         self._state, self._entries = aligned(2 * n), aligned(4 * len(pattern.columns))
-        self._pivots, self._values, self._floor = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._pivots, self._values, self._inverse_rounding = np.zeros(n), np.zeros(n), np.zeros(n)
         self._base, self._moves = aligned(4 * len(self._atoms)), aligned(4 * len(self._atoms))
         self._solution = np.zeros(n)
         self._kept_moves = np.zeros(len(self._moves))
@@ -126,7 +126,7 @@ class SparseRows:
             failed, residual, iterations, worst = _positions(
                 careful, x, reference, targets, NO_LATTICE if lattice is None else lattice, lattice is not None,
                 *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
-                self._floor, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
+                self._inverse_rounding, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
             )  # fmt: skip
             self._given.refuse()
             if not failed:
@@ -275,7 +275,7 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
-    scale, lines, values, floor, base, moves, solution,
+    scale, lines, values, inverse_rounding, base, moves, solution,
 ):  # fmt: skip
     """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     zero = quad(0.0, 0.0, 0.0, 0.0)
@@ -300,12 +300,12 @@ def _begin(  # type: ignore[no-untyped-def]
                 g = second_vector(lines, 8 * p)
                 size *= np.sqrt(dot(g, g))
             reach += size
-        put(floor, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
+        put(inverse_rounding, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _measure(first, last, kinds, parameters, links, wanted, scale, floor, values, state):  # type: ignore[no-untyped-def]
-    """Right-hand sides; largest and total error, the row with the largest, and the largest excess over the floor."""
+def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):  # type: ignore[no-untyped-def]
+    """Right-hand sides; largest and total error, the row with the largest, and the largest in units of its rounding."""
     error, total, excess = 0.0, 0.0, 0.0
     bad = first
     for k in range(first, last):
@@ -319,7 +319,7 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, floor, values
         if e > error:
             error = e
             bad = k
-        excess = max(excess, abs(off) * number(floor, k))
+        excess = max(excess, abs(off) * number(inverse_rounding, k))
     return error, total, excess, bad
 
 
@@ -334,15 +334,15 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
     careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters,
-    links, columns, targets, triple, sides, masses, scale, lines, state, entries, pivots, values, floor, base,
-    moves, solution, kept_moves, kept_solution,
+    links, columns, targets, triple, sides, masses, scale, lines, state, entries, pivots, values, inverse_rounding,
+    base, moves, solution, kept_moves, kept_solution,
 ):  # fmt: skip
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
         _begin(
             first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
-            parameters, links, scale, lines, values, floor, base, moves, solution,
+            parameters, links, scale, lines, values, inverse_rounding, base, moves, solution,
         )  # fmt: skip
         error = np.inf
         best = np.inf
@@ -355,7 +355,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
             )
             error, total, excess, bad = _measure(
-                first, last, kinds, parameters, links, wanted, scale, floor, values, state
+                first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state
             )
             if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
@@ -369,7 +369,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 return True, np.inf, iteration, _first_not_finite(first, last, state)
             if hopeless(iteration, error, previous):
                 return True, error, iteration, bad
-            # Go on to the floor of the relative coordinates as long as Newton still gains.
+            # Go on to the rounding of the relative coordinates as long as Newton still gains.
             if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
             if careful:

@@ -11,7 +11,7 @@ CASES = all_cases()
 
 @pytest.mark.parametrize("program", OURS[1:])
 @pytest.mark.parametrize("number", ["H05", "H13", "H17", "H20", "H22", "H23", "H24", "H39", "X04", "X33", "X40"])
-def test_parts_for_hosts(number, program):
+def test_parts_for_md_engines(number, program):
     cell = run_cell(CASES[number], program, quick=True)
     assert cell.verdict in ("right", "refused"), cell.text
     assert cell.met, cell.text

@@ -94,8 +94,8 @@ def test_every_stepper_is_a_method():
 @pytest.mark.parametrize("name", NAMED)
 def test_every_stepper_runs_dependent_rows_and_finds_the_trajectory(name):
     # 21 rows of rank 19.
-    scene = test_systems.build("ethanol", forces="emt").shortened(4)
-    found = measure.compare(scene.with_time_steps([0.5, 0.25]), methods=[name])
+    system = test_systems.build("ethanol", forces="emt").shortened(4)
+    found = measure.compare(system.with_time_steps([0.5, 0.25]), methods=[name])
     assert [m.status for m in found.measurements] == ["ok", "ok"]
     assert found.measurements[-1].error < 1e-4
 
@@ -163,22 +163,22 @@ def test_usual_methods_and_all(monkeypatch):
         methods.chosen(["all", "rattle"])
 
 
-def test_hosts_fix_the_atoms_of_the_slab():
-    scene = test_systems.build("slab")
+def test_md_engines_fix_the_atoms_of_the_slab():
+    system = test_systems.build("slab")
     for name in ("ase-bonds", "ase-internals", "ase-kcons"):
-        run = methods.METHODS[name].start(scene, scene.time_steps[0])
+        run = methods.METHODS[name].start(system, system.time_steps[0])
         run.advance()
-        moved = np.abs(run.positions - scene.positions).max(axis=1) > 0
-        assert not moved[scene.fixed].any()
-        assert np.delete(moved, scene.fixed).all()
+        moved = np.abs(run.positions - system.positions).max(axis=1) > 0
+        assert not moved[system.fixed].any()
+        assert np.delete(moved, system.fixed).all()
         assert run.constraints.seconds > 0
 
 
 @pytest.mark.parametrize("name", ["triple-pendulum", "rotor", "bead-rotating"])
 def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name):
     # Along a constraint that moves, too.
-    scene = test_systems.build(name)
-    found = measure.compare(scene, methods=["dop853", "dop853-projected"])
+    system = test_systems.build(name)
+    found = measure.compare(system, methods=["dop853", "dop853-projected"])
     for free, held in zip(found.of("dop853"), found.of("dop853-projected"), strict=True):
         assert held.evaluations_per_time == pytest.approx(free.evaluations_per_time, rel=0.05)
         assert held.error < free.error
@@ -190,5 +190,5 @@ def test_projected_dop853_costs_no_more_forces_and_stays_on_the_constraints(name
 
 def test_what_has_kernels_loads_them_before_the_clock_starts():
     for method in methods.METHODS.values():
-        if method.host == "kcons" and method.marches:
+        if method.md_engine == "kcons" and method.marches:
             assert type(method).warm_up is not Method.warm_up, method.name

@@ -12,10 +12,10 @@ from openmm import unit
 from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods import openmm as openmm_methods
-from kcons.comparison.test_systems.openmm_host import OpenMMHost, system_of
+from kcons.comparison.test_systems.openmm_engine import OpenMMEngine, system_of
 from kcons.comparison.work_precision import measure, report
 
-HOSTED = {
+IN_OPENMM = {
     "chain": 4,
     "chain-free": 4,
     "sphere": 2,
@@ -29,11 +29,11 @@ HOSTED = {
 
 
 def build(name):
-    return test_systems.build(name.removesuffix("-box"), HOSTED[name])
+    return test_systems.build(name.removesuffix("-box"), IN_OPENMM[name])
 
 
-@pytest.fixture(scope="module", params=HOSTED)
-def scene(request):
+@pytest.fixture(scope="module", params=IN_OPENMM)
+def in_openmm(request):
     return build(request.param)
 
 
@@ -42,8 +42,8 @@ def rotor():
     return test_systems.build("rotor").shortened(4)
 
 
-def errors(scene, *names, **options):
-    found = measure.compare(scene, methods=names, **options)
+def errors(in_openmm, *names, **options):
+    found = measure.compare(in_openmm, methods=names, **options)
     assert {m.status for m in found.measurements} <= {"ok", "thermostat"}, [m.note for m in found.measurements]
     return found, [[m.error for m in found.of(name)] for name in names]
 
@@ -51,40 +51,42 @@ def errors(scene, *names, **options):
 # -- the same system --------------------------------------------------------------------------------
 
 
-def test_forces_masses_and_distances_are_those_of_the_scene(scene):
-    host = scene.openmm
-    place = openmm.Platform.getPlatformByName(host.platform)
-    context = openmm.Context(host.copy(), openmm.VerletIntegrator(0.001), place)
+def test_forces_masses_and_distances_are_those_of_the_system(in_openmm):
+    md_engine = in_openmm.openmm
+    place = openmm.Platform.getPlatformByName(md_engine.platform)
+    context = openmm.Context(md_engine.copy(), openmm.VerletIntegrator(0.001), place)
     rng = np.random.default_rng(0)
-    x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
-    context.setPositions(x * host.length)
+    x = in_openmm.positions + 0.01 * rng.standard_normal(in_openmm.positions.shape)
+    context.setPositions(x * md_engine.length)
     state = context.getState(forces=True, energy=True)
     forces = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
-    energy = state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole) / host.speed**2
-    wanted = scene.potential.forces(x)
+    energy = state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole) / md_engine.speed**2
+    wanted = in_openmm.potential.forces(x)
     # Internal units of ASE and OpenMM agree to the digits that constants of nature are given with.
-    np.testing.assert_allclose(forces * host.length / host.speed**2, wanted, rtol=0, atol=1e-9 * abs(wanted).max())
-    assert energy == pytest.approx(scene.potential.energy(x), rel=1e-8, abs=1e-12)
-    system = host.system
+    np.testing.assert_allclose(
+        forces * md_engine.length / md_engine.speed**2, wanted, rtol=0, atol=1e-9 * abs(wanted).max()
+    )
+    assert energy == pytest.approx(in_openmm.potential.energy(x), rel=1e-8, abs=1e-12)
+    system = md_engine.system
     masses = [system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(system.getNumParticles())]
-    np.testing.assert_array_equal(masses, scene.masses)
+    np.testing.assert_array_equal(masses, in_openmm.masses)
     rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    if scene.bonds is not None:
-        assert [(i, j) for i, j, _ in rows] == [tuple(pair) for pair in scene.bonds.tolist()]
-        lengths = np.linalg.norm(np.diff(scene.positions[scene.bonds], axis=1)[:, 0], axis=1)
-        np.testing.assert_allclose([d._value for *_, d in rows], lengths * host.length, rtol=1e-13)
-    assert host.copy(constraints=False).getNumConstraints() == 0
+    if in_openmm.bonds is not None:
+        assert [(i, j) for i, j, _ in rows] == [tuple(pair) for pair in in_openmm.bonds.tolist()]
+        lengths = np.linalg.norm(np.diff(in_openmm.positions[in_openmm.bonds], axis=1)[:, 0], axis=1)
+        np.testing.assert_allclose([d._value for *_, d in rows], lengths * md_engine.length, rtol=1e-13)
+    assert md_engine.copy(constraints=False).getNumConstraints() == 0
 
 
 def test_water_has_the_same_forces_in_single_precision():
-    scene = test_systems.build("water", 8)
-    host = scene.openmm
-    assert host.platform == "CPU"
-    x = scene.positions
-    forces = host.potential().forces(x)
-    wanted = scene.potential.forces(x)
+    in_openmm = test_systems.build("water", 8)
+    md_engine = in_openmm.openmm
+    assert md_engine.platform == "CPU"
+    x = in_openmm.positions
+    forces = md_engine.potential().forces(x)
+    wanted = in_openmm.potential.forces(x)
     np.testing.assert_allclose(forces, wanted, rtol=0, atol=1e-5 * abs(wanted).max())
-    assert host.system.getNumConstraints() == 24
+    assert md_engine.system.getNumConstraints() == 24
 
 
 def test_water_cut_off_by_ase_has_no_system():
@@ -94,15 +96,15 @@ def test_water_cut_off_by_ase_has_no_system():
 # -- the same trajectories --------------------------------------------------------------------------
 
 
-def test_same_errors_as_on_arrays(scene):
-    scene = replace(scene, time_steps=scene.time_steps[1:3])
-    surfaces = bool(scene.openmm.surfaces)
+def test_same_errors_as_on_arrays(in_openmm):
+    in_openmm = replace(in_openmm, time_steps=in_openmm.time_steps[1:3])
+    surfaces = bool(in_openmm.openmm.surfaces)
     own = ("openmm-surface-rattle",) if surfaces else ("openmm-verlet-1e-12", "openmm-kcons-rattle")
-    found, (core, *others) = errors(scene, "rattle", *own, "openmm-held-rattle")
+    found, (core, *others) = errors(in_openmm, "rattle", *own, "openmm-held-rattle")
     for other in others:
         assert other == pytest.approx(core, rel=1e-6)
-    # The energy is that of OpenMM, in units of the scene.
-    if "pendulum" in scene.name or scene.name == "alanine":
+    # The energy is that of OpenMM, in units of the test system.
+    if "pendulum" in in_openmm.name or in_openmm.name == "alanine":
         core_slope, held_slope = (found.of(name)[-1].energy_slope for name in ("rattle", "openmm-held-rattle"))
         assert np.sign(core_slope) == np.sign(held_slope)
     for m in found.measurements:
@@ -117,27 +119,27 @@ def test_same_errors_as_on_arrays(scene):
     [("rotor", "blanes-moan6"), ("alanine", "blanes-moan4"), ("alanine", "kahan-li6"), ("dumbbells", "suzuki4")],
 )
 def test_higher_orders_are_the_same_scheme(name, scheme):
-    scene = build(name)
-    scene = replace(scene, time_steps=scene.time_steps[-2:])
-    _, (core, hosted) = errors(scene, scheme, f"openmm-kcons-{scheme}")
+    in_openmm = build(name)
+    in_openmm = replace(in_openmm, time_steps=in_openmm.time_steps[-2:])
+    _, (core, in_openmm) = errors(in_openmm, scheme, f"openmm-kcons-{scheme}")
     # Velocities in OpenMM take up the rounding of the positions divided by a substep.
-    assert hosted == pytest.approx(core, rel=1e-3, abs=3e-11)
-    assert hosted[1] < 0.1 * hosted[0]
+    assert in_openmm == pytest.approx(core, rel=1e-3, abs=3e-11)
+    assert in_openmm[1] < 0.1 * in_openmm[0]
 
 
 @pytest.mark.parametrize("scheme", ["geodesic", "suzuki4", "blanes-moan6"])
 def test_schemes_on_spheres(scheme):
-    scene = test_systems.build("sphere-pendulum", 2)
-    scene = replace(scene, time_steps=scene.time_steps[-2:])
-    _, (core, hosted) = errors(scene, scheme, f"openmm-surface-{scheme}")
-    assert hosted == pytest.approx(core, rel=1e-3)
+    in_openmm = test_systems.build("sphere-pendulum", 2)
+    in_openmm = replace(in_openmm, time_steps=in_openmm.time_steps[-2:])
+    _, (core, in_openmm) = errors(in_openmm, scheme, f"openmm-surface-{scheme}")
+    assert in_openmm == pytest.approx(core, rel=1e-3)
 
 
 def test_built_in_integrators_without_a_bath_are_the_same_leapfrog():
-    scene = build("alanine")
-    scene = replace(scene, time_steps=scene.time_steps[:2])
+    in_openmm = build("alanine")
+    in_openmm = replace(in_openmm, time_steps=in_openmm.time_steps[:2])
     names = ("openmm-verlet-1e-10", "openmm-middle-1e-10", "openmm-nose-hoover-1e-10", "openmm-kcons-leapfrog")
-    found, (verlet, *others) = errors(scene, *names)
+    found, (verlet, *others) = errors(in_openmm, *names)
     for other in others:
         assert other == pytest.approx(verlet, rel=1e-6)
     # Velocities half a step off the positions are not tangent to them.
@@ -157,10 +159,10 @@ def test_tolerance_decides_about_the_residual(rotor):
 
 
 def test_thermostats_state_no_error():
-    scene = build("alanine")
-    scene = replace(scene, time_steps=scene.time_steps[:1])
+    in_openmm = build("alanine")
+    in_openmm = replace(in_openmm, time_steps=in_openmm.time_steps[:1])
     names = ("openmm-middle-bath", "openmm-nose-hoover-bath")
-    found, _ = errors(scene, *names)
+    found, _ = errors(in_openmm, *names)
     for m in found.measurements:
         assert (m.status, m.error, m.energy_slope) == ("thermostat", None, None)
         assert m.constraint_residual < 1e-4
@@ -189,8 +191,8 @@ def counted():
     force = openmm.PythonForce(field)
     x, pairs = plain.positions, plain.bonds
     lengths = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    host = OpenMMHost(lambda: system_of(plain.masses, force, pairs=pairs, lengths=lengths), length=1.0, time=1.0)
-    return replace(plain, openmm=host, horizon=2.0), CALLS
+    md_engine = OpenMMEngine(lambda: system_of(plain.masses, force, pairs=pairs, lengths=lengths), length=1.0, time=1.0)
+    return replace(plain, openmm=md_engine, horizon=2.0), CALLS
 
 
 @pytest.mark.parametrize(
@@ -202,8 +204,8 @@ def counted():
     ],
 )
 def test_force_evaluations_are_counted_right(counted, name):
-    scene, calls = counted
-    run = methods.METHODS[name].start(scene, 0.1)
+    in_openmm, calls = counted
+    run = methods.METHODS[name].start(in_openmm, 0.1)
     made = steps = 0
     while not run.finished:
         # What an onlooker asks for costs the run nothing, and saves it nothing.
@@ -264,9 +266,9 @@ def test_set_up_beyond_the_budget_is_refused_from_then_on(rotor):
 
 
 def test_failure_is_told(rotor):
-    scene = build("alanine")
-    scene = replace(scene, time_steps=(scene.horizon / 4,))
-    found = measure.compare(scene, methods=["openmm-kcons-rattle"])
+    in_openmm = build("alanine")
+    in_openmm = replace(in_openmm, time_steps=(in_openmm.horizon / 4,))
+    found = measure.compare(in_openmm, methods=["openmm-kcons-rattle"])
     (m,) = found.measurements
     assert m.status == "failed"
     assert "Error" in m.note
@@ -275,24 +277,24 @@ def test_failure_is_told(rotor):
 # -- which methods run ------------------------------------------------------------------------------
 
 
-def test_usual_methods_of_a_scene_at_home_in_openmm():
-    scene = build("alanine")
-    picked = methods.chosen(None, scene)
-    assert {m.host for m in picked} == {"openmm"}
+def test_usual_methods_of_a_system_at_home_in_openmm():
+    in_openmm = build("alanine")
+    picked = methods.chosen(None, in_openmm)
+    assert {m.md_engine for m in picked} == {"openmm"}
     names = [m.name for m in picked]
     assert "openmm-verlet-1e-12" in names
     assert "openmm-held-rattle" in names
     assert not any("surface" in name for name in names)
-    assert names == [m.name for m in methods.chosen(["openmm"], scene)]
+    assert names == [m.name for m in methods.chosen(["openmm"], in_openmm)]
 
 
 def test_guests_on_other_test_systems(rotor):
-    hosted = [m.name for m in methods.chosen(None, rotor) if m.host == "openmm"]
-    assert hosted == ["openmm-verlet", "openmm-kcons-rattle"]
+    in_openmm = [m.name for m in methods.chosen(None, rotor) if m.md_engine == "openmm"]
+    assert in_openmm == ["openmm-verlet", "openmm-kcons-rattle"]
     sphere = test_systems.build("sphere", 2)
-    assert [m.name for m in methods.chosen(None, sphere) if m.host == "openmm"] == ["openmm-surface-rattle"]
-    assert not [m for m in methods.chosen(None, test_systems.build("butane")) if m.host == "openmm"]
-    assert not [m for m in methods.chosen() if m.host == "openmm"]
+    assert [m.name for m in methods.chosen(None, sphere) if m.md_engine == "openmm"] == ["openmm-surface-rattle"]
+    assert not [m for m in methods.chosen(None, test_systems.build("butane")) if m.md_engine == "openmm"]
+    assert not [m for m in methods.chosen() if m.md_engine == "openmm"]
 
 
 def test_refusals(monkeypatch, rotor):
@@ -304,6 +306,6 @@ def test_refusals(monkeypatch, rotor):
     assert "kelvin" in methods.METHODS["openmm-middle-bath"].refuses(rotor)
     monkeypatch.setattr(openmm_methods, "find_spec", lambda name: None)
     assert "not installed" in methods.METHODS["openmm-verlet"].refuses(rotor)
-    assert not [m for m in methods.chosen(None, rotor) if m.host == "openmm"]
+    assert not [m for m in methods.chosen(None, rotor) if m.md_engine == "openmm"]
     (only,) = measure.compare(rotor, methods=["openmm-verlet"]).measurements
     assert only.status == "not run"

@@ -18,16 +18,16 @@ from tests.reference import cases
 MOLECULES = {"alanine", "dhfr", "dhfr-water", "villin"}
 
 
-def test_every_scene_is_covered_here():
+def test_every_system_is_covered_here():
     assert set(SMALL) | MOLECULES == set(test_systems.SYSTEMS)
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_start_is_on_the_constraints(name):
-    scene = small(name)
-    sigma, tangency = scene.residuals(scene.positions, scene.velocities)
+    system = small(name)
+    sigma, tangency = system.residuals(system.positions, system.velocities)
     assert np.all(
-        np.abs(scene.constraint_set.value(scene.positions)) <= scene.constraint_set.tolerance(scene.positions)
+        np.abs(system.constraint_set.value(system.positions)) <= system.constraint_set.tolerance(system.positions)
     )
     assert sigma < 1e-13
     assert tangency < 1e-14
@@ -35,28 +35,28 @@ def test_start_is_on_the_constraints(name):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_forces_are_the_gradient_of_the_energy(name):
-    scene = small(name)
+    system = small(name)
     rng = np.random.default_rng(0)
-    direction = rng.standard_normal(scene.positions.shape)
-    energy = [scene.potential.energy(scene.positions + h * direction) for h in (-1e-4, 1e-4)]
+    direction = rng.standard_normal(system.positions.shape)
+    energy = [system.potential.energy(system.positions + h * direction) for h in (-1e-4, 1e-4)]
     slope = (energy[1] - energy[0]) / 2e-4
-    work = -np.sum(scene.potential.forces(scene.positions) * direction)
+    work = -np.sum(system.potential.forces(system.positions) * direction)
     assert slope == pytest.approx(work, rel=1e-4, abs=1e-7)
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_time_steps_divide_the_horizon(name):
-    scene = small(name)
-    for dt in (*scene.time_steps, *scene.shortened(2).time_steps):
-        assert scene.horizon / dt == pytest.approx(round(scene.horizon / dt), abs=1e-9)
+    system = small(name)
+    for dt in (*system.time_steps, *system.shortened(2).time_steps):
+        assert system.horizon / dt == pytest.approx(round(system.horizon / dt), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", [n for n in SMALL if n not in ("water", "fekete")])
 def test_rattle_reaches_the_reference_with_order_two(name):
-    scene = small(name)
-    reference = scene.reference()
-    errors = [scene.deviation(end(scene, dt).positions, reference.positions) for dt in scene.time_steps[1:]]
-    slope = np.polyfit(np.log(scene.time_steps[1:]), np.log(errors), 1)[0]
+    system = small(name)
+    reference = system.reference()
+    errors = [system.deviation(end(system, dt).positions, reference.positions) for dt in system.time_steps[1:]]
+    slope = np.polyfit(np.log(system.time_steps[1:]), np.log(errors), 1)[0]
     assert slope == pytest.approx(2.0, abs=0.1)
     assert reference.error < 0.01 * errors[-1]
 
@@ -66,35 +66,35 @@ def test_rattle_reaches_the_reference_with_order_two(name):
 )
 def test_converged_reference_against_an_independent_integrator(name, size):
     # Eq. (105) with the dense oracle in DOP853: other equations, other code, other integrator.
-    scene = test_systems.build(name, size, **({"forces": "emt"} if name == "ethanol" else {}))
+    system = test_systems.build(name, size, **({"forces": "emt"} if name == "ethanol" else {}))
     if name == "dumbbells":
-        scene = scene.shortened(4)
-    held, masses, shape = scene.constraint_set, scene.masses, scene.positions.shape
+        system = system.shortened(4)
+    held, masses, shape = system.constraint_set, system.masses, system.positions.shape
 
     def rate(_, y):
         x, v = y.reshape(2, *shape)
-        f = scene.potential.forces(x)
+        f = system.potential.forces(x)
         a = projection.acceleration(held.jacobian(x).toarray(), masses, f.ravel(), held.acceleration_target(x, v))
         return np.concatenate([v.ravel(), a])
 
-    start = np.concatenate([scene.positions.ravel(), scene.velocities.ravel()])
-    y = solve_ivp(rate, (0, scene.horizon), start, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
-    reference = scene.reference()
-    assert scene.deviation(y.reshape(2, *shape)[0], reference.positions) < 1e-7
+    start = np.concatenate([system.positions.ravel(), system.velocities.ravel()])
+    y = solve_ivp(rate, (0, system.horizon), start, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+    reference = system.reference()
+    assert system.deviation(y.reshape(2, *shape)[0], reference.positions) < 1e-7
 
 
 @pytest.mark.parametrize("name", STORED)
-def test_scene_is_the_stored_case(name):
-    scene, case = small(name), cases.load(STORED[name])
+def test_system_is_the_stored_case(name):
+    system, case = small(name), cases.load(STORED[name])
     x, v = case.initial.positions, case.initial.velocities
-    np.testing.assert_allclose(scene.positions, x, rtol=0, atol=5e-16)
-    np.testing.assert_allclose(scene.velocities, v, rtol=0, atol=5e-16)
-    np.testing.assert_array_equal(scene.masses, case.masses)
-    forces = scene.potential.forces(x)
+    np.testing.assert_allclose(system.positions, x, rtol=0, atol=5e-16)
+    np.testing.assert_allclose(system.velocities, v, rtol=0, atol=5e-16)
+    np.testing.assert_array_equal(system.masses, case.masses)
+    forces = system.potential.forces(x)
     np.testing.assert_allclose(forces, case.force(x, v), rtol=1e-13, atol=1e-13)
     # The same accelerations: the same constraints.
     for s in case.snapshots:
-        a = scene.motion.acceleration(s.positions, s.velocities, scene.potential.forces(s.positions), s.time)
+        a = system.motion.acceleration(s.positions, s.velocities, system.potential.forces(s.positions), s.time)
         np.testing.assert_allclose(a, s.accelerations, rtol=0, atol=2e-10 * max(1.0, np.abs(s.accelerations).max()))
 
 
@@ -102,13 +102,13 @@ def test_scene_is_the_stored_case(name):
 def test_solution_meets_the_stored_one(name):
     # What is wrong at the start, or on the way, grows as the stored case is sensitive to its start. The start is wrong
     # by rounding, and a step by its tolerance at most; those of many steps do not add up, as they have either sign.
-    scene, case = small(name), cases.load(STORED[name])
+    system, case = small(name), cases.load(STORED[name])
     known = [(s, grown) for s, grown in zip(case.solution, sensitivities(STORED[name]), strict=True)]
-    known = [(s, grown) for s, grown in known if s.time <= scene.horizon]
+    known = [(s, grown) for s, grown in known if s.time <= system.horizon]
     assert known
     for s, grown in known:
-        found = scene.solution(s.time)
-        off = scene.deviation(found.positions, s.positions)
+        found = system.solution(s.time)
+        off = system.deviation(found.positions, s.positions)
         assert off < 4 * FINEST * grown
         assert found.error < 4 * (FINEST + COARSER) * grown
         assert off < 5 * found.error + 4 * EPS * grown  # the estimate is honest
@@ -116,12 +116,12 @@ def test_solution_meets_the_stored_one(name):
 
 @pytest.mark.parametrize("name", STORED)
 def test_solution_stays_on_the_constraints(name):
-    scene = small(name)
-    for time in (0.0, 0.3 * scene.horizon, scene.horizon):
-        x = scene.solution(time).positions
-        np.testing.assert_allclose(scene.constraint_set.value(x, time), 0.0, rtol=0, atol=2e-14)
+    system = small(name)
+    for time in (0.0, 0.3 * system.horizon, system.horizon):
+        x = system.solution(time).positions
+        np.testing.assert_allclose(system.constraint_set.value(x, time), 0.0, rtol=0, atol=2e-14)
         if time == 0.0:
-            np.testing.assert_allclose(x, scene.positions, rtol=0, atol=1e-14)
+            np.testing.assert_allclose(x, system.positions, rtol=0, atol=1e-14)
 
 
 # -- geometry ---------------------------------------------------------------------------------------
@@ -152,6 +152,6 @@ def test_solution_stays_on_the_constraints(name):
         ("ethanol", 1, {"forces": "x"}, "no forces 'x' for ethanol"),
     ],
 )
-def test_bad_scene(name, size, options, text):
+def test_bad_system(name, size, options, text):
     with pytest.raises(InputError, match=text):
         test_systems.build(name, size, **options)

@@ -96,30 +96,30 @@ def test_unreadable_files_and_unknown_names(tmp_path, capsys):
     assert "--forces is for files" in plan("ethanol", "--forces", "emt", capsys=capsys)[2]
 
 
-def test_scene_with_a_calculator_of_ase(ethanol):
-    scene = quietly(test_systems.from_file, ethanol, forces="emt", constrain="hangles")
-    assert scene.constraint_set.n_rows == len(scene.bonds) == 13
-    assert scene.openmm is None
-    assert max(scene.residuals(scene.positions, scene.velocities)) < 1e-12
-    assert "ASE's emt" in scene.title
+def test_system_with_a_calculator_of_ase(ethanol):
+    system = quietly(test_systems.from_file, ethanol, forces="emt", constrain="hangles")
+    assert system.constraint_set.n_rows == len(system.bonds) == 13
+    assert system.openmm is None
+    assert max(system.residuals(system.positions, system.velocities)) < 1e-12
+    assert "ASE's emt" in system.title
 
 
-def test_scene_with_a_force_field_is_the_one_of_openmm(alanine):
+def test_system_with_a_force_field_is_the_one_of_openmm(alanine):
     by_openmm = test_systems.build("alanine", constrain="hbonds")
-    scene = quietly(test_systems.from_file, alanine)
-    assert scene.openmm.home
-    assert {tuple(sorted(p)) for p in scene.bonds.tolist()} == {tuple(sorted(p)) for p in by_openmm.bonds.tolist()}
+    system = quietly(test_systems.from_file, alanine)
+    assert system.openmm.home
+    assert {tuple(sorted(p)) for p in system.bonds.tolist()} == {tuple(sorted(p)) for p in by_openmm.bonds.tolist()}
     x = by_openmm.positions
-    assert scene.potential.energy(x) == pytest.approx(by_openmm.potential.energy(x), abs=1e-9)
-    assert scene.openmm.system.getNumConstraints() == 12
+    assert system.potential.energy(x) == pytest.approx(by_openmm.potential.energy(x), abs=1e-9)
+    assert system.openmm.system.getNumConstraints() == 12
 
 
 def test_rigid_residues_in_openmm(alanine):
-    scene = quietly(test_systems.from_file, alanine, rigid_residues=["ALA"])
-    inside = [k for k, name in enumerate(scene.symbols) if name]
-    assert scene.openmm.home and len(inside) == 22
-    assert scene.openmm.system.getNumConstraints() == scene.motion.constraint_set.n_rows
-    assert scene.motion.rank == 3 * 10 - 6 + 7  # the residue, and the hydrogens of both caps
+    system = quietly(test_systems.from_file, alanine, rigid_residues=["ALA"])
+    inside = [k for k, name in enumerate(system.symbols) if name]
+    assert system.openmm.home and len(inside) == 22
+    assert system.openmm.system.getNumConstraints() == system.motion.constraint_set.n_rows
+    assert system.motion.rank == 3 * 10 - 6 + 7  # the residue, and the hydrogens of both caps
 
 
 def test_forces_that_do_not_fit(ethanol, alanine):
@@ -128,7 +128,7 @@ def test_forces_that_do_not_fit(ethanol, alanine):
     with pytest.raises(InputError, match="residue"):
         quietly(test_systems.from_file, ethanol)  # no template
     with pytest.raises(UnsupportedError, match="holds distances only"):
-        any_file._openmm_host(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
+        any_file._openmm_engine(None, [LinearRelation(0, [1, 2], [0.5, 0.5])], (), "Reference")
 
 
 def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):
@@ -142,7 +142,7 @@ def test_compare_runs_on_a_file(ethanol, tmp_path, capsys, monkeypatch):
     assert json.loads((tmp_path / "compare-ethanol" / "compare.json").read_text())
 
 
-def test_virtual_sites_have_a_plan_and_no_scene(tmp_path):
+def test_virtual_sites_have_a_plan_and_no_system(tmp_path):
     path = tmp_path / "tip4p.gro"
     lines = ["water", "    4"]
     for name, x, y in (("OW", 0.0, 0.0), ("HW1", 0.096, 0.0), ("HW2", -0.024, 0.093), ("MW", 0.009, 0.012)):
@@ -169,7 +169,7 @@ def test_a_protein_in_water_with_force_fields_by_name(tmp_path, capsys, monkeypa
     from openmm import app, unit
 
     monkeypatch.setenv("OPENMM_CPU_THREADS", "1")
-    scene = quietly(test_systems.from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
+    test_system = quietly(test_systems.from_file, VILLIN, select="all", forces="amber14-all,amber14/tip3p")
     pdb = app.PDBFile(str(VILLIN))
     system = app.ForceField("amber14-all.xml", "amber14/tip3p.xml").createSystem(
         pdb.topology, nonbondedMethod=app.PME, constraints=app.HBonds, rigidWater=True
@@ -178,14 +178,14 @@ def test_a_protein_in_water_with_force_fields_by_name(tmp_path, capsys, monkeypa
         tuple(sorted(p[:2])): p[2].value_in_unit(unit.angstrom)
         for p in map(system.getConstraintParameters, range(system.getNumConstraints()))
     }
-    held = {tuple(sorted(pair)) for pair in scene.bonds.tolist()}
-    assert held == set(wanted) and scene.constraint_set.n_atoms == 8867
+    held = {tuple(sorted(pair)) for pair in test_system.bonds.tolist()}
+    assert held == set(wanted) and test_system.constraint_set.n_atoms == 8867
     box = [list(v.value_in_unit(unit.angstrom)) for v in system.getDefaultPeriodicBoxVectors()]
-    np.testing.assert_allclose(scene.cell, box, atol=1e-4)
+    np.testing.assert_allclose(test_system.cell, box, atol=1e-4)
     # The same water: the parameters of the Systems, which one by one decide the energy.
     theirs, ours = (
         next(f for f in one.getForces() if isinstance(f, openmm.NonbondedForce))
-        for one in (system, scene.openmm.system)
+        for one in (system, test_system.openmm.system)
     )
     for k in range(0, 8867, 7):
         assert theirs.getParticleParameters(k) == ours.getParticleParameters(k)

@@ -12,24 +12,24 @@ from kcons.comparison.test_systems import dumbbells
 
 @pytest.mark.parametrize("size", [8, 20])
 def test_box_of_dumbbells(size):
-    scene = test_systems.build("dumbbells", size, seed=3)
-    assert scene.n_atoms == 2 * size
-    assert scene.motion.rank == size
-    sigma, tangency = scene.residuals(scene.positions, scene.velocities)
+    system = test_systems.build("dumbbells", size, seed=3)
+    assert system.n_atoms == 2 * size
+    assert system.motion.rank == size
+    sigma, tangency = system.residuals(system.positions, system.velocities)
     assert sigma < 1e-14
     assert tangency < 1e-14
-    d = scene.positions[:, None] - scene.positions
-    d -= scene.cell * np.round(d / scene.cell)
+    d = system.positions[:, None] - system.positions
+    d -= system.cell * np.round(d / system.cell)
     other = np.arange(2 * size)[:, None] // 2 != np.arange(2 * size) // 2
     assert np.linalg.norm(d, axis=2)[other].min() > 1.0  # no overlaps
-    x, direction = scene.positions, np.random.default_rng(1).standard_normal(scene.positions.shape)
-    slope = (scene.potential.energy(x + 1e-6 * direction) - scene.potential.energy(x - 1e-6 * direction)) / 2e-6
-    assert slope == pytest.approx(-np.sum(scene.potential.forces(x) * direction), rel=1e-6)
+    x, direction = system.positions, np.random.default_rng(1).standard_normal(system.positions.shape)
+    slope = (system.potential.energy(x + 1e-6 * direction) - system.potential.energy(x - 1e-6 * direction)) / 2e-6
+    assert slope == pytest.approx(-np.sum(system.potential.forces(x) * direction), rel=1e-6)
     # Forces do not see where the box begins, nor by which image an atom is given.
-    moved = x + scene.cell * np.array([0.3, 2.0, -1.0])
-    np.testing.assert_allclose(scene.potential.forces(moved), scene.potential.forces(x), atol=1e-11)
-    reference = scene.reference()
-    errors = [scene.deviation(end(scene, dt).positions, reference.positions) for dt in scene.time_steps[1:]]
+    moved = x + system.cell * np.array([0.3, 2.0, -1.0])
+    np.testing.assert_allclose(system.potential.forces(moved), system.potential.forces(x), atol=1e-11)
+    reference = system.reference()
+    errors = [system.deviation(end(system, dt).positions, reference.positions) for dt in system.time_steps[1:]]
     np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.1)
     assert reference.error < 1e-4 * errors[-1]
 

@@ -22,12 +22,12 @@ def test_optima_are_the_published_ones():
 
 @pytest.mark.parametrize("size", OPTIMA)
 def test_every_size_finds_its_optimum(size):
-    scene = test_systems.build("fekete", size)
-    found = measure.compare(scene.with_time_steps([0.16]), methods=["rattle"])
+    system = test_systems.build("fekete", size)
+    found = measure.compare(system.with_time_steps([0.16]), methods=["rattle"])
     (m,) = found.of("rattle")
     assert m.error < 1e-8
     assert found.reference["how"].startswith("the least energy known")
-    assert scene.deviation(scene.positions, scene.positions) > 0.01  # energy, not distance
+    assert system.deviation(system.positions, system.positions) > 0.01  # energy, not distance
 
 
 def test_sizes_without_a_known_optimum_are_refused():
@@ -36,8 +36,8 @@ def test_sizes_without_a_known_optimum_are_refused():
 
 
 def test_methods_without_friction_refuse():
-    scene = test_systems.build("fekete")
+    system = test_systems.build("fekete")
     for name in ("ase-kcons", "shake-1e-8", "openmm-verlet"):
-        assert "friction" in methods.METHODS[name].refuses(scene)
+        assert "friction" in methods.METHODS[name].refuses(system)
     for name in ("rattle", "kahan-li6", "dop853"):
-        assert methods.METHODS[name].refuses(scene) is None
+        assert methods.METHODS[name].refuses(system) is None

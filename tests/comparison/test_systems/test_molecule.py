@@ -13,17 +13,17 @@ from kcons.motion import Motion
 
 
 def test_ethanol_topology():
-    scene = small("ethanol")
-    bonds = scene.angle_bonds
+    system = small("ethanol")
+    bonds = system.angle_bonds
     assert len(bonds) == 8
-    assert len(scene.angles) == 13
-    symbols = np.array(scene.symbols)
+    assert len(system.angles) == 13
+    symbols = np.array(system.symbols)
     assert sorted("".join(sorted(symbols[pair])) for pair in bonds) == ["CC"] + ["CH"] * 5 + ["CO"] + ["HO"]
-    assert scene.motion.rank == 19
-    assert scene.motion.degrees_of_freedom == 8
+    assert system.motion.rank == 19
+    assert system.motion.degrees_of_freedom == 8
     # The same set by distances alone.
-    assert Motion(scene.constraint_set, scene.positions).rank == 19
-    assert len(scene.bonds) == 21
+    assert Motion(system.constraint_set, system.positions).rank == 19
+    assert len(system.bonds) == 21
 
 
 @pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")

@@ -71,9 +71,9 @@ def test_alanine_dipeptide(alanine):
 
 @pytest.mark.parametrize(("constrain", "rows"), [("hbonds", 12), ("hangles", 30)])
 def test_what_is_held_can_be_chosen(constrain, rows):
-    scene = test_systems.build("alanine", constrain=constrain)
-    assert scene.constraint_set.n_rows == rows
-    assert scene.openmm.system.getNumConstraints() == rows
+    system = test_systems.build("alanine", constrain=constrain)
+    assert system.constraint_set.n_rows == rows
+    assert system.openmm.system.getNumConstraints() == rows
 
 
 def test_reference_is_converged_in_double_precision(alanine):
@@ -81,28 +81,28 @@ def test_reference_is_converged_in_double_precision(alanine):
 
 
 def test_protein_of_2489_atoms():
-    scene = structure.build(structure="dhfr", platform="CPU")
-    assert (scene.n_atoms, scene.constraint_set.n_rows, scene.motion.rank) == (2489, 2523, 2523)
-    assert scene.openmm.platform == "CPU"
-    assert scene.residuals(scene.positions, scene.velocities)[0] < 1e-12
+    system = structure.build(structure="dhfr", platform="CPU")
+    assert (system.n_atoms, system.constraint_set.n_rows, system.motion.rank) == (2489, 2523, 2523)
+    assert system.openmm.platform == "CPU"
+    assert system.residuals(system.positions, system.velocities)[0] < 1e-12
 
 
 @pytest.mark.validation
 @pytest.mark.parametrize(("name", "atoms", "rows"), [("villin", 8867, 8576), ("dhfr-water", 23558, 22290)])
 def test_proteins_in_water(name, atoms, rows):
-    scene = test_systems.build(name)
-    assert (scene.n_atoms, scene.constraint_set.n_rows) == (atoms, rows)
-    assert "PME" in scene.title
-    assert scene.residuals(scene.positions, scene.velocities)[0] < 1e-12
+    system = test_systems.build(name)
+    assert (system.n_atoms, system.constraint_set.n_rows) == (atoms, rows)
+    assert "PME" in system.title
+    assert system.residuals(system.positions, system.velocities)[0] < 1e-12
     # Forces in single precision, and enough of a cutoff's smoothness to tell methods apart.
-    assert scene.reference().error < 1e-5
+    assert system.reference().error < 1e-5
 
 
 def test_file_is_the_same_molecule(alanine):
-    scene = test_systems.from_file(ALANINE, constrain="allbonds")
-    np.testing.assert_array_equal(scene.positions, alanine.positions)
-    np.testing.assert_array_equal(scene.velocities, alanine.velocities)
-    assert scene.name == ALANINE.stem
+    system = test_systems.from_file(ALANINE, constrain="allbonds")
+    np.testing.assert_array_equal(system.positions, alanine.positions)
+    np.testing.assert_array_equal(system.velocities, alanine.velocities)
+    assert system.name == ALANINE.stem
     assert test_systems.from_file(ALANINE, quick=True).horizon == pytest.approx(alanine.horizon / 2)
 
 
@@ -116,9 +116,9 @@ def test_start_is_relaxed():
 
 
 def test_hydrogens_are_added(bare):
-    scene = test_systems.from_file(bare, add_hydrogens=True)
-    assert scene.n_atoms == 22
-    assert scene.constraint_set.n_rows == 12
+    system = test_systems.from_file(bare, add_hydrogens=True)
+    assert system.n_atoms == 22
+    assert system.constraint_set.n_rows == 12
 
 
 def test_hydrogens_do_not_depend_on_the_platforms_of_the_machine(bare, monkeypatch):
@@ -136,17 +136,17 @@ def test_hydrogens_do_not_depend_on_the_platforms_of_the_machine(bare, monkeypat
 
 
 def test_box_decides_about_the_forces(tmp_path, alanine):
-    scene = test_systems.from_file(water(tmp_path / "water.pdb"))
-    assert "PME" in scene.title
-    assert scene.constraint_set.n_rows == 3
-    np.testing.assert_allclose(scene.cell, 20 * np.eye(3), atol=1e-9)
+    system = test_systems.from_file(water(tmp_path / "water.pdb"))
+    assert "PME" in system.title
+    assert system.constraint_set.n_rows == 3
+    np.testing.assert_allclose(system.cell, 20 * np.eye(3), atol=1e-9)
     # Lengths are those that SETTLE holds, in single precision.
-    found = measure.compare(scene.with_time_steps([1.0]), methods=["openmm-verlet", "openmm-kcons-rattle"])
+    found = measure.compare(system.with_time_steps([1.0]), methods=["openmm-verlet", "openmm-kcons-rattle"])
     assert all(m.status == "ok" and m.constraint_residual < 1e-12 for m in found.measurements)
     placeholder = "CRYST1    1.000    1.000    1.000  90.00  90.00  90.00 P 1           1\n"
-    scene = test_systems.from_file(changed(tmp_path / "nmr.pdb", head=placeholder))
-    assert scene.cell is None
-    assert "PME" not in scene.title
+    system = test_systems.from_file(changed(tmp_path / "nmr.pdb", head=placeholder))
+    assert system.cell is None
+    assert "PME" not in system.title
     assert alanine.cell is None
 
 

@@ -16,52 +16,52 @@ from kcons.steppers import State, System, run
 
 
 def test_error_estimate_of_the_converged_reference_is_honest():
-    scene = small("chain")
-    fine = converged(scene, min(scene.time_steps) / 4)
+    system = small("chain")
+    fine = converged(system, min(system.time_steps) / 4)
     assert fine.error < 1e-12
-    for dt in (4 * max(scene.time_steps), 2 * max(scene.time_steps)):
-        coarse = converged(scene, dt)
-        assert 0.05 * coarse.error < scene.deviation(coarse.positions, fine.positions) < coarse.error
+    for dt in (4 * max(system.time_steps), 2 * max(system.time_steps)):
+        coarse = converged(system, dt)
+        assert 0.05 * coarse.error < system.deviation(coarse.positions, fine.positions) < coarse.error
         assert coarse.error > 100 * fine.error
 
 
 def test_error_estimate_of_the_converged_reference_sees_noisy_forces():
-    scene = small("chain")
+    system = small("chain")
     rng = np.random.default_rng(4)
 
     def noisy(x):
-        energy, forces = scene.potential.energy(x), scene.potential.forces(x)
+        energy, forces = system.potential.energy(x), system.potential.forces(x)
         return energy, forces * (1 + 1e-6 * rng.standard_normal(forces.shape))
 
-    right = scene.reference()
-    found = replace(scene, potential=Potential(noisy, "noisy")).reference()
-    off = scene.deviation(found.positions, right.positions)
+    right = system.reference()
+    found = replace(system, potential=Potential(noisy, "noisy")).reference()
+    off = system.deviation(found.positions, right.positions)
     assert off > 1e3 * right.error
     assert 0.2 * off < found.error < 20 * off
 
 
 def test_thermal_velocities():
-    scene = small("water")
-    v = thermal_velocities(scene.motion, scene.positions, 300.0, seed=3)
-    masses = scene.masses[:, None]
+    system = small("water")
+    v = thermal_velocities(system.motion, system.positions, 300.0, seed=3)
+    masses = system.masses[:, None]
     assert np.abs(np.sum(masses * v, axis=0)).max() < 1e-12
     kinetic = 0.5 * np.sum(masses * v**2)
     assert kinetic == pytest.approx(0.5 * (6 * 8 - 3) * units.kB * 300.0, rel=1e-12)
-    again = thermal_velocities(scene.motion, scene.positions, 300.0, seed=3)
+    again = thermal_velocities(system.motion, system.positions, 300.0, seed=3)
     assert np.array_equal(v, again)
-    assert not np.allclose(v, thermal_velocities(scene.motion, scene.positions, 300.0, seed=4))
+    assert not np.allclose(v, thermal_velocities(system.motion, system.positions, 300.0, seed=4))
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_atoms_carry_the_scene(name):
-    scene = small(name)
-    atoms = scene.atoms()
+def test_atoms_carry_the_system(name):
+    system = small(name)
+    atoms = system.atoms()
     assert not atoms.constraints
-    np.testing.assert_array_equal(atoms.positions, scene.positions)
-    np.testing.assert_allclose(atoms.get_velocities(), scene.velocities, rtol=1e-14, atol=1e-300)
-    np.testing.assert_array_equal(atoms.get_forces(), scene.potential.forces(scene.positions))
-    assert atoms.get_potential_energy() == scene.potential.energy(scene.positions)
-    np.testing.assert_array_equal(atoms.get_masses(), scene.masses)
+    np.testing.assert_array_equal(atoms.positions, system.positions)
+    np.testing.assert_allclose(atoms.get_velocities(), system.velocities, rtol=1e-14, atol=1e-300)
+    np.testing.assert_array_equal(atoms.get_forces(), system.potential.forces(system.positions))
+    assert atoms.get_potential_energy() == system.potential.energy(system.positions)
+    np.testing.assert_array_equal(atoms.get_masses(), system.masses)
 
 
 @pytest.mark.parametrize(
@@ -73,15 +73,15 @@ def test_bad_time_step(dt, text):
 
 
 def test_time_steps_are_sorted_coarse_first():
-    scene = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
-    np.testing.assert_allclose(np.array(scene.time_steps) / units.fs, [10.0, 5.0, 2.5])
+    system = small("chain").with_time_steps([2.5, 10.0, 5.0, 5.0])
+    np.testing.assert_allclose(np.array(system.time_steps) / units.fs, [10.0, 5.0, 2.5])
 
 
 @pytest.mark.parametrize("name", ["sphere", "sphere-pendulum", "rotor", "bead-rotating"])
-def test_shortened_scene_has_its_solution_at_its_own_horizon(name):
-    scene = small(name)
-    half = scene.shortened(2)
-    assert half.horizon == scene.horizon / 2
+def test_shortened_system_has_its_solution_at_its_own_horizon(name):
+    test_system = small(name)
+    half = test_system.shortened(2)
+    assert half.horizon == test_system.horizon / 2
     system = System(half.motion, half.potential.forces)
     end = run(system, State(half.positions, half.velocities), half.horizon / 800, 800)
     assert half.deviation(end.positions, half.reference().positions) < 1e-4

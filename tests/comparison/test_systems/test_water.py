@@ -25,8 +25,8 @@ def test_equilibrated_water_needs_no_relaxation(size):
 
 
 def test_cut_water_has_no_overlaps():
-    scene = test_systems.build("water", 20, forces="ase")
-    d = scene.positions[::3][:, None] - scene.positions[::3]
-    d -= scene.cell * np.round(d / scene.cell)
+    system = test_systems.build("water", 20, forces="ase")
+    d = system.positions[::3][:, None] - system.positions[::3]
+    d -= system.cell * np.round(d / system.cell)
     assert np.linalg.norm(d, axis=2)[np.triu_indices(20, 1)].min() > 2.2
-    assert scene.potential.energy(scene.positions) / 20 < -0.2  # eV a molecule; ice is near -0.6
+    assert system.potential.energy(system.positions) / 20 < -0.2  # eV a molecule; ice is near -0.6

@@ -130,7 +130,7 @@ def test_evaluations_decide_where_forces_take_no_time():
     assert fronts.verdict(comparison(*RATTLE, force=1e-5)).decides == "wall"
 
 
-def test_hosts_are_judged_by_themselves():
+def test_md_engines_are_judged_by_themselves():
     # Within ASE nothing beats kcons, though OpenMM is cheaper; across MD engines evaluations are compared.
     points = (
         point("ase-kcons", "ASE Verlet + kcons", 1e-2, 100, 3.0),
@@ -138,11 +138,11 @@ def test_hosts_are_judged_by_themselves():
         point("openmm-verlet", "OpenMM Verlet, 1e-5", 1e-2, 50, 0.1),
     )
     found = fronts.verdict(comparison(*points))
-    standings = {(s.host, s.cost): s for s in found.standings}
+    standings = {(s.md_engine, s.cost): s for s in found.standings}
     assert standings["ASE", "wall"].gain == pytest.approx(10.0)
     assert not standings["ASE", "wall"].losses
     assert not standings["OpenMM", "wall"].rivals  # nothing of kcons there
-    assert [loss.method for loss in standings[fronts.EVERY_HOST, "evaluations"].losses] == ["openmm-verlet"]
+    assert [loss.method for loss in standings[fronts.EVERY_MD_ENGINE, "evaluations"].losses] == ["openmm-verlet"]
 
 
 def test_baselines_and_failures_are_no_points():
@@ -162,14 +162,14 @@ def test_many_losses_in_one_sentence():
     assert "33 % cheaper" in fronts.sentence(losses[0], "Å")
 
 
-def test_summary_has_a_row_for_each_host():
+def test_summary_has_a_row_for_each_md_engine():
     peer = point("dop853", "SciPy DOP853", 1e-2, 300, 3.0)
     (row,) = fronts.summary(comparison(*RATTLE, peer))
-    assert (row["host"], row["cost"], row["losses"]) == ("arrays", "wall time", [])
+    assert (row["md_engine"], row["cost"], row["losses"]) == ("arrays", "wall time", [])
     assert row["front"] == ["kcons RATTLE"]
 
 
-def test_evaluations_decide_on_a_host_that_computes_forces_in_no_time():
+def test_evaluations_decide_on_an_md_engine_that_computes_forces_in_no_time():
     ours = point("openmm-rattle", "OpenMM + kcons compiled RATTLE, 1e-12", 1e-3, 100, 2e-5)
     theirs = point("openmm-verlet", "OpenMM Verlet, 1e-5", 1e-3, 100, 1e-5)
     arrays = (point("rattle", "kcons RATTLE", 1e-3, 100, 1.0), point("shake-1e-8", "SHAKE", 1e-3, 100, 0.9))
@@ -178,5 +178,5 @@ def test_evaluations_decide_on_a_host_that_computes_forces_in_no_time():
         found = fronts.verdict(comparison(ours, theirs, baseline, *arrays, force=1e-5, margin=0.05))
         assert found.decides_on("OpenMM") == decides
         assert found.decides_on("arrays") == "wall"
-        assert [loss.host for loss in found.losses if loss.host == "OpenMM"] == ["OpenMM"] * losses
-        assert any(loss.host == "arrays" for loss in found.losses)
+        assert [loss.md_engine for loss in found.losses if loss.md_engine == "OpenMM"] == ["OpenMM"] * losses
+        assert any(loss.md_engine == "arrays" for loss in found.losses)

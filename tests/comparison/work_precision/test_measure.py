@@ -45,9 +45,9 @@ def test_error_falls_with_the_square_of_the_step(result, method):
 
 
 def test_rattle_is_the_same_in_the_core_and_in_ase(result):
-    for core, hosted in zip(result.of("rattle"), result.of("ase-kcons"), strict=True):
-        assert hosted.error == pytest.approx(core.error, rel=1e-6)
-        assert hosted.evaluations_per_time == pytest.approx(core.evaluations_per_time)
+    for core, in_openmm in zip(result.of("rattle"), result.of("ase-kcons"), strict=True):
+        assert in_openmm.error == pytest.approx(core.error, rel=1e-6)
+        assert in_openmm.evaluations_per_time == pytest.approx(core.evaluations_per_time)
 
 
 def test_error_is_the_distance_from_the_reference(chain, result):
@@ -124,13 +124,13 @@ def test_methods_that_cannot_hold_a_sphere_say_so(spheres):
 
 
 def test_energy_slope_is_the_fit():
-    scene = test_systems.build("sphere", 2)
+    system = test_systems.build("sphere", 2)
     log = measure._Log(times=[0.0, 1.0, 2.0, 3.0, 4.0], energies=[1.0, 3.0, 5.0, 7.0, 9.0])
-    slope, error = measure._energy_slope(scene, log)
-    assert slope == pytest.approx(2.0 / scene.motion.degrees_of_freedom)
+    slope, error = measure._energy_slope(system, log)
+    assert slope == pytest.approx(2.0 / system.motion.degrees_of_freedom)
     assert error == pytest.approx(0.0, abs=1e-12)
     log.energies = [0.0, 1.0, 0.0, 1.0, 0.0]
-    slope, error = measure._energy_slope(scene, log)
+    slope, error = measure._energy_slope(system, log)
     assert abs(slope) < 2 * error
 
 
@@ -142,8 +142,8 @@ class Slow(methods.CoreStepper):
 
     pause = 0.6
 
-    def start(self, scene, setting):
-        started = super().start(scene, setting)
+    def start(self, system, setting):
+        started = super().start(system, setting)
         advance, pause = started.advance, self.pause
 
         def slowly():
@@ -155,7 +155,7 @@ class Slow(methods.CoreStepper):
 
 
 class Broken(methods.CoreStepper):
-    def start(self, scene, setting):
+    def start(self, system, setting):
         raise ConvergenceError("did not converge, as an example\nwith more lines")
 
 
@@ -195,13 +195,13 @@ def test_failure_of_a_method_is_a_result(monkeypatch, chain):
 
 def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
     class Runaway(methods.CoreStepper):
-        def start(self, scene, setting):
-            started = super().start(scene, setting)
+        def start(self, system, setting):
+            started = super().start(system, setting)
             advance = started.advance
 
             def away():
                 advance()
-                started._state = replace(started._state, positions=np.full_like(scene.positions, np.nan))
+                started._state = replace(started._state, positions=np.full_like(system.positions, np.nan))
 
             started.advance = away
             return started
@@ -247,11 +247,11 @@ COMPOSED = ("suzuki4", "kahan-li6", "blanes-moan4", "blanes-moan6")
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_quick_comparison(name):
-    scene = test_systems.build(name, quick=True)
+    system = test_systems.build(name, quick=True)
     if name in ("bead-ellipse", "bead-torus"):
-        scene = scene.shortened(3)  # nothing is compiled on these surfaces
-    steps = scene.time_steps[:2]
-    result = measure.compare(replace(scene, time_steps=steps), budget=60)
+        system = system.shortened(3)  # nothing is compiled on these surfaces
+    steps = system.time_steps[:2]
+    result = measure.compare(replace(system, time_steps=steps), budget=60)
     refused = {m.method: m.note for m in result.measurements if m.status == "not run" and m.setting == 0}
     assert refused.keys() == REFUSED[name].keys()
     for method, text in REFUSED[name].items():
@@ -268,9 +268,9 @@ def test_quick_comparison(name):
     for m in plain:
         assert m.constraint_residual < 1e-12
         assert m.velocity_residual < 1e-12
-        assert m.evaluations_per_time == pytest.approx(scene.units.long_time_unit / scene.units.time_unit / m.setting)
-    for core, hosted in zip(plain, result.of("ase-kcons"), strict="ase-kcons" not in refused):
-        assert hosted.error == pytest.approx(core.error, rel=1e-5)
+        assert m.evaluations_per_time == pytest.approx(system.units.long_time_unit / system.units.time_unit / m.setting)
+    for core, in_openmm in zip(plain, result.of("ase-kcons"), strict="ase-kcons" not in refused):
+        assert in_openmm.error == pytest.approx(core.error, rel=1e-5)
     # The projected equation, at its tightest tolerance, is closer than RATTLE.
     assert result.of("dop853")[-1].error < 0.1 * plain[-1].error
     assert result.reference["error"] < 1e-3 * plain[-1].error

@@ -6,7 +6,7 @@ from kcons.comparison import test_systems
 from kcons.comparison.work_precision import parts_of_the_whole, whole
 
 
-def test_the_plan_has_every_scene_that_was_asked_for():
+def test_the_plan_has_every_system_that_was_asked_for():
     plan = {item.key: item for item in parts_of_the_whole.PLAN}
     assert len(plan) == len(parts_of_the_whole.PLAN)
     for item in plan.values():

@@ -187,9 +187,9 @@ def test_methods_differ_in_colour_and_marker(monkeypatch):
     styles = {name: report.style(name) for name in known + others}
     assert len({colour for colour, _ in styles.values()}) == len(styles)
     # Methods of OpenMM may share markers with those of other MD engines, which are of other colours.
-    hosted = [styles[name][1] for name in known if name.startswith("openmm")]
+    in_openmm = [styles[name][1] for name in known if name.startswith("openmm")]
     rest = [styles[name][1] for name in [*known, *others] if name not in known or not name.startswith("openmm")]
-    assert len(set(hosted)) == len(hosted)
+    assert len(set(in_openmm)) == len(in_openmm)
     assert len(set(rest)) == len(rest) - 1  # both baselines have the same
     assert report.style("unheard of") == ("black", "x")
 

@@ -41,21 +41,21 @@ def spheres():
 
 
 MARCHING = ("rattle", "suzuki4", "blanes-moan6", "geodesic", "projected-rk4", "baumgarte", "verlet")
-HOSTED = ("ase-kcons", "ase-bonds", "ase-internals", "ase-verlet", "shake-1e-4", "shake-1e-8", "mici", "mici-tight")
+IN_OPENMM = ("ase-kcons", "ase-bonds", "ase-internals", "ase-verlet", "shake-1e-4", "shake-1e-8", "mici", "mici-tight")
 
 
-def started(scene, name):
+def started(system, name):
     if name.startswith("mici"):
         pytest.importorskip("mici")
     method = methods.METHODS[name]
     assert method.marches
-    return method.start(scene, min(method.settings(scene)))
+    return method.start(system, min(method.settings(system)))
 
 
 # -- steps that nobody looks at ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*MARCHING, *HOSTED])
+@pytest.mark.parametrize("name", [*MARCHING, *IN_OPENMM])
 def test_marching_is_advancing(chain, name):
     looked_at, alone = started(chain, name), started(chain, name)
     for _ in range(7):
@@ -78,7 +78,7 @@ def test_marching_is_advancing_with_friction(name):
     np.testing.assert_array_equal(alone.positions, looked_at.positions)
 
 
-@pytest.mark.parametrize("name", [*MARCHING, *HOSTED])
+@pytest.mark.parametrize("name", [*MARCHING, *IN_OPENMM])
 def test_back_at_the_start_everything_is_as_it_was(chain, name):
     run = started(chain, name)
     evaluations = chain.potential.evaluations
@@ -342,8 +342,8 @@ def test_whole_runs_are_made_again_where_steps_cannot_be(chain, monkeypatch):
     runs = []
     start = methods.ProjectedOde.start
 
-    def noted(self, scene, setting):
-        run = start(self, scene, setting)
+    def noted(self, system, setting):
+        run = start(self, system, setting)
         runs.append((run, run.constraints.seconds))
         return run
 
@@ -384,8 +384,8 @@ def test_a_round_that_does_not_come_back_is_interrupted(chain, monkeypatch):
             pass
 
     monkeypatch.setattr(methods._CoreRun, "march", endless)
-    scene = replace(chain, time_steps=chain.time_steps[:1])
-    (only,) = measure.compare(scene, methods=["rattle"], rounds=SHORT, budget=0.5).measurements
+    system = replace(chain, time_steps=chain.time_steps[:1])
+    (only,) = measure.compare(system, methods=["rattle"], rounds=SHORT, budget=0.5).measurements
     assert only.status == "ok"
     assert "round 1: OverBudgetError: not done after 1.5 s" in only.note
 
@@ -406,9 +406,9 @@ def test_openmm_makes_many_steps_at_a_stretch(chain):
 
 @pytest.mark.skipif(find_spec("openmm") is None, reason="OpenMM is not installed")
 def test_openmm_is_timed_in_rounds():
-    scene = test_systems.build("chain", 4)
-    scene = replace(scene, time_steps=scene.time_steps[:1])
-    found = measure.compare(scene, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
+    system = test_systems.build("chain", 4)
+    system = replace(system, time_steps=system.time_steps[:1])
+    found = measure.compare(system, methods=["openmm-verlet", "openmm-held-rattle"], rounds=SHORT)
     assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
     assert not any(m.note for m in found.measurements)
     assert found.timing["margin"] is not None

@@ -45,7 +45,7 @@ class Listener(Watcher):
 def tiny(monkeypatch):
     for module in (parts_of_the_whole, whole):
         monkeypatch.setattr(module, "PLAN", TINY)
-    monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
+    monkeypatch.setattr(whole, "methods_of", lambda item, system, quick: (METHODS, {}))
     monkeypatch.setattr(machine, "code_digest", lambda: "digest")
 
 
@@ -55,7 +55,7 @@ def finished(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for module in (parts_of_the_whole, whole):
             patch.setattr(module, "PLAN", TINY)
-        patch.setattr(whole, "methods_of", lambda item, scene, quick: (METHODS, {}))
+        patch.setattr(whole, "methods_of", lambda item, system, quick: (METHODS, {}))
         patch.setattr(machine, "code_digest", lambda: "digest")
         whole.run(TINY, folder)
     return folder
@@ -151,7 +151,7 @@ def test_page_is_one_file_with_everything(finished):
     assert f"numpy {environment['versions']['numpy']}" in page.text
 
 
-def test_winners_name_host_and_gain(finished):
+def test_winners_name_md_engine_and_gain(finished):
     table = whole_page.winners(whole.parts(finished))
     cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
     (sphere,) = [row for row in cells if row["test system"] == "Spheres"]
@@ -216,7 +216,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     assert (tmp_path / "sphere.json").exists()
 
 
-def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
+def test_other_code_system_or_settings_are_measured_anew(finished, monkeypatch):
     item = TINY[0]
     key = whole.read(finished, item.key)["key"]
     assert key == whole.key_of(item, False)
@@ -228,7 +228,7 @@ def test_other_code_scene_or_settings_are_measured_anew(finished, monkeypatch):
 
 @pytest.mark.usefixtures("empty_pictures")
 def test_fresh_measures_again_and_half_a_file_is_no_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(whole, "methods_of", lambda item, scene, quick: (["rattle"], {}))
+    monkeypatch.setattr(whole, "methods_of", lambda item, system, quick: (["rattle"], {}))
     (tmp_path / "sphere.json").write_text('{"format": "kcons-rep')
     assert whole.read(tmp_path, "sphere") is None
     sphere = TINY[2:3]
@@ -248,7 +248,7 @@ def test_quick_leaves_large_parts_out_and_keeps_to_its_time(tmp_path):
     assert all(done <= total for done, total in listener.times)
 
 
-def test_a_scene_that_cannot_be_built_is_a_failure_and_is_tried_again(tmp_path):
+def test_a_system_that_cannot_be_built_is_a_failure_and_is_tried_again(tmp_path):
     bad = (Item("chain-0", "No chain", "chain", 0),)
     for _ in range(2):
         listener = Listener()
@@ -319,16 +319,16 @@ def test_there_is_nothing_to_redraw(tmp_path):
 # -- the real plan ----------------------------------------------------------------------------------
 
 
-def test_methods_are_the_usual_ones_of_every_host(monkeypatch):
+def test_methods_are_the_usual_ones_of_every_md_engine(monkeypatch):
     monkeypatch.undo()
-    scene = test_systems.build("chain", 3)
-    names, left_out = whole.methods_of(Item("x", "x", "chain"), scene, False)
+    system = test_systems.build("chain", 3)
+    names, left_out = whole.methods_of(Item("x", "x", "chain"), system, False)
     for name in ("rattle", "blanes-moan6", "ase-kcons", "ase-bonds", "ase-internals", "dop853", "verlet"):
         assert name in names
     assert "openmm-middle-bath" not in names
     assert not left_out
     assert set(STEPPERS) | {"extrapolation"} <= set(names)
-    quick, _ = whole.methods_of(Item("x", "x", "chain"), scene, True)
+    quick, _ = whole.methods_of(Item("x", "x", "chain"), system, True)
     assert {name for name in quick if name in STEPPERS} == set(USUAL_STEPPERS)
-    kept, out = whole.methods_of(Item("x", "x", "chain", without={"ase-i": "slow", "dop": "why"}), scene, False)
+    kept, out = whole.methods_of(Item("x", "x", "chain", without={"ase-i": "slow", "dop": "why"}), system, False)
     assert out == {"ase-internals": "slow", "dop853": "why", "dop853-projected": "why"} and not set(out) & set(kept)

@@ -36,6 +36,7 @@ from kcons.constraints import Distance
 from kcons.errors import ConvergenceError, InputError, NonFiniteError, OverdeterminedError, UnsupportedError
 from kcons.openmm import (
     NoseHoover,
+    NoseHooverMiddle,
     ProjectedIntegrator,
     SurfaceIntegrator,
     hold,
@@ -127,6 +128,86 @@ def test_conserved_energy_is_kept_to_order_two(platform):
         assert slopes[0] == pytest.approx(2, abs=0.5)
     else:
         np.testing.assert_allclose(slopes, 2, atol=0.2)
+
+
+# -- the chain in the middle of a step -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_a_chain_in_the_middle_conserves_energy_to_order_two(platform):
+    system, x, v = alanine("HBonds")
+    spans = []
+    for n in (1, 2, 4):
+        ensemble = NoseHooverMiddle(300.0, 20.0)
+        integrator = ProjectedIntegrator(1e-3 / n, ensemble=ensemble, tolerance=1e-12)
+        context = started(system, integrator, x, v, platform)
+        values = []
+        for _ in range(100):
+            integrator.step(n)
+            values.append(ensemble.conserved_energy(integrator))
+        spans.append(np.std(values))
+        assert max(residuals(system, context)) <= 1e-9
+    np.testing.assert_allclose(-np.diff(np.log2(spans)), 2, atol=0.2)
+
+
+def test_a_chain_in_the_middle_is_the_same_chain_in_small_steps():
+    """The link's velocity of both differs by the square of the time step."""
+    system, x, v = alanine("HBonds")
+    apart = []
+    for n in (100, 200):
+        links = []
+        for ensemble in (NoseHoover(300.0, 20.0), NoseHooverMiddle(300.0, 20.0)):
+            integrator = ProjectedIntegrator(0.05 / n, ensemble=ensemble, tolerance=1e-12)
+            context = run(system, integrator, x, 1.2 * v, n)
+            links.append(integrator.getGlobalVariableByName("link1"))
+            del context
+        apart.append(abs(links[0] - links[1]))
+        assert abs(links[0]) > 5 * apart[-1]
+    assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.3)
+
+
+def test_a_chain_in_the_middle_is_time_reversible():
+    """With velocities and links turned round, 50 steps of 4 fs lead back; without the links they do not."""
+    system, x, v = alanine("AllBonds")
+    for turned, limit in ((-1.0, 1e-9), (1.0, None)):
+        integrator = ProjectedIntegrator(4e-3, ensemble=NoseHooverMiddle(300.0, 20.0), tolerance=1e-14)
+        context = run(system, integrator, x, v, 20)
+        start = state_of(context)
+        integrator.step(50)
+        assert np.abs(positions_of(context) - start[0]).max() > 0.01
+        context.setVelocities(-state_of(context)[1])
+        for k in (1, 2, 3):
+            link = f"link{k}"
+            integrator.setGlobalVariableByName(link, turned * integrator.getGlobalVariableByName(link))
+        integrator.step(50)
+        off = np.abs(positions_of(context) - start[0]).max()
+        assert off <= limit if limit else off > 1e-4
+
+
+def test_carried_rows_under_a_chain_in_the_middle_move_as_those_of_the_system():
+    system, x, v = loose_alanine()
+    other = copy.deepcopy(system)
+    carried = hold(other, [], positions=x, take="all")
+    ends = []
+    for this, parts in ((system, ()), (other, (carried,))):
+        ensemble = NoseHooverMiddle(300.0, 20.0, momentum="free")
+        integrator = ProjectedIntegrator(1e-3, parts=parts, tolerance=1e-13, ensemble=ensemble)
+        context = run(this, integrator, x, v, 20)
+        ends.append((*state_of(context), integrator.program.remembered()))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=3e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=3e-9)
+    assert ends[0][2] == pytest.approx(ends[1][2], rel=1e-7)
+
+
+def test_a_chain_in_the_middle_takes_rattle_and_stays_itself():
+    for scheme in ("leapfrog", "suzuki4", "geodesic"):
+        with pytest.raises(UnsupportedError, match=r"leapfrog|order|another form"):
+            ProjectedIntegrator(1e-3, scheme, ensemble=NoseHooverMiddle(300.0, 20.0))
+    ensemble = NoseHooverMiddle(300.0, 20.0, length=2)
+    assert ensemble != NoseHoover(300.0, 20.0, length=2)
+    warmer = ensemble.at(310.0)
+    assert type(warmer) is NoseHooverMiddle
+    assert repr(warmer) == "NoseHooverMiddle(310 K, 20/ps, length=2)"
 
 
 # -- what is held ----------------------------------------------------------------------------------------

@@ -7,13 +7,11 @@ from functools import cache
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import PLATFORMS, context_of
+from openmm_systems import PLATFORMS
 from reference import cases
 from surface_cases import (
-    FORMULA,
     KINDS,
     POSITIONS,
-    QUADRICS,
     core_run,
     energy_of,
     on_surface,
@@ -100,18 +98,6 @@ def test_observed_order(kind, scheme):
         errors.append(max(np.abs(there - x).max(), np.abs(velocity - v).max()))
     slope = -np.polyfit(np.log(numbers), np.log(errors), 1)[0]
     assert slope == pytest.approx(order, abs=0.15)
-
-
-@pytest.mark.parametrize("kind", QUADRICS)
-@pytest.mark.parametrize("scheme", ["rattle", "suzuki4"])
-def test_compiled_landing_is_the_same(kind, scheme):
-    pair = [on_surface(kind, scheme, 0.02, atoms=(2, 0), compiled=compiled) for compiled in (False, True)]
-    for integrator, _ in pair:
-        integrator.step(50)
-    (x, v), (x2, v2) = (state_of(context) for _, context in pair)
-    assert np.abs(x - x2).max() <= 1e-13
-    assert np.abs(v - v2).max() <= 1e-13
-    assert max(worst(*pair[1])) <= 1e-14
 
 
 def test_several_steps_at_once_are_the_same_as_one_by_one():
@@ -344,57 +330,3 @@ def test_leapfrog():
     integrator.step(100)
     off, _ = worst(integrator, context)
     assert off <= 1e-14
-
-
-def test_formula_with_intermediate_values_and_parameters():
-    x = np.array([[0.8164965809277261, 0, 0], [0, 1.0, 0], [0, 0, 3.0]])
-    system = system_of()
-    integrator = SurfaceIntegrator(
-        0.01, surfaces=[ExpressionSurface([0, 1], FORMULA), ExpressionSurface(2, "z-a", {"a": 3.0})], system=system
-    )
-    context = started(system, integrator, x, [[0, 1, 0], [1, 0, 0], [1, 1, 0]])
-    integrator.step(100)
-    there, _ = state_of(context)
-    X, Y, Z = there[:2].T
-    assert np.abs(1.5 * X**2 + Y**2 + 2 * Z**2 + 0.3 * X * Y * Z - 1).max() <= 1e-14
-    assert there[2, 2] == pytest.approx(3.0, abs=1e-14)
-
-
-@pytest.mark.parametrize("compiled", [False, True])
-def test_sphere_as_a_bond_of_openmm(compiled):
-    """The vector between two bonded particles moves on a sphere, with the reduced mass: VerletIntegrator's own bond."""
-    masses, length, dt = (12.0, 4.0), 0.3, 1e-3
-    reduced = 1 / (1 / masses[0] + 1 / masses[1])
-    r, u = np.array([length, 0, 0]), np.array([0, 1.5, -0.7])
-
-    pair = openmm.System()
-    for m in masses:
-        pair.addParticle(m)
-    pair.addConstraint(0, 1, length)
-    between = openmm.CustomCompoundBondForce(2, "120*(z2-z1)+300*(x2-x1)*(y2-y1)")
-    between.addBond([0, 1], [])
-    pair.addForce(between)
-    theirs = openmm.VerletIntegrator(dt)
-    theirs.setConstraintTolerance(1e-15)
-    bonded = context_of(pair, theirs)
-    share = np.array([-masses[1], masses[0]])[:, None] / sum(masses)
-    bonded.setPositions(share * r)
-    force = np.array(bonded.getState(forces=True).getForces(asNumpy=True)._value)
-    bonded.setVelocities(share * u - 0.5 * dt * force / np.array(masses)[:, None])
-
-    single = openmm.System()
-    single.addParticle(reduced)
-    field = openmm.CustomExternalForce("120*z+300*x*y")
-    field.addParticle(0)
-    single.addForce(field)
-    sphere = Sphere([0], [0, 0, 0], length)
-    ours = SurfaceIntegrator(dt, surfaces=sphere, system=single, compiled=compiled)
-    context = context_of(single, ours)
-    context.setPositions([r])
-    context.setVelocities([u])
-    for steps, limit in ((100, 1e-12), (3900, 1e-9)):
-        ours.step(steps)
-        theirs.step(steps)
-        both = bonded.getState(positions=True).getPositions(asNumpy=True)._value
-        x = state_of(context)[0][0]
-        assert np.abs(x - (both[1] - both[0])).max() <= limit

@@ -18,7 +18,7 @@ CONSTRAINTS = [
 ]
 
 
-class Scene:
+class Rows:
     def __init__(self, cell=None, seed=0):
         rng = np.random.default_rng(seed)
         self.x_ref = 1.5 * rng.normal(size=(10, 3))
@@ -45,7 +45,7 @@ class Scene:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_matches_dense_newton(seed):
-    c = Scene(seed=seed)
+    c = Rows(seed=seed)
     solver = c.solver()
     x, velocities, found = c.x_new.copy(), c.velocities.copy(), np.full(c.set.n_rows, np.nan)
     outcome = solver.positions(Request(x, c.x_ref, velocities=velocities, inv_dt=500.0), found)
@@ -60,7 +60,7 @@ def test_matches_dense_newton(seed):
 
 @pytest.mark.parametrize("driven", [False, True])
 def test_tangents_match_dense_solve(driven):
-    c = Scene(seed=1)
+    c = Rows(seed=1)
     rates = np.random.default_rng(2).normal(size=c.set.n_rows) if driven else None
     solver = c.solver()
     y, found = c.y.copy(), np.full(c.set.n_rows, np.nan)
@@ -93,7 +93,7 @@ def test_periodic_equals_unwrapped():
 
 
 def test_pinned_atoms_stay():
-    c = Scene(seed=4)
+    c = Rows(seed=4)
     c.inv_mass[2] = 0.0
     x, y = c.x_new.copy(), c.y.copy()
     x[2], y[2] = c.x_ref[2], 0.0
@@ -106,7 +106,7 @@ def test_pinned_atoms_stay():
 
 @pytest.mark.parametrize("damage", ["nan", "flipped", "coincident"])
 def test_failure_changes_nothing(damage):
-    c = Scene(seed=5)
+    c = Rows(seed=5)
     if damage == "nan":
         c.x_new[7, 2] = np.nan
     elif damage == "flipped":
@@ -124,7 +124,7 @@ def test_failure_changes_nothing(damage):
 
 
 def test_failed_tangents_change_nothing():
-    c = Scene(seed=6)
+    c = Rows(seed=6)
     c.y[3, 1] = np.nan
     y = c.y.copy()
     assert not c.solver().tangents(Request(y, c.x_ref)).converged

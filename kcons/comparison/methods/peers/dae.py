@@ -217,7 +217,7 @@ class Dae(Method):
 
 def dae_methods() -> list[Method]:
     """Radau and IDA."""
-    common: dict[str, Any] = dict(adaptive=True, host="peer", guest=True, damps=True)
+    common: dict[str, Any] = dict(adaptive=True, md_engine="peer", guest=True, damps=True)
     return [
         Dae("dae-radau", "scipy-dae Radau, index 2", **common),
         Dae("dae-ida", "SUNDIALS IDA, index 2", package="scikit-sundae", module="sksundae", make=_IdaRun, **common),

@@ -304,7 +304,7 @@ def lammps_methods() -> list[Method]:
             f"lammps-{fix}-{exponent(tolerance)}",
             f"LAMMPS fix {fix}, {exponent(tolerance)}",
             usual=tolerance == USUAL,
-            host="peer",
+            md_engine="peer",
             guest=True,
             remark=OFF_TANGENT if fix == "shake" else "",
             fix=fix,

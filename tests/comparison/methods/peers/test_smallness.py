@@ -11,8 +11,8 @@ from kcons.comparison.methods.peers.smallness import dense_rows
 def test_dense_rows_are_those_of_the_set():
     rng = np.random.default_rng(0)
     for name in ("triple-pendulum", "rotor", "sphere", "butane"):
-        scene = test_systems.build(name)
-        value, jacobian = dense_rows(scene.constraint_set)
-        x = scene.positions + 0.01 * rng.standard_normal(scene.positions.shape)
-        np.testing.assert_allclose(value(x.ravel()), scene.constraint_set.value(x), rtol=0, atol=1e-15)
-        np.testing.assert_allclose(jacobian(x.ravel()), scene.constraint_set.jacobian(x).toarray(), rtol=0, atol=1e-15)
+        system = test_systems.build(name)
+        value, jacobian = dense_rows(system.constraint_set)
+        x = system.positions + 0.01 * rng.standard_normal(system.positions.shape)
+        np.testing.assert_allclose(value(x.ravel()), system.constraint_set.value(x), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(jacobian(x.ravel()), system.constraint_set.jacobian(x).toarray(), rtol=0, atol=1e-15)

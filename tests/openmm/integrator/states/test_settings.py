@@ -5,17 +5,16 @@ from __future__ import annotations
 import copy
 import functools
 import pickle
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import openmm
 import pytest
 from openmm import app, unit
-from openmm_systems import context_of, potential_energy, state_of
+from openmm_systems import potential_energy, state_of
+from tied_cluster import EVERYTHING, MASSES, X, begun, cluster, thermostatted
 
 from kcons.constraints import Distance, Sphere
-from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.errors import InputError, KconsError
 from kcons.openmm import (
     CollectiveRows,
     Isokinetic,
@@ -28,25 +27,8 @@ from kcons.openmm import (
 )
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
 
-X = np.random.default_rng(3).random((8, 3)) * 0.3
-MASSES = np.full(8, 12.0)
-EVERYTHING = {"positions": True, "velocities": True, "parameters": True, "integratorParameters": True}
 #: Radius of the sphere that holds particle 0, about a centre that is not the origin.
 RADIUS, CENTRE = 0.2, X[0] - [0.2, 0, 0]
-
-
-def cluster(strength=200.0, bonded=False):
-    """Eight particles tied by springs to one another and to a place; with `bonded`, one distance held by OpenMM."""
-    system, force, field = openmm.System(), openmm.HarmonicBondForce(), openmm.CustomExternalForce("50*(x^2+y^2+z^2)")
-    for i in range(8):
-        field.addParticle(system.addParticle(MASSES[i]), [])
-        for j in range(i):
-            force.addBond(i, j, 0.3, strength)
-    system.addForce(force)
-    system.addForce(field)
-    if bonded:
-        system.addConstraint(6, 7, float(np.linalg.norm(X[6] - X[7])))
-    return system
 
 
 def bond(i=0, j=7):
@@ -55,57 +37,27 @@ def bond(i=0, j=7):
     return force
 
 
-@dataclass
-class Made:
-    """An integrator with its Context, and what can be asked of it."""
-
-    integrator: Any
-    context: openmm.Context
-    part: Any = None
-
-    def run(self, steps=1):
-        self.integrator.step(steps)
-        return self.context.getState(**EVERYTHING)
-
-
-def thermostatted(ensemble, **options):
-    def make(strength=200.0):
-        integrator = ProjectedIntegrator(0.002, ensemble=ensemble, **options)
-        return _begun(cluster(strength, bonded=True), integrator)
-
-    return make
-
-
 def rattle(strength=200.0):
-    return _begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
+    return begun(cluster(strength, bonded=True), RattleIntegrator(0.002))
 
 
 def on_a_sphere(radius=RADIUS, strength=200.0, **options):
     system = cluster(strength)
     surface = Sphere([0], CENTRE, radius)
     integrator = SurfaceIntegrator(0.002, surfaces=surface, system=system, **options)
-    return _begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
+    return begun(system, integrator, lambda context: integrator.applyConstraints(context), integrator.surfaces[0])
 
 
 def row_at(target=0.30, strength=200.0, **options):
     system = cluster(strength)
     rows = CollectiveRows(system, [Row(bond(), target)], positions=X)
-    return _begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
+    return begun(system, ProjectedIntegrator(0.002, parts=[rows], **options), rows.restore, rows)
 
 
 def carried_at(target=0.30, strength=200.0, **options):
     system = cluster(strength)
     part = hold(system, [Distance([[0, 7]], target)], X)
-    return _begun(system, ProjectedIntegrator(0.002, parts=[part], **options), part.apply_positions, part)
-
-
-def _begun(system, integrator, restore=None, part=None):
-    context = context_of(system, integrator)
-    context.setPositions(X)
-    context.setVelocities(0.3 * np.random.default_rng(1).normal(size=X.shape))
-    if restore is not None:
-        restore(context)
-    return Made(integrator, context, part)
+    return begun(system, ProjectedIntegrator(0.002, parts=[part], **options), part.apply_positions, part)
 
 
 #: Every class and ensemble, each as often as wanted.
@@ -257,7 +209,7 @@ def test_seeds_of_checkpoints():
     def make(seed):
         integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 10.0))
         integrator.setRandomNumberSeed(seed)
-        return _begun(cluster(bonded=True), integrator)
+        return begun(cluster(bonded=True), integrator)
 
     first = make(1)
     first.run(3)
@@ -313,58 +265,6 @@ def test_copies_have_the_settings_of_now(kind, how):
 # -- ensembles are values -----------------------------------------------------------------------------
 
 
-def test_ensembles_are_values():
-    shared = Langevin(300, 1.0)
-    one, two = thermostatted(shared)(), thermostatted(shared)()
-    one.integrator.setTemperature(500)
-    one.integrator.setFriction(7)
-    two.run()
-    assert two.integrator.getGlobalVariableByName("kT") == GAS_CONSTANT * 300
-    assert (shared.temperature, shared.friction) == (300, 1.0)
-    assert one.integrator.getTemperature() == 500 * unit.kelvin
-    assert one.integrator.getFriction() == 7 / unit.picosecond
-    for value, name in ((shared, "temperature"), (shared, "friction"), (Isokinetic(300), "temperature")):
-        with pytest.raises(UnsupportedError, match="setTemperature or setFriction"):
-            setattr(value, name, 400.0)
-    with pytest.raises(AttributeError):
-        one.integrator.ensemble = shared
-    with pytest.raises(UnsupportedError, match="setting of the integrator"):
-        one.integrator.setGlobalVariableByName("kT", 3.0)
-    with pytest.raises(UnsupportedError, match="setting of the integrator"):
-        one.integrator.setGlobalVariable(one.integrator.program.variables.index("friction: 1/ps") - 1, 3.0)
-    assert Langevin(300, 1.0) == shared != Langevin(300, 2.0)
-    assert len({Langevin(300, 1.0), shared, Isokinetic(300, atoms=[1, 2]), Isokinetic(300, atoms=[1, 2])}) == 2
-    twins = Isokinetic(300), Isokinetic(300)
-    made = [thermostatted(ensemble)() for ensemble in (twins[0], twins[0])]
-    made[0].run()
-    made[0].integrator.setTemperature(600)
-    made[1].run(2)
-    assert made[1].integrator.getTemperature() == 300 * unit.kelvin
-    v = state_of(made[1].context)[1]
-    count = twins[0].count(made[1].integrator)
-    assert abs(MASSES @ np.sum(v**2, axis=1) / ((count - 1) * GAS_CONSTANT * 300) - 1) < 1e-12
-
-
-def test_what_an_ensemble_lacks():
-    plain, smooth = ProjectedIntegrator(0.002), ProjectedIntegrator(0.002, ensemble=Isokinetic(300))
-    for call in (plain.getTemperature, plain.getFriction, smooth.getFriction, lambda: smooth.setFriction(1)):
-        with pytest.raises(UnsupportedError, match="ensemble=Langevin"):
-            call()
-    assert smooth.getTemperature() == 300 * unit.kelvin
-    for wrong, match in (
-        (lambda: Langevin(-1, 1), "temperature"),
-        (lambda: Langevin(300 * unit.nanometer, 1), "give it in K"),
-        (lambda: Langevin(300, 1 * unit.picosecond), "give it in 1/ps"),
-        (lambda: Langevin(300, -1), "friction"),
-        (lambda: Langevin(float("nan"), 1), "temperature"),
-        (lambda: Isokinetic(0), "temperature"),
-        (lambda: smooth.setTemperature(0), "temperature"),
-        (lambda: smooth.setTemperature(3 * unit.nanometer), "give it in K"),
-    ):
-        with pytest.raises(InputError, match=match):
-            wrong()
-
-
 @pytest.mark.parametrize("make", [row_at, carried_at, on_a_sphere, lambda **given: thermostatted(**given)()])
 def test_zero_kelvin_brings_to_rest(make):
     """Friction without noise: all energy goes, the certificate holds with velocities of rounding alone."""
@@ -383,7 +283,7 @@ def test_zero_kelvin_brings_to_rest(make):
 
 
 def stock(integrator):
-    return lambda: _begun(cluster(bonded=True), integrator())
+    return lambda: begun(cluster(bonded=True), integrator())
 
 
 STOCK = {
@@ -490,11 +390,11 @@ def test_states_into_a_compound_integrator():
     compound, ours = openmm.CompoundIntegrator(), ProjectedIntegrator(0.002, ensemble=Langevin(400, 50.0))
     compound.addIntegrator(ours)
     compound.addIntegrator(openmm.VerletIntegrator(0.002))
-    made = _begun(cluster(bonded=True), compound)
+    made = begun(cluster(bonded=True), compound)
     giver = openmm.CompoundIntegrator()
     giver.addIntegrator(other := ProjectedIntegrator(0.002, ensemble=Langevin(300, 1.0)))
     giver.addIntegrator(openmm.VerletIntegrator(0.002))
-    given = _begun(cluster(bonded=True), giver)
+    given = begun(cluster(bonded=True), giver)
     made.context.setState(given.run(2))
     compound.step(1)
     assert ours.getGlobalVariableByName("friction") == 50.0

@@ -26,7 +26,7 @@ ASE_LENGTH, ASE_TIME = 0.1, 1e-3 / units.fs
 
 
 @dataclass
-class OpenMMHost:
+class OpenMMEngine:
     """What OpenMM needs to run a test system.
 
     Attributes

@@ -1,0 +1,180 @@
+"""OpenMM at 4 fs with all bonds and all angles held: how well the rows stay, and whether the energy drifts.
+
+    python examples/24_openmm_four_femtoseconds.py                   alanine dipeptide for 0.2 ps on the CPU
+    python examples/24_openmm_four_femtoseconds.py --full --out F    the committed results
+    python examples/24_openmm_four_femtoseconds.py --show F          the tables of an earlier run
+
+Alanine dipeptide and villin in implicit solvent (amber14, OBC2, no cutoff). What is held is what
+constraints_of(..., "allangles") gives at an energy minimum. The run starts after 5 ps of Langevin dynamics at 300 K.
+The drift is the slope of the total energy in kT a nanosecond and degree of freedom, with its standard error from ten
+blocks. Residuals are the largest of all rows (nm, radian) at the ends of calls of 50 steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openmm
+from openmm import app, unit
+from rich.console import Console
+
+from kcons import ConstraintSet
+from kcons.comparison import measure, scripts
+from kcons.constraints import Angle, Constraint, Distance
+from kcons.openmm import Langevin, ProjectedIntegrator, constraints_of, hold, positions_of
+from kcons.topology import HeldRows, bond_angles
+
+DATA = Path(__file__).resolve().parent.parent / "tests" / "data"
+TEMPERATURE, STEP, CALL = 300.0, 0.004, 50
+KT = 0.00831446261815324 * TEMPERATURE
+#: The structures by name. Villin comes with OpenMM, in water and with ions, which are taken away.
+STRUCTURES = {
+    "alanine dipeptide": DATA / "alanine-dipeptide-implicit.pdb",
+    "villin": Path(app.__file__).parent / "data" / "test.pdb",
+}
+
+
+# -- what is held -----------------------------------------------------------------------------------
+
+
+def protein(path: Path) -> tuple[app.Topology, openmm.System, np.ndarray]:
+    """Topology, System without constraints, and positions near a minimum of its energy."""
+    pdb = app.PDBFile(str(path))
+    model = app.Modeller(pdb.topology, pdb.positions)
+    model.delete([residue for residue in model.topology.residues() if residue.name in ("HOH", "Cl", "Na")])
+    field = app.ForceField("amber14-all.xml", "implicit/obc2.xml")
+    system = field.createSystem(model.topology, nonbondedMethod=app.NoCutoff)
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("CPU"))
+    context.setPositions(model.positions)
+    openmm.LocalEnergyMinimizer.minimize(context, 1, 300)
+    return model.topology, system, positions_of(context)
+
+
+def condition(items: list[Constraint], x: np.ndarray, masses: np.ndarray) -> tuple[int, int, float]:
+    """Rows, rank, and the condition number of the independent ones: rows of length 1, weighted with the masses."""
+    whole = ConstraintSet(items, x, masses)
+    rows = whole.jacobian(x).toarray() / np.sqrt(np.repeat(masses, 3))
+    s = np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True), compute_uv=False)
+    rank = int((s > 1e-9 * s[0]).sum())
+    return len(rows), rank, float(s[0] / s[rank - 1])
+
+
+def conditions(held: HeldRows, x: np.ndarray) -> dict[str, tuple[int, int, float]]:
+    """Of the rows that are held, and of all bonds and all angles as they are."""
+    bonds = held.topology.bonds
+    plain = [Distance(bonds), Angle(bond_angles(bonds, len(x)))]
+    return {
+        "held": condition(list(held), x, held.topology.masses),
+        "every angle": condition(plain, x, held.topology.masses),
+    }
+
+
+# -- the runs ---------------------------------------------------------------------------------------
+
+
+def placed(system: openmm.System, held: HeldRows, x: np.ndarray, place: str, **options: Any) -> tuple[Any, ...]:
+    """Integrator, rows and Context on a copy of the System."""
+    own = copy.deepcopy(system)
+    part = hold(own, held.constraint_set.constraints, x)
+    integrator = ProjectedIntegrator(STEP, parts=[part], **options)
+    integrator.setRandomNumberSeed(1)
+    name, _, precision = place.partition(" ")
+    properties = {"Precision": precision} if precision else {}
+    context = openmm.Context(own, integrator, openmm.Platform.getPlatformByName(name), properties)
+    return integrator, part, context
+
+
+def total_energy(context: openmm.Context) -> float:
+    state = context.getState(energy=True)
+    return float((state.getKineticEnergy() + state.getPotentialEnergy()).value_in_unit(unit.kilojoule_per_mole))
+
+
+def run(name: str, place: str, picoseconds: float, warm_up: float) -> dict[str, Any]:
+    """One structure: conditions, drift, residuals."""
+    topology, system, x = protein(STRUCTURES[name])
+    held = constraints_of(topology, x, "allangles", system=system)
+    integrator, _, context = placed(system, held, x, place, ensemble=Langevin(TEMPERATURE, 5.0))
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, TEMPERATURE, 1)
+    integrator.step(round(warm_up / STEP))
+    start = context.getState(positions=True, velocities=True)
+    integrator, part, context = placed(system, held, x, place)
+    context.setState(start)
+    energies, residuals, temperatures = [], [], []
+    for _ in range(round(picoseconds / STEP / CALL)):
+        integrator.step(CALL)
+        energies.append(total_energy(context))
+        residuals.append(part.report(context, condition=False).residual)
+        temperatures.append(integrator.computeSystemTemperature().value_in_unit(unit.kelvin))
+    freedom = integrator.degrees_of_freedom()
+    t = np.arange(len(energies)) * CALL * STEP * 1e-3
+    slope, error = scripts.slope(t, np.array(energies) / (KT * freedom))
+    return {
+        "atoms": len(x),
+        "rows": held.summary(),
+        "conditions": conditions(held, x),
+        "freedom": freedom,
+        "place": place,
+        "picoseconds": len(energies) * CALL * STEP,
+        "temperature": float(np.mean(temperatures)),
+        "residual": float(np.max(residuals)),
+        "drift": {"slope": slope, "error": error},
+        "scatter": float(np.std(energies) / KT),
+    }
+
+
+# -- output -----------------------------------------------------------------------------------------
+
+
+def show(result: dict[str, Any]) -> None:
+    console = Console(width=130)
+    rows = []
+    for name, runs in result["runs"].items():
+        for which, (count, rank, number) in runs["conditions"].items():
+            rows.append((f"{name}, {runs['atoms']} atoms", which, f"{count}", f"{rank}", f"{number:.3g}"))
+    console.print(
+        scripts.table("Rows", ("molecule", "angles", "rows", "rank", "condition"), {"molecule", "angles"}, rows)
+    )
+    headings = ("molecule", "platform", "ps", "degrees of freedom", "K", "largest residual", "drift, kT/ns/dof")
+    rows = [
+        (
+            name,
+            runs["place"],
+            f"{runs['picoseconds']:g}",
+            f"{runs['freedom']}",
+            f"{runs['temperature']:.0f}",
+            f"{runs['residual']:.1e}",
+            f"{runs['drift']['slope']:+.1e} ± {runs['drift']['error']:.0e}",
+        )
+        for name, runs in result["runs"].items()
+    ]
+    console.print(scripts.table("Constant energy at 4 fs", headings, {"molecule", "platform"}, rows))
+    machine = result["machine"]
+    console.print(f"OpenMM {machine['versions']['openmm']}; {machine['date']}")
+
+
+def measured(chosen: argparse.Namespace) -> dict[str, Any]:
+    names = chosen.structure or (list(STRUCTURES) if chosen.full else ["alanine dipeptide"])
+    place = chosen.platform or ("OpenCL mixed" if chosen.full else "CPU")
+    picoseconds = chosen.picoseconds or (100.0 if chosen.full else 4.0)
+    return {
+        "machine": measure.environment(),
+        "full": chosen.full,
+        "runs": {name: run(name, place, picoseconds, 5.0 if chosen.full else 0.2) for name in names},
+    }
+
+
+def main() -> None:
+    parser = scripts.options(__doc__, full="both molecules, 100 ps on OpenCL in mixed precision")
+    parser.add_argument("--platform", help="such as CPU or 'OpenCL mixed'")
+    parser.add_argument("--structure", action="append", choices=list(STRUCTURES), help="may be given several times")
+    parser.add_argument("--picoseconds", type=float, help="length of the runs")
+    scripts.script(parser, measured, show)
+
+
+if __name__ == "__main__":
+    main()

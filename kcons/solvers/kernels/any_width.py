@@ -1,0 +1,185 @@
+"""Numbers some doubles wide for Numba kernels.
+
+Kernels written with them read like scalar code and are vector code by construction: nothing depends on what the
+auto-vectoriser recognises, and Newton loops of unknown length may stand inside a kernel.
+
+Arrays are handed to intrinsics only: an array handed to a Python function inside a loop costs reference counting, and
+the call makes every vector register spill. They are read and written without checks of the index.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models, register_default
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic
+
+#: No 'nnan' (it calls NaN converged) and no 'reassoc' (it undoes differences).
+FLAGS = ("contract", "arcp", "nsz")
+DOUBLE = ir.DoubleType()
+INT32 = ir.IntType(32)
+INT64 = ir.IntType(64)
+_POINT = ir.VectorType(DOUBLE, 4)
+#: Of four numbers, those of a point.
+POINT_MASK = ir.Constant(ir.VectorType(ir.IntType(1), 4), [1, 1, 1, 0])
+_INSTRUCTIONS = ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"))
+
+
+class VectorType(types.Type):
+    """Numba type of some doubles that are computed with together."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(name=f"Doubles{width}")
+        self.width = width
+
+
+@register_default(VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: VectorType) -> None:
+        super().__init__(manager, kind, ir.VectorType(DOUBLE, kind.width))
+
+
+class Vectors:
+    """Numbers of one width, see `vectors`.
+
+    Attributes
+    ----------
+    kind : VectorType
+        For signatures. + - * / take two of them, or one and a double; - one.
+    llvm : llvmlite.ir.VectorType
+    load, store : intrinsic
+        ``load(array, start)``, ``store(array, start, value)``: those that begin at an entry of a flat float64 array.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.kind = VectorType(width)
+        self.llvm = ir.VectorType(DOUBLE, width)
+        self.load = reader(self.kind, self.llvm)
+        self.store = writer(self.kind, self.llvm)
+        for function, instruction in _INSTRUCTIONS:
+            self._define(function, instruction)
+        self._define_negation()
+
+    def splat(self, builder: Any, value: Any) -> Any:
+        """All equal to one double; a vector stays as it is."""
+        if value.type == self.llvm:
+            return value
+        one = builder.insert_element(ir.Constant(self.llvm, ir.Undefined), value, INT32(0))
+        return shuffle(builder, one, one, [0] * self.llvm.count)
+
+    def of(self, builder: Any, values: Any) -> Any:
+        """Made of doubles."""
+        result = ir.Constant(self.llvm, ir.Undefined)
+        for lane, value in enumerate(values):
+            result = builder.insert_element(result, value, INT32(lane))
+        return result
+
+    def all_true(self, builder: Any, test: Any) -> Any:
+        """Whether a comparison holds for all."""
+        bits = builder.bitcast(test, ir.IntType(self.llvm.count))
+        return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, 2**self.llvm.count - 1))
+
+    def unary(self, name: str) -> Callable[..., Any]:
+        """The function of each that LLVM calls `name`, such as 'sqrt'."""
+
+        @intrinsic
+        def function(typingctx, value):  # type: ignore[no-untyped-def]
+            def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+                return call(builder, f"llvm.{name}.v{self.llvm.count}f64", self.llvm, args)
+
+            return self.kind(self.kind), codegen
+
+        return function  # type: ignore[no-any-return]
+
+    def _define(self, function: Any, instruction: str) -> None:
+        kind = self.kind
+        cases = [
+            signature(kind, kind, kind),
+            signature(kind, kind, types.float64),
+            signature(kind, types.float64, kind),
+        ]
+        infer_global(function)(type(f"_{instruction}_{kind.name}", (ConcreteTemplate,), {"cases": cases}))
+
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            left, right = (self.splat(builder, value) for value in args)
+            return getattr(builder, instruction)(left, right, flags=FLAGS)
+
+        for case in cases:
+            lower_builtin(function, *case.args)(lower)
+
+    def _define_negation(self) -> None:
+        cases = [signature(self.kind, self.kind)]
+        infer_global(operator.neg)(type(f"_neg_{self.kind.name}", (ConcreteTemplate,), {"cases": cases}))
+
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return builder.fneg(args[0], flags=FLAGS)
+
+        lower_builtin(operator.neg, self.kind)(lower)
+
+
+@cache
+def vectors(width: int) -> Vectors:
+    """Numbers `width` doubles wide."""
+    return Vectors(width)
+
+
+# -- for intrinsics -----------------------------------------------------------------------------------
+
+
+def shuffle(builder: Any, left: Any, right: Any, mask: list[int]) -> Any:
+    """Doubles of two vectors, by their numbers."""
+    return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(INT32, len(mask)), mask))
+
+
+def pointer(context: Any, builder: Any, array_type: Any, array: Any, start: Any, to: Any = None) -> Any:
+    """To an entry of an array; as one to a vector where `to` is its type."""
+    data = context.make_array(array_type)(context, builder, array).data
+    found = builder.gep(data, [start], inbounds=True)
+    return found if to is None else builder.bitcast(found, ir.PointerType(to))
+
+
+def call(builder: Any, name: str, result: Any, args: Any) -> Any:
+    """Call an LLVM intrinsic."""
+    function_type = ir.FunctionType(result, [a.type for a in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), args)
+
+
+def masked_point(builder: Any, place: Any) -> Any:
+    """(x, y, z, 0) of the point at a pointer; the mask keeps the last one of an array from reading beyond it."""
+    source = builder.bitcast(place, ir.PointerType(_POINT))
+    rest = ir.Constant(_POINT, [0.0] * 4)
+    return call(builder, "llvm.masked.load.v4f64.p0v4f64", _POINT, [source, INT32(8), POINT_MASK, rest])
+
+
+def reader(kind: Any, vector: Any) -> Callable[..., Any]:
+    """The intrinsic that reads from a flat float64 array; doubles where `vector` is None."""
+
+    @intrinsic
+    def function(typingctx, array, start):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            return builder.load(pointer(context, builder, sig.args[0], *args, vector), align=8)
+
+        return kind(array, types.int64), codegen
+
+    return function  # type: ignore[no-any-return]
+
+
+def writer(kind: Any, vector: Any) -> Callable[..., Any]:
+    """The intrinsic that writes into one."""
+
+    @intrinsic
+    def function(typingctx, array, start, value):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            builder.store(args[2], pointer(context, builder, sig.args[0], *args[:2], vector), align=8)
+
+        return types.void(array, types.int64, kind), codegen
+
+    return function  # type: ignore[no-any-return]

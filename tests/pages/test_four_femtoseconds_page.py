@@ -1,0 +1,30 @@
+"""All bonds and angles at 4 fs: the page shows the committed results, and they are what it says."""
+
+from __future__ import annotations
+
+import json
+
+from committed_pages import FOLDER, page, printed
+
+RESULTS = FOLDER / "openmm_four_femtoseconds.json"
+
+
+def test_page_shows_the_committed_results():
+    assert printed("24_openmm_four_femtoseconds.py", RESULTS.name) in page("openmm_platforms.md")
+
+
+def test_rows_stay_and_energy_is_what_the_page_says():
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    assert found["full"]
+    assert set(found["runs"]) == {"alanine dipeptide", "villin"}
+    for run in found["runs"].values():
+        assert run["place"] == "OpenCL mixed"
+        assert run["picoseconds"] == 100
+        assert run["residual"] < 4e-9
+        rows, rank, condition = run["conditions"]["held"]
+        assert rows == rank == run["conditions"]["every angle"][1]
+        assert condition < 100 < run["conditions"]["every angle"][2]
+    drift = found["runs"]["alanine dipeptide"]["drift"]
+    assert abs(drift["slope"]) <= 3 * drift["error"] < 1e-3
+    villin = found["runs"]["villin"]
+    assert -0.14 < villin["drift"]["slope"] * villin["freedom"] * 0.1 < -0.12
