@@ -601,6 +601,49 @@ MUTANTS = [
         "same = open_ & (given[place] != given[place])",
         "tests/constraints/periodic/test_images.py::test_a_length_found_and_the_same_one_given",
     ),
+    # -- topology: all angles --
+    (
+        "topology/angle_rows.py",
+        "flat = volume < np.sin(np.radians(FLAT_CENTRE))",
+        "flat = volume < -np.sin(np.radians(FLAT_CENTRE))",
+        "tests/topology/test_angle_rows.py::test_a_flat_centre_has_an_improper_dihedral",
+    ),
+    (
+        "topology/angle_rows.py",
+        "-snapshot.topology.masses[others], rank",
+        "+snapshot.topology.masses[others], rank",
+        "tests/topology/test_angle_rows.py::test_of_six_angles_the_one_between_the_lightest_is_none_of_the_rows",
+    ),
+    (
+        "topology/angle_rows.py",
+        "turning = (earlier.sum(axis=1) == 1) & ~earlier[:, 0]",
+        "turning = earlier.sum(axis=1) > 9",
+        "tests/topology/test_angle_rows.py::test_beside_a_rigid_body_only_what_it_leaves_is_held",
+    ),
+    (
+        "topology/ring_systems.py",
+        "FLAT_RING = 20.0",
+        "FLAT_RING = 0.0",
+        "tests/topology/test_ring_systems.py::test_a_ring_is_rigid_by_as_many_rows_as_it_needs",
+    ),
+    (
+        "topology/ring_systems.py",
+        "_independent(rows[held], rows[~held])",
+        "_independent(rows[:0], rows[~held])",
+        "tests/topology/test_ring_systems.py::test_a_ring_is_rigid_by_as_many_rows_as_it_needs",
+    ),
+    (
+        "openmm/ensembles/nose_hoover_ensemble.py",
+        'self._advance(program, "2")',
+        'self._advance(program, "1")',
+        "tests/openmm/ensembles/test_nose_hoover_ensemble.py::test_a_chain_in_the_middle_is_the_same_chain_in_small_steps",
+    ),
+    (
+        "openmm/integrator/step_writer.py",
+        "self._project if self.ensemble.measures else lambda: None",
+        "lambda: None",
+        "tests/openmm/ensembles/test_nose_hoover_ensemble.py::test_a_chain_in_the_middle_is_time_reversible",
+    ),
     (
         "topology/guessed_bonds.py",
         "wrapped = y if lattice is None else wrapped_into(y, lattice)[1]",
