@@ -1,4 +1,4 @@
-"""Steps in few compiled calls; `test_piecewise`, `test_march` and `test_fused_stages` compare what they compute."""
+"""Steps in few compiled calls; `test_piecewise`, `test_splitting` and `test_fused_stages` compare what they compute."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from kcons.steppers import Rattle, Suzuki4
 from kcons.steppers.executors.fused import fused_steps
 from tests.steppers.stages.test_fused_stages import GROUPS, STEPPERS, SYSTEMS, molecules
-from tests.steppers.test_march import assert_same, one_by_one
+from tests.steppers.test_splitting import assert_same, one_by_one
 
 
 @pytest.mark.parametrize("name", ["hydrogens", "far", "no force"])

@@ -10,7 +10,7 @@ from kcons.steppers import Rattle, Splitting, System, run
 from kcons.steppers.executors.piecewise import ArrayStep, SplittingStep
 from kcons.steppers.operations import Evaluate, Kick
 from tests.steppers.stages.test_fused_stages import GROUPS, STEPPERS, SYSTEMS, molecules, springs
-from tests.steppers.test_march import assert_same
+from tests.steppers.test_splitting import assert_same
 
 KICK_FIRST = [stepper for stepper in STEPPERS if stepper.kick_first]
 
