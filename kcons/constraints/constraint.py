@@ -36,9 +36,8 @@ class RowKind(IntEnum):
     INTERPRETED = 0
     DISTANCE = 1  # no parameters
     ANGLE = 2  # atoms i, j, k with vertex j; no parameters; coordinate theta
-    DIHEDRAL = 3  # atoms i, j, k, l; no parameters; coordinate phi, smooth through +-180 degrees
-    LINEAR = 4  # sum_a c_a . r_a; parameters c, 3 numbers an atom
-    FUNCTION = 5  # a function that the kernels call; see `kcons.solvers.sparse.row_functions`
+    LINEAR = 3  # sum_a c_a . r_a; parameters c, 3 numbers an atom
+    FUNCTION = 4  # a function that the kernels call; see `kcons.solvers.sparse.row_functions`
 
 
 class Constraint(ABC):

@@ -194,7 +194,7 @@ class Dihedral(Constraint):
     held = ANGLE
     translation_invariant = True
     period = 2 * np.pi
-    kind = RowKind.DIHEDRAL
+    kind = RowKind.FUNCTION
 
     def __init__(self, quads: ArrayLike, target: Target = None) -> None:
         super().__init__(quads, target)

@@ -24,6 +24,11 @@ from kcons.solvers.sparse.row_values import miss, near
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
 
 _EPS = float(np.finfo(float).eps)
+#: Rows that take their iterations together.
+BLOCK = 32
+#: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
+#: often the step from there was halved, -1 once it has arrived.
+WORDS, ROUNDING, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
 
 
 class SingleRows:
@@ -48,8 +53,9 @@ class SingleRows:
         self._given = GivenRows(constraint_set, rows, widest)
         # Row by row: its first slot, its first parameter, its kind.
         links = np.zeros((len(rows) + 1, 3), np.uint32)
-        links[:, 0], links[:, 1], links[:-1, 2] = incidence.indptr, self._given.starts, self._given.kinds
-        self._tables = links.ravel(), atoms, self._given.numbers, inverse_masses[atoms], np.zeros(3 * widest)
+        links[:, 0], links[:-1, 1], links[:-1, 2] = incidence.indptr, self._given.starts, self._given.kinds
+        self._tables = links.ravel(), atoms, self._given.numbers, inverse_masses[atoms]
+        self._work = np.zeros(3 * widest * BLOCK), np.zeros(WORDS * BLOCK)
         self._scale = constraint_set.scale[rows]
         self._targets = np.ascontiguousarray(constraint_set.target(0.0)[rows])
         self._pushes, self._solution = np.zeros(3 * len(atoms)), np.zeros(len(rows))
@@ -64,8 +70,9 @@ class SingleRows:
         self._given.numbers[:2] = time, reference_time
         found = _positions(
             x, reference, self._targets if wanted is None else wanted[self.rows],
-            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, self._scale, self._pushes,
-            self._solution, x if velocities is None else velocities, 0.0 if velocities is None else inv_dt,
+            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, *self._work, self._scale,
+            self._pushes, self._solution, x if velocities is None else velocities,
+            0.0 if velocities is None else inv_dt,
         )  # fmt: skip
         self._given.refuse()
         if found[0] and multipliers is not None:
@@ -135,63 +142,83 @@ def _apply(x, factor, slot, end, atoms, pushes):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    x, x_ref, wanted, lattice, periodic, links, atoms, numbers, masses, base, scale, pushes, solution, velocities,
-    inv_dt,
+    x, x_ref, wanted, lattice, periodic, links, atoms, numbers, masses, base, state, scale, pushes, solution,
+    velocities, inv_dt,
 ):  # fmt: skip
     worst, worst_row, most = 0.0, -1, 0
-    for k in range(len(solution)):
-        slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
-        relative = entry(links, 3 * k + 2) != FUNCTION
-        out = ROOM + 3 * (end - slot)
-        count = 3 * (end - slot)
-        _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
-        call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
-        reach = 0.0
-        for p in range(slot, end):
-            rolled()
-            size, far = 0.0, 0.0
-            for i in range(3):
-                g, r = number(numbers, out + 1 + 3 * (p - slot) + i), number(x, 3 * entry(atoms, p) + i)
-                put(pushes, 3 * p + i, g * number(masses, p))
-                size, far = size + g * g, far + r * r
-            reach += math.sqrt(size * far)
-        rounding = max(1e-14 * number(scale, k), 2 * _EPS * reach)
-        _gather(x, slot, end, atoms, relative, lattice, periodic, base, 0)
-        lam, last, previous, iteration, halvings = 0.0, 0.0, np.inf, 0, 0
-        while True:
-            for i in range(count):
+    for begin in range(0, len(solution), BLOCK):
+        stop = min(begin + BLOCK, len(solution))
+        first = entry(links, 3 * begin)
+        for k in range(begin, stop):
+            slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
+            relative = entry(links, 3 * k + 2) != FUNCTION
+            out = ROOM + 3 * (end - slot)
+            _gather(x_ref, slot, end, atoms, relative, lattice, periodic, numbers, ROOM)
+            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 1), out)
+            reach = 0.0
+            for p in range(slot, end):
                 rolled()
-                put(numbers, ROOM + i, number(base, i) + lam * number(pushes, 3 * slot + i))
-            call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
-            slope = 0.0
-            for i in range(count):
-                rolled()
-                slope += number(numbers, out + 1 + i) * number(pushes, 3 * slot + i)
-            off = miss(FUNCTION, number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
-            error = abs(off)
-            if not (error < np.inf):
-                return False, np.inf, iteration, k
-            if error <= rounding and (error <= NEWTON_TOLERANCE * number(scale, k) or error > 0.1 * previous):
-                break
-            if iteration == MAX_ITERATIONS:
-                return False, error / number(scale, k), iteration, k
-            if iteration > 0 and not (error < 0.999 * previous) and error > 1e-10 * number(scale, k):
-                if halvings == MAX_HALVINGS:
-                    return False, error / number(scale, k), iteration, k
-                halvings += 1
-                lam = last + 0.5 * (lam - last)
-                continue
-            previous, last, halvings = error, lam, 0
-            lam += off / slope
+                size, far = 0.0, 0.0
+                for i in range(3):
+                    g, r = number(numbers, out + 1 + 3 * (p - slot) + i), number(x, 3 * entry(atoms, p) + i)
+                    put(pushes, 3 * p + i, g * number(masses, p))
+                    size, far = size + g * g, far + r * r
+                reach += math.sqrt(size * far)
+            _gather(x, slot, end, atoms, relative, lattice, periodic, base, 3 * (slot - first))
+            at = WORDS * (k - begin)
+            put(state, at + ROUNDING, max(1e-14 * number(scale, k), 2 * _EPS * reach))
+            put(state, at + PREVIOUS, np.inf)
+            put(state, at + LAST, 0.0)
+            put(state, at + HALVINGS, 0.0)
+            put(solution, k, 0.0)
+        # Rows of a block take each iteration together, so that the processor has several under way at once.
+        iteration, left = 0, stop - begin
+        while left > 0:
+            left = 0
+            for k in range(begin, stop):
+                at = WORDS * (k - begin)
+                halvings = number(state, at + HALVINGS)
+                if halvings < 0.0:
+                    continue
+                slot, parameters, lam = entry(links, 3 * k), entry(links, 3 * k + 1), number(solution, k)
+                count = 3 * (entry(links, 3 * k + 3) - slot)
+                out = ROOM + count
+                for i in range(count):
+                    rolled()
+                    r = number(base, 3 * (slot - first) + i) + lam * number(pushes, 3 * slot + i)
+                    put(numbers, ROOM + i, r)
+                call_row(numbers, parameters, ROOM, parameters + 2, number(numbers, 0), out)
+                slope = 0.0
+                for i in range(count):
+                    rolled()
+                    slope += number(numbers, out + 1 + i) * number(pushes, 3 * slot + i)
+                off = miss(number(numbers, out), number(wanted, k), number(numbers, parameters + 1))
+                whole, error, previous = number(scale, k), abs(off), number(state, at + PREVIOUS)
+                if not (error < np.inf):
+                    return False, np.inf, iteration, k
+                rounding = number(state, at + ROUNDING)
+                if error <= rounding and (error <= NEWTON_TOLERANCE * whole or error > 0.1 * previous):
+                    # A gradient must not have turned by 90 degrees or more within the step.
+                    if not (slope > 0.0):
+                        return False, np.inf, iteration, k
+                    put(state, at + HALVINGS, -1.0)
+                    if error >= worst * whole:
+                        worst, worst_row = error / whole, k
+                    continue
+                if iteration == MAX_ITERATIONS or halvings > MAX_HALVINGS:
+                    return False, error / whole, iteration, k
+                left += 1
+                last = number(state, at + LAST)
+                if previous < np.inf and not (error < 0.999 * previous) and error > 1e-10 * whole:
+                    put(state, at + HALVINGS, halvings + 1.0)
+                    put(solution, k, last + 0.5 * (lam - last))
+                else:
+                    put(state, at + PREVIOUS, error)
+                    put(state, at + LAST, lam)
+                    put(state, at + HALVINGS, 0.0)
+                    put(solution, k, lam + off / slope)
             iteration += 1
-        # A gradient must not have turned by 90 degrees or more within the step.
-        if not (slope > 0.0):
-            return False, np.inf, iteration, k
-        put(solution, k, lam)
-        error /= number(scale, k)
-        if error >= worst:
-            worst, worst_row = error, k
-        most = max(most, iteration)
+        most = max(most, iteration - 1)
     for k in range(len(solution)):
         slot, end, lam = entry(links, 3 * k), entry(links, 3 * k + 3), number(solution, k)
         _apply(x, lam, slot, end, atoms, pushes)
@@ -202,7 +229,7 @@ def _positions(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tangents(  # type: ignore[no-untyped-def]
-    x, y, wanted, driven, lattice, periodic, links, atoms, numbers, masses, base, pushes, solution
+    x, y, wanted, driven, lattice, periodic, links, atoms, numbers, masses, pushes, solution
 ):
     worst, worst_row, most = 0.0, -1, 0
     for k in range(len(solution)):

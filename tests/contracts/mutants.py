@@ -133,12 +133,12 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/row_values.py",
-        "difference -= 2 * np.pi * np.rint(difference / (2 * np.pi))",
-        "difference -= np.pi * np.rint(difference / np.pi)",
-        "tests/solvers/sparse/test_row_values.py::test_dihedrals_miss_by_the_shorter_way",
+        "difference -= period * np.rint(difference / period)",
+        "difference -= 0.5 * period * np.rint(2 * difference / period)",
+        "tests/solvers/sparse/test_row_values.py::test_rows_with_a_period_miss_by_the_shorter_way",
     ),
     (
-        "solvers/sparse/row_values.py",
+        "solvers/sparse/row_functions.py",
         "hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "hb = -(hx * gx + hy * gy + hz * gz) / (b2 * size)",
         "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",
@@ -148,6 +148,31 @@ MUTANTS = [
         "y -= a * cell[0][1] + b * cell[1][1] + c * cell[2][1]",
         "y -= a * cell[0][1] + b * cell[1][1]",
         "tests/solvers/sparse/test_row_values.py::test_rows_equal_their_constraints",
+    ),
+    # -- solvers: functions --
+    (
+        "solvers/sparse/row_functions.py",
+        "f, g = h / (rho * q), up / q",
+        "f, g = h / rho, up / q",
+        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Torus-open]",
+    ),
+    (
+        "solvers/sparse/row_functions.py",
+        "if np.all(table == table[0]):",
+        "if np.any(table == table[0]):",
+        "tests/solvers/test_single_rows.py::test_rows_agree_with_the_dense_solver[Sphere-open]",
+    ),
+    (
+        "solvers/single_rows.py",
+        "put(solution, k, last + 0.5 * (lam - last))",
+        "put(solution, k, lam)",
+        "tests/solvers/test_single_rows.py::test_steps_that_overshoot_are_halved",
+    ),
+    (
+        "constraints/functions/expressions.py",
+        "second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]",
+        "second = [bend, value.diff(t), along.diff(t) + value.diff(t, 2)]",
+        "tests/constraints/test_constraint_set.py::test_acceleration_target_is_the_second_derivative_along_any_curve",
     ),
     # -- solvers: numbers several doubles wide --
     (

@@ -110,7 +110,6 @@ TESTED_ELSEWHERE = {
     "comparison/methods/peers/shake.py": "comparison/methods/peers/test_peer_methods.py",
     "comparison/work_precision/whole_page.py": "comparison/work_precision/test_whole.py",
     "openmm/integrator/interface.py": "openmm/integrator/test_projected.py",
-    "openmm/integrator/states/states_on_constraints.py": "openmm/integrator/states/test_minimization.py",
 }
 
 

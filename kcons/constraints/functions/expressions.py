@@ -33,8 +33,6 @@ FUNCTIONS: dict[str, Any] = {
 }
 _IN_SYMPY = {"abs": "Abs"}
 _COORDINATE = re.compile(r"([xyz])([1-9]\d*)")
-#: Changes with what is written into the files.
-_VERSION = 1
 _OPERATIONS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
 
 
@@ -208,7 +206,8 @@ _NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": 
 
 def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...]) -> ModuleType:
     """The module of a formula, from its file if there is one."""
-    key = hashlib.sha256(repr((_VERSION, ast.unparse(tree), width, parameters)).encode()).hexdigest()[:24]
+    meant = repr((ast.unparse(tree), width, parameters)).encode()
+    key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
     folder = _folder()
     path = folder / f"formula_{key}.py"
     if not path.exists():

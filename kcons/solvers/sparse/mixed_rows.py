@@ -95,7 +95,7 @@ class SparseRows:
         self._links = links.ravel()
         self._made_of = constraint_set, rows, inverse_masses, late
         self._given = GivenRows(constraint_set, self.rows, int(widths.max(initial=0)))
-        links[:, 3] = self._given.starts
+        links[:-1, 3] = self._given.starts
         self._tables = (
             pattern.clusters, self._atoms, atom_start, slot_atoms, self._given.kinds, self._given.numbers, self._links,
             pattern.columns, pattern.targets, triple, sides, masses,
@@ -309,10 +309,10 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
     error, total, excess = 0.0, 0.0, 0.0
     bad = first
     for k in range(first, last):
-        kind, period = entry(kinds, k), 0.0
-        if kind >= FUNCTION:
+        period = 0.0
+        if entry(kinds, k) >= FUNCTION:
             period = number(parameters, entry(links, 4 * k + 3) + 1)
-        off = miss(kind, number(values, k), number(wanted, k), period)
+        off = miss(number(values, k), number(wanted, k), period)
         put(state, 2 * k + 1, off)
         e = abs(off) / number(scale, k)
         total += e

@@ -63,6 +63,28 @@ def call_row(typingctx, numbers, function, r, p, time, out):
 # -- families -----------------------------------------------------------------------------------------------
 
 
+def _dihedral(r, p, t, out):
+    """Of i, j, k, l from f = i - j, g = j - k, h = l - k. Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996)."""
+    fx, fy, fz = r[0] - r[3], r[1] - r[4], r[2] - r[5]
+    gx, gy, gz = r[3] - r[6], r[4] - r[7], r[5] - r[8]
+    hx, hy, hz = r[9] - r[6], r[10] - r[7], r[11] - r[8]
+    ax, ay, az = fy * gz - fz * gy, fz * gx - fx * gz, fx * gy - fy * gx
+    bx, by, bz = hy * gz - hz * gy, hz * gx - hx * gz, hx * gy - hy * gx
+    size = math.sqrt(gx * gx + gy * gy + gz * gz)
+    a2 = ax * ax + ay * ay + az * az
+    b2 = bx * bx + by * by + bz * bz
+    sx, sy, sz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+    out[0] = math.atan2((sx * gx + sy * gy + sz * gz) / size, ax * bx + ay * by + az * bz)
+    ga, gb = size / a2, size / b2
+    fa = (fx * gx + fy * gy + fz * gz) / (a2 * size)
+    hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)
+    tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
+    out[1], out[2], out[3] = -ga * ax, -ga * ay, -ga * az
+    out[4], out[5], out[6] = tx + ga * ax, ty + ga * ay, tz + ga * az
+    out[7], out[8], out[9] = -tx - gb * bx, -ty - gb * by, -tz - gb * bz
+    out[10], out[11], out[12] = gb * bx, gb * by, gb * bz
+
+
 def _plane(r, p, t, out):
     """p . r."""
     out[0], out[1], out[2], out[3] = p[0] * r[0] + p[1] * r[1] + p[2] * r[2], p[0], p[1], p[2]
@@ -150,6 +172,7 @@ def _radius_of_gyration(r, p, t, out):
 
 
 FAMILIES: dict[str, Callable[..., None]] = {
+    "Dihedral": _dihedral,
     "Plane": _plane,
     "Sphere": _sphere,
     "Cylinder": _cylinder,
@@ -243,39 +266,43 @@ class GivenRows:
         Of each row, `RELATIVE_FUNCTION` included.
     numbers : ndarray of float64
         All parameters, as the module says.
-    starts : ndarray of int64, shape (n + 1,)
-        First parameter of each row, and the end.
+    starts : ndarray of int64, shape (n,)
+        First parameter of each row.
     """
 
     def __init__(self, constraint_set: ConstraintSet, rows: IntArray, widest: int) -> None:
         """`rows` of the set in the order of the kernels; `widest` is the most atoms that one of them has."""
-        items = list(zip(constraint_set.constraints, constraint_set.starts, strict=False))
-        kinds, sizes = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
-        tables: list[FloatArray] = []
-        for item, start in items:
-            mine = slice(start, start + item.n_rows)
-            table = item.parameters().reshape(item.n_rows, -1) if item.kind else np.zeros((item.n_rows, 0))
+        kinds, starts = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
+        order = np.full(constraint_set.n_rows, -1)
+        order[rows] = np.arange(len(rows))
+        end = ROOM + 6 * widest + 1
+        tables: list[tuple[Constraint, int, FloatArray]] = []
+        for item, first in zip(constraint_set.constraints, constraint_set.starts, strict=False):
+            mine = slice(first, first + item.n_rows)
+            here = np.flatnonzero(order[mine] >= 0)
+            if not len(here):
+                continue
+            here = here[np.argsort(order[mine][here])]
+            table = item.parameters().reshape(item.n_rows, -1)[here]
             kinds[mine] = item.kind
             if item.kind == FUNCTION:
                 kinds[mine] += item.relative
-                numbered = [np.arange(item.n_rows)[:, None]] if item.functions else []
-                table = np.hstack([np.tile([0.0, item.period or 0.0], (item.n_rows, 1)), table, *numbered])
-            sizes[mine] = table.shape[1]
-            tables.append(table)
-        self.kinds = kinds[rows]
-        self.starts = ROOM + 6 * widest + 1 + np.concatenate([[0], np.cumsum(sizes[rows])])
-        self.numbers = np.zeros(int(self.starts[-1]))
-        place = np.full(constraint_set.n_rows, -1)
-        place[rows] = self.starts[:-1]
+                numbered = [here[:, None]] if item.functions else []
+                table = np.hstack([np.tile([0.0, item.period or 0.0], (len(here), 1)), table, *numbered])
+            if np.all(table == table[0]):
+                table = table[:1]  # rows that are alike read the same numbers
+            count, size = table.shape
+            starts[first + here] = end + (np.arange(len(here)) * size if count > 1 else 0)
+            tables.append((item, end, table))
+            end += table.size
+        self.kinds, self.starts = kinds[rows], starts[rows]
+        self.numbers = np.zeros(end)
         self.functions = []
-        for (item, start), table in zip(items, tables, strict=True):
-            at = place[start : start + item.n_rows]
-            here = at >= 0
-            at = at[here]
-            self.numbers[at[:, None] + np.arange(table.shape[1])] = table[here]
-            if item.kind == FUNCTION and len(at):
+        for item, first, table in tables:
+            self.numbers[first : first + table.size] = table.ravel()
+            if item.kind == FUNCTION:
                 self.functions.append(row_function(item, self.numbers))
-                self.numbers.view(np.int64)[at] = self.functions[-1].address
+                self.numbers.view(np.int64)[first : first + table.size : table.shape[1]] = self.functions[-1].address
 
     @property
     def python(self) -> list[PythonRows]:

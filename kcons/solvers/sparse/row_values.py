@@ -1,4 +1,4 @@
-"""Values and gradients of compiled rows: distances, angles, dihedrals, linear rows, functions.
+"""Values and gradients of compiled rows: distances, angles, linear rows, functions.
 
 Scalar code for one row at a time. Positions are held as ``base + moves`` so that differences of atoms that
 lie far from the origin keep their digits while moves are small; both as quads (x, y, z, any) by atom.
@@ -21,7 +21,6 @@ from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, call_row
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
-DIHEDRAL = int(RowKind.DIHEDRAL)
 LINEAR = int(RowKind.LINEAR)
 
 #: Which of the two gradients in a slot's line: as numbers of NumPy, for which `evaluate` is compiled once.
@@ -77,29 +76,6 @@ def angle(u, w):  # type: ignore[no-untyped-def]
     bx, by, bz = _cross(cx, cy, cz, wx, wy, wz)
     value = math.atan2(c, ux * wx + uy * wy + uz * wz)
     return value, (fu * ax, fu * ay, fu * az), (fw * bx, fw * by, fw * bz)
-
-
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def dihedral(f, g, h):  # type: ignore[no-untyped-def]
-    """Dihedral of i, j, k, l from f = i - j, g = j - k, h = l - k, and its gradients by all but atom k, then t.
-
-    Atom k takes what the others leave. Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996).
-    """
-    fx, fy, fz = f
-    gx, gy, gz = g
-    hx, hy, hz = h
-    ax, ay, az = _cross(fx, fy, fz, gx, gy, gz)
-    bx, by, bz = _cross(hx, hy, hz, gx, gy, gz)
-    size = math.sqrt(gx * gx + gy * gy + gz * gz)
-    a2 = ax * ax + ay * ay + az * az
-    b2 = bx * bx + by * by + bz * bz
-    sx, sy, sz = _cross(bx, by, bz, ax, ay, az)
-    value = math.atan2((sx * gx + sy * gy + sz * gz) / size, ax * bx + ay * by + az * bz)
-    ga, gb = size / a2, size / b2
-    fa = (fx * gx + fy * gy + fz * gz) / (a2 * size)
-    hb = (hx * gx + hy * gy + hz * gz) / (b2 * size)
-    tx, ty, tz = fa * ax - hb * bx, fa * ay - hb * by, fa * az - hb * bz
-    return value, (-ga * ax, -ga * ay, -ga * az), (tx, ty, tz), (gb * bx, gb * by, gb * bz)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -169,16 +145,6 @@ def evaluate(  # type: ignore[no-untyped-def]
             _put(lines, place, a[0], a[1], a[2])
             _put(lines, place + 8, -(a[0] + b[0]), -(a[1] + b[1]), -(a[2] + b[2]))
             _put(lines, place + 16, b[0], b[1], b[2])
-        elif kind == DIHEDRAL:
-            j, l = entry(slot_atoms, slot + 1), entry(slot_atoms, slot + 2)
-            f = _difference(i, j, base, moves, cell, inverse, periodic)
-            g = _difference(j, l, base, moves, cell, inverse, periodic)
-            h = _difference(entry(slot_atoms, slot + 3), l, base, moves, cell, inverse, periodic)
-            value, a, t, b = dihedral(f, g, h)
-            _put(lines, place, a[0], a[1], a[2])
-            _put(lines, place + 8, t[0] - a[0], t[1] - a[1], t[2] - a[2])
-            _put(lines, place + 16, -t[0] - b[0], -t[1] - b[1], -t[2] - b[2])
-            _put(lines, place + 24, b[0], b[1], b[2])
         elif kind == LINEAR:
             # sum c . r; small moves and large positions are summed apart.
             whole, change = 0.0, 0.0
@@ -201,11 +167,9 @@ def evaluate(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def miss(kind, value, target, period):  # type: ignore[no-untyped-def]
-    """target - value, for dihedrals and functions with a period by the shorter way round."""
+def miss(value, target, period):  # type: ignore[no-untyped-def]
+    """target - value, where there is a period by the shorter way round."""
     difference = target - value
-    if kind == DIHEDRAL:
-        difference -= 2 * np.pi * np.rint(difference / (2 * np.pi))
-    elif period > 0.0:
+    if period > 0.0:
         difference -= period * np.rint(difference / period)
     return difference

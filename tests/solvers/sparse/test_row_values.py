@@ -6,14 +6,14 @@ import pytest
 from kcons.constraints import Angle, CenterDistance, Cylinder, Dihedral, Distance, LinearCombination, Plane, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.solvers.sparse.mixed_rows import SparseRows
-from kcons.solvers.sparse.row_values import DIHEDRAL, evaluate, miss
+from kcons.solvers.sparse.row_values import evaluate, miss
 
 KINDS = {
     RowKind.DISTANCE: Distance([[3, 1], [7, 2]]),
     RowKind.ANGLE: Angle([[0, 1, 2], [5, 3, 8]]),
-    RowKind.DIHEDRAL: Dihedral([[0, 1, 2, 3], [8, 6, 4, 2]]),
+    "dihedrals": Dihedral([[0, 1, 2, 3], [8, 6, 4, 2]]),
     RowKind.LINEAR: LinearCombination([[4, 6, 7]], np.arange(9.0).reshape(1, 3, 3) - 3.5),
-    RowKind.FUNCTION: Cylinder([2, 8], [0.1, 0.2, 0.3], [1.0, 2.0, -0.5]),
+    "functions": Cylinder([2, 8], [0.1, 0.2, 0.3], [1.0, 2.0, -0.5]),
     "functions of differences": CenterDistance([[3, 4], [0, 1]], [[7], [5]]),
 }
 
@@ -68,10 +68,11 @@ def test_all_kinds_together():
     np.testing.assert_allclose(gradient, constraint_set.jacobian(x).toarray(), atol=1e-12)
 
 
-def test_dihedrals_miss_by_the_shorter_way():
-    assert miss(DIHEDRAL, 3.1, -3.1, 0.0) == pytest.approx(2 * np.pi - 6.2)
+def test_rows_with_a_period_miss_by_the_shorter_way():
+    turn = 2 * np.pi
+    assert miss(3.1, -3.1, turn) == pytest.approx(2 * np.pi - 6.2)
     # More than a quarter of a turn is nothing to go round for.
-    assert miss(DIHEDRAL, -1.0, 1.9, 0.0) == pytest.approx(2.9)
-    assert miss(DIHEDRAL, 1.0, -1.9, 0.0) == pytest.approx(-2.9)
-    assert miss(DIHEDRAL, -1.0, 2.4, 0.0) == pytest.approx(3.4 - 2 * np.pi)
-    assert miss(int(RowKind.ANGLE), 3.1, 0.1, 0.0) == pytest.approx(-3.0)
+    assert miss(-1.0, 1.9, turn) == pytest.approx(2.9)
+    assert miss(1.0, -1.9, turn) == pytest.approx(-2.9)
+    assert miss(-1.0, 2.4, turn) == pytest.approx(3.4 - 2 * np.pi)
+    assert miss(3.1, 0.1, 0.0) == pytest.approx(-3.0)

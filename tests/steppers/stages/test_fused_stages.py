@@ -174,7 +174,7 @@ def test_steps_without_solution_are_the_engines(names) -> None:
     """The same error, for the same row, after which a usual step is what it would have been."""
     taken = failed = 0
     for stepper in STEPPERS:
-        for dt in np.geomspace(0.5, 20.0, 4 if names == ["longer"] else 12):
+        for dt in [0.5, 20.0] if names == ["longer"] else np.geomspace(0.5, 20.0, 12):
             pair = [molecules(*names, force=None, piecewise=p) for p in (False, True)]
             outcomes = []
             for system, state in pair:
@@ -387,7 +387,7 @@ def test_the_engine_takes_over_in_the_middle_of_a_stage() -> None:
     """Steps so long that some flights take many iterations or a rescue, and some have no solution."""
     taken = failed = 0
     for stepper in STEPPERS:
-        for dt in np.geomspace(0.5, 8.0, 40):
+        for dt in np.geomspace(0.5, 8.0, 20):
             (system, state), (other, _) = triangles(force=None), triangles(force=None, piecewise=True)
             calls = []
             engine = system.motion.project_positions

@@ -216,7 +216,7 @@ def test_momenta_grow_with_the_potential(order):
 
     expected = momenta(start)
     assert np.abs(expected).max() > 0.01
-    n = {2: 40000, 4: 8000, 6: 2000}[order]
+    n = {2: 4000, 4: 1600, 6: 500}[order]
     off = np.abs(momenta(run(held, start, 1.0 / n, n, stepper=Isokinetic(order=order))) - expected).max()
     assert off <= {2: 1e-5, 4: 1e-10, 6: 1e-10}[order] * np.abs(expected).max()
 
