@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.cli.terminal import console, names
-from kcons.constraints import Angle, Dihedral, Distance
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    Cylinder,
+    Dihedral,
+    Distance,
+    Ellipsoid,
+    Plane,
+    RadiusOfGyration,
+    Sphere,
+    Torus,
+)
 from kcons.constraints.compilation import announcer
 from kcons.constraints.constraint import Constraint
 from kcons.errors import InputError
@@ -103,6 +114,14 @@ def proteins() -> None:
     _use(ZIGZAG[:8], *ROWS, copies=LARGE)
 
 
+def surfaces() -> None:
+    """particles on surfaces, groups of atoms"""
+    origin, up = [-5.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+    rows = Sphere(0, origin), Cylinder(1, origin, up), Torus(2, origin, up, 1.0), Plane(3, up)
+    ellipsoid = Ellipsoid(4, origin, [1.0, 2.0, 3.0], target=None)
+    _use(ZIGZAG[:10], *rows, ellipsoid, CenterDistance([5], [6]), RadiusOfGyration([7, 8, 9]))
+
+
 def thermostats() -> None:
     """Langevin, isokinetic and Nosé-Hoover dynamics on bond lengths"""
     kinds = Isokinetic(1.0, momentum="free"), NoseHooverChain(1.0, 1.0, momentum="free"), Langevin(1.0, 1.0, 1)
@@ -155,7 +174,9 @@ def _use(molecule: FloatArray, *rows: Constraint, copies: int = 1, steppers: tup
     """What is asked of an engine, and some steps, for equal molecules, free and in a cell."""
     n = len(molecule)
     x = _copies(molecule, copies)
-    many = [type(item)(np.concatenate([item.atoms + k * n for k in range(copies)])) for item in rows]
+    many = list(rows)
+    if copies > 1:
+        many = [type(item)(np.concatenate([item.atoms + k * n for k in range(copies)])) for item in rows]
     for cell in (None, (np.ptp(x) + 100.0) * np.eye(3)):
         motion = Motion(ConstraintSet(many, x, np.ones(len(x)), cell=cell), x)
         v = motion.project_velocities(x, np.random.default_rng(0).normal(size=x.shape) * 0.01)
@@ -169,7 +190,7 @@ def _use(molecule: FloatArray, *rows: Constraint, copies: int = 1, steppers: tup
 
 
 KINDS: dict[str, Callable[[], None]] = {
-    use.__name__: use for use in (molecules, water, bonds, proteins, thermostats, ase, check)
+    use.__name__: use for use in (molecules, water, bonds, proteins, surfaces, thermostats, ase, check)
 }
 #: Packages that some of them need.
 NEEDS = {"check": "MDAnalysis"}

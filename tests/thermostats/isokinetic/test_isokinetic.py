@@ -55,7 +55,7 @@ def test_reference_trajectories_to_their_tolerance(name):
     held, case, state = referenced(name), cases.load(name), begin(name)
     thermostat = Isokinetic(order=6)
     kinetic = held.kinetic_energy(state.velocities)
-    steps = {"A10_isokinetic_lj4": 1000, "A10_isokinetic_dumbbell_quartic": 200}.get(name, 100)
+    steps = {"A10_isokinetic_lj4": 500, "A10_isokinetic_dumbbell_quartic": 120}.get(name, 100)
     for target in case.solution:
         span = target.time - state.time
         if target.time > 10:  # lj4 is chaotic

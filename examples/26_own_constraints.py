@@ -1,7 +1,7 @@
 """What a step costs with constraints of one's own, beside the families of kcons.
 
-    python examples/25_own_constraints.py           a few seconds
-    python examples/25_own_constraints.py --full    a minute: longer blocks, 100,000 particles
+    python examples/26_own_constraints.py           a few seconds
+    python examples/26_own_constraints.py --full    a minute: longer blocks, 100,000 particles
 
 One particle, a step of RATTLE without forces; then many, the projection of positions and of velocities, for each row.
 Processor time of blocks that are taken in turn in one process; medians, and ratios to the sphere.

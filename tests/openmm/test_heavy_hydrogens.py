@@ -1,0 +1,110 @@
+"""Heavy hydrogens at 4 fs: what is reported at the ends of steps, and what the committed runs say of configurations."""
+
+from __future__ import annotations
+
+import json
+import math
+import runpy
+
+import numpy as np
+import pytest
+from committed_pages import FOLDER, ROOT, page, printed
+
+RESULTS = FOLDER / "openmm_heavy_hydrogens.json"
+
+
+@pytest.fixture(scope="module")
+def example():
+    return runpy.run_path(str(ROOT / "examples" / "25_openmm_heavy_hydrogens.py"))
+
+
+def test_langevin_reports_what_harmonic_vibrations_say_and_300_k_half_a_kick_later(example):
+    """40 ps: about 270 K at the ends of steps of 4 fs, 300 K in between, within three standard errors."""
+    system, x = example["alanine"]("HBonds")
+    start = example["start_of"](system, x, 1, 1000)
+    omega = example["harmonic"](system, x)
+    # 66 coordinates, 12 bonds with hydrogen; a carbonyl vibrates in 19 fs.
+    assert len(omega) == 54
+    assert 2e3 * math.pi / omega.max() == pytest.approx(19, abs=1)
+    expected = 300 * (1 - np.mean((0.004 * omega) ** 2) / 4)
+    found = example["sample"](system, start, "kcons Langevin", 0.004, 40.0)
+    for name, kelvin in (("reported", expected), ("half", 300.0)):
+        assert abs(found[name]["mean"] - kelvin) <= 3 * found[name]["error"] < 20
+    assert found["half"]["mean"] - found["reported"]["mean"] > 20
+
+
+def test_a_harmonic_oscillator_has_the_frequency_of_its_spring(example):
+    """The analysis, on alanine whose wells are the only forces."""
+    system, x = example["alanine"]("AllBonds")
+    for k in reversed(range(system.getNumForces())):
+        if type(system.getForce(k)).__name__ != "CustomExternalForce":
+            system.removeForce(k)
+    omega = example["harmonic"](system, x)
+    masses = example["masses_of"](system)
+    # Six motions of a rigid body among them: between the frequencies of the lightest and the heaviest atom.
+    assert len(omega) == 66 - system.getNumConstraints()
+    lowest, highest = np.sqrt(200 / masses.max()), np.sqrt(200 / masses.min())
+    assert lowest * (1 - 1e-9) <= omega.min() <= omega.max() <= highest * (1 + 1e-9)  # differences of forces
+
+
+# -- the committed results --------------------------------------------------------------------------------
+
+
+def parts():
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    assert found["full"]
+    return found["parts"]
+
+
+def off(part, name, fs, key):
+    """What a mean is off the reference, in its unit, and the standard error of that."""
+    runs = {(run["name"], run["fs"]): run[key] for run in part["runs"]}
+    zero, this = runs["LangevinMiddleIntegrator", 1], runs[name, fs]
+    return this["mean"] - zero["mean"], math.hypot(this["error"], zero["error"])
+
+
+def test_page_shows_the_committed_results():
+    assert printed("25_openmm_heavy_hydrogens.py", RESULTS.name) in page("openmm_models.md")
+
+
+@pytest.mark.parametrize("constraints", ["HBonds", "AllBonds"])
+def test_configurations_of_langevin_at_4_fs_are_right(constraints):
+    part = parts()[constraints]
+    for key in ("bonds", "angles") if constraints == "HBonds" else ("angles",):
+        away, error = off(part, "kcons Langevin", 4, key)
+        assert abs(away) <= 3 * error
+    (run,) = (run for run in part["runs"] if (run["name"], run["fs"]) == ("kcons Langevin", 4))
+    assert abs(run["half"]["mean"] - 300) <= 3 * run["half"]["error"] < 5
+    assert run["reported"]["mean"] == pytest.approx(part["expected"], abs=5)
+
+
+def test_a_chain_at_the_ends_of_steps_warms_configurations_and_one_in_the_middle_does_not():
+    part = parts()["HBonds"]
+    away, error = off(part, "kcons NoseHoover", 4, "angles")
+    assert away > 5 * error
+    away, error = off(part, "kcons NoseHooverMiddle", 4, "angles")
+    assert abs(away) <= 3 * error
+    # Bonds, which hardly couple to the rest, are sampled slowly by chains, those of OpenMM too.
+    ours, one = off(part, "kcons NoseHooverMiddle", 4, "bonds")
+    theirs, two = off(part, "NoseHooverIntegrator", 4, "bonds")
+    assert abs(ours - theirs) <= 3 * math.hypot(one, two)
+
+
+def test_rattle_drifts_no_more_than_verlet():
+    for part in parts().values():
+        ours, theirs = part["drift"]["kcons rattle"], part["drift"]["VerletIntegrator"]
+        assert abs(ours["slope"]) <= abs(theirs["slope"]) + 3 * math.hypot(ours["error"], theirs["error"])
+        assert ours["error"] < 0.02
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("name", ["kcons Langevin", "kcons NoseHooverMiddle"])
+def test_configurations_at_4_fs_anew(example, name):
+    """The committed run once more, half a minute."""
+    system, x = example["alanine"]("HBonds")
+    found = example["sample"](system, example["start_of"](system, x, 1, 5000), name, 0.004, 1000.0)
+    zero = parts()["HBonds"]["runs"][0]
+    for key in ("bonds", "angles") if name == "kcons Langevin" else ("angles",):
+        error = math.hypot(found[key]["error"], zero[key]["error"])
+        assert abs(found[key]["mean"] - zero[key]["mean"]) <= 3 * error
+    assert abs(found["half"]["mean"] - 300) <= 3 * found["half"]["error"]
