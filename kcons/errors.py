@@ -7,6 +7,7 @@ the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 
 class KconsError(Exception):
@@ -150,7 +151,11 @@ class ConvergenceError(KconsError, RuntimeError):
         Step number, where a stepper knows it.
     singular : bool
         A held dihedral has come to where it is undefined: a smaller time step does not help.
+    positions : ndarray, shape (n_atoms, 3), or None
+        The best place found by a search for a minimum.
     """
+
+    positions: Any = None
 
     def __init__(
         self,

@@ -118,7 +118,7 @@ def minimise(
         tolerance=tolerance,
         iterations=step,
     )
-    error.positions = x  # type: ignore[attr-defined]
+    error.positions = x
     raise error
 
 
