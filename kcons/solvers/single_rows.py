@@ -20,7 +20,7 @@ from kcons.solvers.kernels.two_and_four_wide import entry, lane, load_point, num
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
 from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, GivenRows, call_row
-from kcons.solvers.sparse.row_values import miss, near
+from kcons.solvers.sparse.row_values import cell_of, miss, near
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, MAX_ITERATIONS, NEWTON_TOLERANCE
 
 _EPS = float(np.finfo(float).eps)
@@ -110,16 +110,7 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
         rolled()
         here = load_point(x, 3 * entry(atoms, p))
         if relative:
-            cell = (
-                (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
-                (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
-                (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
-            )
-            inverse = (
-                (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
-                (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
-                (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
-            )
+            cell, inverse = cell_of(lattice)
             dx, dy, dz = near(here - before, quad(0.0, 0.0, 0.0, 0.0), cell, inverse, periodic)
             a, b, c = a + dx, b + dy, c + dz
             before = here

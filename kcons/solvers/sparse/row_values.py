@@ -37,6 +37,22 @@ def _difference(i, j, base, moves, cell, inverse, periodic):  # type: ignore[no-
     )  # fmt: skip
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def cell_of(lattice):  # type: ignore[no-untyped-def]
+    """A cell and its inverse as tuples, as `near` takes them."""
+    cell = (
+        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
+        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
+        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
+    )
+    inverse = (
+        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
+        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
+        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
+    )
+    return cell, inverse
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def near(whole, change, cell, inverse, periodic):  # type: ignore[no-untyped-def]
     # No arrays come here: one that passes a branch costs reference counting.
@@ -116,16 +132,7 @@ def evaluate(  # type: ignore[no-untyped-def]
 
     ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its first parameter.
     """
-    cell = (
-        (lattice[0, 0, 0], lattice[0, 0, 1], lattice[0, 0, 2]),
-        (lattice[0, 1, 0], lattice[0, 1, 1], lattice[0, 1, 2]),
-        (lattice[0, 2, 0], lattice[0, 2, 1], lattice[0, 2, 2]),
-    )
-    inverse = (
-        (lattice[1, 0, 0], lattice[1, 0, 1], lattice[1, 0, 2]),
-        (lattice[1, 1, 0], lattice[1, 1, 1], lattice[1, 1, 2]),
-        (lattice[1, 2, 0], lattice[1, 2, 1], lattice[1, 2, 2]),
-    )
+    cell, inverse = cell_of(lattice)
     for k in range(first, last):
         kind = entry(kinds, k)
         slot = entry(links, 4 * k + 2)
