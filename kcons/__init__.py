@@ -1,13 +1,14 @@
 """kcons holds things fixed in molecular dynamics, exactly and cheaply.
 
 - `errors`: what is raised
-- `constraints`, `projection`: what can be held; the theory, dense and literal
+- `constraints`: what can be held
 - `topology`: what files say of a system
 - `solvers`, `plan`: constraint solvers, and which one holds what
 - `motion`: the engine
 - `steppers`, `thermostats`: dynamics on constraints
 - `models`: flows and growth under constraints
 - `ase`, `openmm`, `mdanalysis`: MD engines and files, imported by name: ``from kcons.ase import constrain``
+- `free_energy`: free energies along held coordinates, and relaxed scans
 - `comparison`, `cli`: which method and which step; the command
 """
 
@@ -34,6 +35,7 @@ MOVED = {
     "fronts": "comparison.work_precision.fronts",
     "growth": "models.growth",
     "hard_cases": "comparison.hard_cases",
+    "projection": "constraints.projection",
     "recommendation": "comparison.work_precision.recommendation",
     "report": "comparison.work_precision.report",
     "sampling": "comparison.averages.sampling",

@@ -9,7 +9,7 @@ python examples/notes/example_4.py        writes example_4.png and example_4.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.models.flows import ParticleOnSphere
 
 R, m = 1.0, 2.0  # m, kg

@@ -9,7 +9,7 @@ python examples/notes/figure_10.py        writes figure_10.png and figure_10.pdf
 import matplotlib.pyplot as plt
 import numpy as np
 
-from kcons import projection
+from kcons.constraints import projection
 
 # Positions in nm and velocities in nm/ps. A distance between two atoms, and the first one on the plane z = 0.
 x = np.array([[0.0, 0.0, 0.0], [0.6, 0.3, 0.8]])

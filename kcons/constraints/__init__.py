@@ -11,6 +11,7 @@
 - `contradictions`: targets that exclude each other
 - `periodic`: which images rows mean, and the cell
 - `constraint_set`: many constraints as one sigma, A and b
+- `projection`: the theory, dense and literal
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from oracle_sets import (
 )
 
 from kcons import constraints as held
-from kcons import projection
+from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 

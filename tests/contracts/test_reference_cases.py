@@ -10,7 +10,7 @@ import pytest
 from reference import cases
 from reference.cases import Case, Snapshot
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State, System, run

@@ -7,7 +7,7 @@ import pytest
 from motion_systems import TRIANGLE, WATER, ZIGZAG, steps
 
 from kcons import constraints as held
-from kcons import projection
+from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 

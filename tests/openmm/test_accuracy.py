@@ -21,8 +21,7 @@ from openmm_systems import (
     water_box,
 )
 
-from kcons import projection
-from kcons.constraints import Distance
+from kcons.constraints import Distance, projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.openmm import ProjectedIntegrator

@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 from committed_pages import said
 
-from kcons import projection
 from kcons.cli import main
-from kcons.constraints import Constraint
+from kcons.constraints import Constraint, projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 

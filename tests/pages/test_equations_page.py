@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcons import projection
+from kcons.constraints import projection
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import assume
 
 from kcons import constraints as held
-from kcons import projection
+from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 

@@ -13,8 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons import projection
-from kcons.constraints import Angle, Constraint, Distance, FixedAtoms
+from kcons.constraints import Angle, Constraint, Distance, FixedAtoms, projection
 from kcons.constraints.constraint_set import ConstraintSet
 
 Array = NDArray[np.float64]
@@ -159,7 +158,7 @@ class Problem:
         return 0.5 * float(np.sum(self.m[moving, None] * v[moving] ** 2))
 
     def oracle(self) -> ConstraintSet:
-        """The rows for the dense theory of `kcons.projection`; none of the solvers knows of it."""
+        """The rows for the dense theory of `kcons.constraints.projection`; none of the solvers knows of it."""
         return ConstraintSet(self.rows(), self.x, self.m)
 
     def tangent(self, v: ArrayLike) -> Array:

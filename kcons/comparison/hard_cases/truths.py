@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj, ellipk
 
-from kcons import projection
 from kcons.comparison.hard_cases.problem import Array, Numbers, Problem
+from kcons.constraints import projection
 
 _KNOWN: dict[tuple[Any, ...], Array] = {}
 

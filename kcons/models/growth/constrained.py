@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError, SingularGeometryError
 from kcons.models.growth import orthogonal_rows
 from kcons.models.growth.model import FloatArray, GrowthModel, Populations

@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from small_test_systems import SMALL, STORED, end, small
 
-from kcons import projection
 from kcons.comparison import test_systems
 from kcons.comparison.test_systems.minimal import COARSER, FINEST
+from kcons.constraints import projection
 from kcons.errors import InputError
 from tests.contracts.test_reference_orders import EPS, sensitivities
 from tests.reference import cases

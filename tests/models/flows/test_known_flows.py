@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flow_reference import case
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.errors import InputError
 from kcons.models.flows import (
     DampedOscillator,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.errors import ConstraintError, ContradictionError, ConvergenceError, InputError
 from kcons.models.growth import (
     ConstrainedGrowth,

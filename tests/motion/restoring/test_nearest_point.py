@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kcons import constraints as held
-from kcons import projection
+from kcons.constraints import projection
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InfeasibleError, InputError, SingularGeometryError
 from kcons.motion import Motion

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kcons import projection
+from kcons.constraints import projection
 from kcons.errors import ContradictionError, InputError
 
 

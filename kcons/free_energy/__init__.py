@@ -1,0 +1,1 @@
+"""Free energies along held coordinates, and relaxed scans."""
