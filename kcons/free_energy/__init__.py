@@ -1,6 +1,8 @@
 """Free energies along held coordinates, and relaxed scans.
 
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
 - `averages`: means of correlated samples with weights
+- `mean_forces`: the mean force of one window
 """
 
 from importlib import import_module
@@ -8,6 +10,9 @@ from typing import Any
 
 #: Public names by the module that has them, which is imported when one is asked for.
 _NAMES = {
+    "held_coordinates": ("HeldCoordinates", "Sample"),
+    "series": ("Recorder", "Series"),
+    "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "averages": ("Mean", "weighted_mean"),
 }
 
