@@ -21,12 +21,11 @@ def force(x, t):
     return f
 
 
-def recorded(coordinates, others=(), dt=0.01, steps=40, stepper=None, v=None):
+def recorded(coordinates, others=(), dt=0.01, steps=40, stepper=None):
     motion = Motion(ConstraintSet([*others, *coordinates.values()], X, M), X)
     system = System(motion, force)
-    still = np.zeros_like(X) if v is None else motion.project_velocities(X, v)
     recorder = Recorder(system, HeldCoordinates(motion, coordinates, X))
-    run(system, system.initial_state(X, still), dt, steps, stepper=stepper, observers=[recorder])
+    run(system, system.initial_state(X, np.zeros_like(X)), dt, steps, stepper=stepper, observers=[recorder])
     return recorder
 
 
