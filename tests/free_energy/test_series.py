@@ -68,9 +68,7 @@ def test_work_is_the_energy_that_moving_targets_add(coordinate):
 
 
 def test_files_have_all_of_it(tmp_path):
-    series = recorded(
-        {"turn": Dihedral([[0, 1, 2, 3]]), "bond": Distance([[0, 1]])}, v=np.ones((4, 3)) * M[:, None]
-    ).series
+    series = recorded({"turn": Dihedral([[0, 1, 2, 3]]), "bond": Distance([[0, 1]])}, steps=8).series
     series.save(tmp_path / "series.npz")
     read = Series.load(tmp_path / "series.npz")
     assert read.names == series.names and read.periods.tolist() == series.periods.tolist()
