@@ -1,8 +1,23 @@
 """Free energies along held coordinates, and relaxed scans.
 
-- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima with coordinates held at the points of a grid
+- `averages`: means of correlated samples with weights
+- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
-from kcons.free_energy.relaxed_scan import Scan, scan
+from importlib import import_module
+from typing import Any
 
-__all__ = ["Scan", "scan"]
+#: Public names by the module that has them, which is imported when one is asked for.
+_NAMES = {
+    "averages": ("Mean", "weighted_mean"),
+    "relaxed_scan": ("Scan", "scan"),
+}
+
+__all__ = sorted(name for names in _NAMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _NAMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -167,7 +167,9 @@ def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
         raise UnreadableError(f"{place} is no plan of a scan; take another folder", item="folder")
     unknown = sorted(set(before) ^ set(plan))
     if unknown:
-        raise InputError(f"{place} has unknown or missing entries: {', '.join(unknown)}; take another folder", item=unknown[0])
+        raise InputError(
+            f"{place} has unknown or missing entries: {', '.join(unknown)}; take another folder", item=unknown[0]
+        )
     wrong = [name for name in plan if before[name] != json.loads(json.dumps(plan[name]))]
     if wrong:
         raise OccupiedError(

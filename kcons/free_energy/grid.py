@@ -28,8 +28,8 @@ class Grid:
     coordinates : sequence of Constraint
         One row each.
     values : sequence of array_like
-        For each of them, in angstrom or radian; put into ascending order. Of dihedrals over a whole turn the last value,
-        which is the first one again, is left out.
+        For each of them, in angstrom or radian; put into ascending order. Of dihedrals over a whole turn the last
+        value, which is the first one again, is left out.
 
     Attributes
     ----------
@@ -79,9 +79,7 @@ class Grid:
 
     def shown(self, point: Point) -> list[float]:
         """The values at a point, angles in degrees."""
-        return [
-            float(np.degrees(v)) if turn else v for v, turn in zip(self.at(point), self.in_degrees, strict=True)
-        ]
+        return [float(np.degrees(v)) if turn else v for v, turn in zip(self.at(point), self.in_degrees, strict=True)]
 
     def said(self, point: Point) -> str:
         """For messages: 'Dihedral(0, 1, 2, 3) = 30'."""

@@ -46,6 +46,9 @@ LOWER = 2.7e-4
 #: Atoms up to which curvatures are kept as a table; beyond, relaxations remember their last steps only.
 MOST_ATOMS = 150
 
+#: Relaxations to a point that failed after which it is given up.
+MOST_TRIES = 4
+
 #: Told of every attempt: points done, points in all, and a line about it.
 Progress = Callable[[int, int, str], None]
 
@@ -111,7 +114,9 @@ class Scan:
             The point was not reached.
         """
         if point not in self.best:
-            raise InputError(f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point")
+            raise InputError(
+                f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point"
+            )
         found = self.atoms.copy()
         found.positions[:] = self.best[point].positions
         found.info["energy"] = self.best[point].energy
@@ -238,7 +243,7 @@ class _Surface:
             raise
         except Exception as error:
             raise CalculatorError(
-                f"the calculator failed ({type(error).__name__}: {error}); look at the structure, or take other settings"
+                f"the calculator failed ({type(error).__name__}: {error}); change its settings, or leave the value out"
             ) from error
         if not np.isfinite(energy):
             raise NonFiniteError(f"the energy is not finite: {energy}", item="energy")
@@ -333,9 +338,7 @@ class _Wavefront:
         if attempt is None:
             attempt = Attempt(len(attempts), point, source)
             try:
-                self.surface.relaxed(
-                    attempt, None if source is None else attempts[source], self.fmax, self.evaluations
-                )
+                self.surface.relaxed(attempt, None if source is None else attempts[source], self.fmax, self.evaluations)
             except KconsError as error:
                 attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
                 self._first = self._first or error
@@ -373,7 +376,3 @@ class _Wavefront:
         _, point, number = min(pairs)
         self._queue.append((point, number))
         return True
-
-
-#: Relaxations to a point that failed after which it is given up.
-MOST_TRIES = 4
