@@ -1,6 +1,8 @@
 """Free energies along held coordinates, and relaxed scans.
 
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
 - `averages`: means of correlated samples with weights
+- `mean_forces`: the mean force of one window
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
@@ -9,6 +11,9 @@ from typing import Any
 
 #: Public names by the module that has them, which is imported when one is asked for.
 _NAMES = {
+    "held_coordinates": ("HeldCoordinates", "Sample"),
+    "series": ("Recorder", "Series"),
+    "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "averages": ("Mean", "weighted_mean"),
     "relaxed_scan": ("Scan", "scan"),
 }
