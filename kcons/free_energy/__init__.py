@@ -3,6 +3,7 @@
 - `held_coordinates`, `series`: multipliers and Z by name, and samples of them
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
 from importlib import import_module
@@ -14,6 +15,7 @@ _NAMES = {
     "series": ("Recorder", "Series"),
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "averages": ("Mean", "weighted_mean"),
+    "relaxed_scan": ("Scan", "scan"),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)
