@@ -1,1 +1,28 @@
-"""Free energies along held coordinates, and relaxed scans."""
+"""Free energies along held coordinates, and relaxed scans.
+
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `averages`: means of correlated samples with weights
+- `mean_forces`: the mean force of one window
+- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
+"""
+
+from importlib import import_module
+from typing import Any
+
+#: Public names by the module that has them, which is imported when one is asked for.
+_NAMES = {
+    "held_coordinates": ("HeldCoordinates", "Sample"),
+    "series": ("Recorder", "Series"),
+    "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
+    "averages": ("Mean", "weighted_mean"),
+    "relaxed_scan": ("Scan", "scan"),
+}
+
+__all__ = sorted(name for names in _NAMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _NAMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -375,7 +375,12 @@ MUTANTS = [
         "t",
         "tests/models/flows/test_hamiltonian.py::test_order_where_the_hamiltonian_depends_on_time",
     ),
-    ("constraints/projection.py", "rtol)].conj().T)", "rtol)].T)", "tests/constraints/test_projection.py::test_complex_matrices"),
+    (
+        "constraints/projection.py",
+        "rtol)].conj().T)",
+        "rtol)].T)",
+        "tests/constraints/test_projection.py::test_complex_matrices",
+    ),
     # -- steppers, thermostats, arrays --
     (
         "motion/local_projections.py",

@@ -1,0 +1,191 @@
+"""Means of correlated samples with weights, and their errors.
+
+The mean force of a window is a ratio, sum w f/sum w. To first order its fluctuation is that of the mean of the series
+u = w (f - mean)/<w>, whose neighbours depend on each other: a mean of n values has g times the variance of independent
+ones, g being the statistical inefficiency (Chodera et al., J. Chem. Theory Comput. 3, 26 (2007), eq. 20). Where
+equilibration ends is where most independent samples are left (Chodera, J. Chem. Theory Comput. 12, 1799 (2016)).
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import FloatArray, numbers
+from kcons.errors import InputError, UnsupportedError
+
+#: Fewest values that an error is taken from, and independent samples below which it is not to be relied on.
+FEWEST, FEW_INDEPENDENT = 16, 10
+#: Places from which on a run is tried as equilibrated.
+_ORIGINS = 50
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Means of d quantities.
+
+    Attributes
+    ----------
+    value : ndarray, shape (d,)
+    covariance : ndarray, shape (d, d)
+        Of the means, not of the samples.
+    error : ndarray, shape (d,)
+        Standard errors.
+    n : int
+        Samples used.
+    n_effective : float
+        Independent samples of equal weight that would tell as much: (sum w)^2/sum w^2 over the inefficiency.
+    inefficiency : ndarray, shape (d,)
+        Samples for each independent one.
+    start : int
+        First sample used: what is before it was taken for equilibration.
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+    error: FloatArray
+    n: int
+    n_effective: float
+    inefficiency: FloatArray
+    start: int = 0
+
+
+def pymbar() -> ModuleType:
+    """The package pymbar, imported when it is needed.
+
+    Raises
+    ------
+    UnsupportedError
+        It is not installed.
+    """
+    # It logs general advice when it is imported, some of it through the logger of a module.
+    loud = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        import pymbar
+    except ModuleNotFoundError:
+        raise UnsupportedError(
+            "errors of correlated series and BAR are left to pymbar, which is not installed: "
+            "python -m pip install 'kcons[free-energy]'"
+        ) from None
+    finally:
+        logging.disable(loud)
+    return pymbar  # type: ignore[no-any-return]
+
+
+def weighted_mean(
+    values: ArrayLike,
+    weights: ArrayLike | None = None,
+    *,
+    log_weights: ArrayLike | None = None,
+    equilibration: bool = False,
+) -> Mean:
+    """Mean of correlated samples, sum w f/sum w, with its error.
+
+    Parameters
+    ----------
+    values : array_like, shape (n, d) or (n,)
+        In the order in which they were taken.
+    weights : array_like, shape (n,), optional
+        Equal by default. A common factor does not matter.
+    log_weights : array_like, shape (n,), optional
+        In place of `weights`, where these would overflow.
+    equilibration : bool
+        Leave out the beginning as far as that leaves more independent samples.
+
+    Raises
+    ------
+    InputError
+        Fewer than 16 samples; a NaN or infinity; a negative weight, or none that is positive.
+    UnsupportedError
+        pymbar is not installed.
+
+    Warns
+    -----
+    UserWarning
+        Fewer than 10 independent samples; a quantity that never changes, whose error is then 0.
+    """
+    series, factors = _checked(values, weights, log_weights)
+    start = _equilibrated(_linearised(series, factors)) if equilibration else 0
+    series, factors = series[start:], factors[start:]
+    n = len(series)
+    fluctuation = _linearised(series, factors)
+    scale = np.maximum(np.abs(series).max(axis=0), np.finfo(float).tiny)
+    constant = np.abs(series - series[0]).max(axis=0) <= 1e-13 * scale
+    if constant.any():
+        warnings.warn(
+            f"all values of column {np.flatnonzero(constant).tolist()} are the same: their error is given as 0. "
+            "Either they are known exactly, or they were recorded once and repeated",
+            UserWarning,
+            stacklevel=2,
+        )
+        fluctuation[:, constant] = 0.0
+    inefficiency = np.array(
+        [1.0 if still else _inefficiency(u) for u, still in zip(fluctuation.T, constant, strict=True)]
+    )
+    widening = np.sqrt(inefficiency)
+    covariance = fluctuation.T @ fluctuation / (n * (n - 1)) * np.outer(widening, widening)
+    effective = float(factors.sum() ** 2 / (factors**2).sum() / inefficiency.max())
+    if effective < FEW_INDEPENDENT:
+        heaviest = float(factors.max() / factors.sum())
+        warnings.warn(
+            f"{n} samples are worth {effective:.1f} independent ones (the heaviest has {heaviest:.0%} of the weight, "
+            f"memory lasts for {inefficiency.max():.0f} samples): the error is not to be relied on. Sample longer",
+            UserWarning,
+            stacklevel=2,
+        )
+    return Mean(_mean(series, factors), covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency, start)
+
+
+def _checked(
+    values: ArrayLike, weights: ArrayLike | None, log_weights: ArrayLike | None
+) -> tuple[FloatArray, FloatArray]:
+    """Values (n, d) and weights (n,) whose mean is about 1."""
+    series = numbers(values, "values")
+    series = series[:, None] if series.ndim == 1 else series
+    if series.ndim != 2 or len(series) < FEWEST or not series.shape[1]:
+        raise InputError(
+            f"values of shape {series.shape} are too few for an error; give (n, d) with n of {FEWEST} or more",
+            item="values",
+        )
+    if weights is not None and log_weights is not None:
+        raise InputError("both weights and log_weights are given; give one of them", item="log_weights")
+    item = "weights" if log_weights is None else "log_weights"
+    given = weights if log_weights is None else log_weights
+    factors = np.zeros(len(series)) if given is None else numbers(given, item)
+    if factors.shape != (len(series),):
+        raise InputError(f"{item} must have shape {(len(series),)}, not {factors.shape}", item=item)
+    for array, name in ((series, "values"), (factors, item)):
+        wrong = np.argwhere(~np.isfinite(array))
+        if len(wrong):
+            raise InputError(f"sample {wrong[0, 0]} of {name} is not finite; leave it out", item=name)
+    if given is None or item == "log_weights":
+        factors = np.exp(factors - factors.max())
+    if (factors < 0).any() or not factors.any():
+        raise InputError("weights must not be negative, and one of them must be positive", item="weights")
+    return series, factors / factors.mean()
+
+
+def _mean(series: FloatArray, factors: FloatArray) -> FloatArray:
+    return np.asarray(factors @ series / factors.sum())
+
+
+def _linearised(series: FloatArray, factors: FloatArray) -> FloatArray:
+    """What the ratio sum w f/sum w fluctuates by, sample by sample: its mean is 0."""
+    return factors[:, None] * (series - _mean(series, factors)) / factors.mean()
+
+
+def _inefficiency(series: FloatArray) -> float:
+    return float(pymbar().timeseries.statistical_inefficiency(series))
+
+
+def _equilibrated(series: FloatArray) -> int:
+    """The latest place at which one of the columns is found to be equilibrated; at least `FEWEST` samples stay."""
+    detect = pymbar().timeseries.detect_equilibration
+    skip = max(1, len(series) // _ORIGINS)
+    return min(max(int(detect(u, nskip=skip)[0]) for u in series.T), len(series) - FEWEST)

@@ -1,0 +1,123 @@
+"""Means of correlated samples: their errors are as large as they say."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy import averages
+from kcons.free_energy.averages import weighted_mean
+
+
+def ar1(rng, n, memory, d=1):
+    """x' = a x + noise of variance 1 each, from its stationary distribution: g = (1 + a)/(1 - a)."""
+    noise = rng.standard_normal((n, d)) * np.sqrt(1 - memory**2)
+    noise[0] = rng.standard_normal(d)
+    return lfilter([1.0], [1.0, -memory], noise, axis=0)
+
+
+def within(found, expected, deviations):
+    """How many of the results are within so many standard errors."""
+    off = np.array([(m.value - expected) / m.error for m in found])
+    return float((np.abs(off) < deviations).mean())
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7, 0.9])
+def test_intervals_cover_as_often_as_they_say(memory):
+    rng, exact = np.random.default_rng(1), (1 + memory) / (1 - memory)
+    found = [weighted_mean(5.0 + ar1(rng, round(1000 * exact), memory)) for _ in range(300)]
+    # Standard deviation of the counts: 0.027 and 0.013.
+    assert within(found, 5.0, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
+    assert within(found, 5.0, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
+    # pymbar never says less than 1 and stops where the correlation first crosses 0: some 2/sqrt(1000) too much.
+    assert np.mean([m.inefficiency[0] for m in found]) == pytest.approx(exact, rel=0.1)
+    assert np.mean([m.n_effective for m in found]) == pytest.approx(1000, rel=0.1)
+
+
+def test_weights_that_belong_to_the_values():
+    """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
+    rng, b = np.random.default_rng(2), 0.6
+    found = []
+    for _ in range(300):
+        x = ar1(rng, 3000, 0.6)
+        found.append(weighted_mean(x, log_weights=b * x[:, 0] + 900.0))
+    assert within(found, b, norm.ppf(0.84)) == pytest.approx(0.68, abs=0.08)
+    assert within(found, b, norm.ppf(0.975)) == pytest.approx(0.95, abs=0.04)
+
+
+def test_several_quantities_at_once_have_a_covariance():
+    rng = np.random.default_rng(3)
+    mixing = np.array([[1.0, 0.0], [0.8, 0.3]])
+    found = [weighted_mean(ar1(rng, 1000, 0.5, d=2) @ mixing.T) for _ in range(300)]
+    seen = np.cov(np.array([m.value for m in found]).T)
+    said = np.mean([m.covariance for m in found], axis=0)
+    assert said == pytest.approx(3 * mixing @ mixing.T / 1000, rel=0.08)
+    assert seen == pytest.approx(said, rel=0.25)  # of 300 samples, a variance is known to 8 percent
+
+
+def test_weights_mean_what_repetition_means():
+    rng = np.random.default_rng(4)
+    x = rng.standard_normal(200)
+    often = rng.integers(1, 4, 200)
+    assert weighted_mean(x, often).value == pytest.approx([np.repeat(x, often).mean()], rel=1e-13)
+    one, other = weighted_mean(x, often), weighted_mean(x, log_weights=np.log(often) - 2000.0)
+    assert one.error == pytest.approx(other.error, rel=1e-9)
+    assert one.n == 200 and one.n_effective <= often.sum() ** 2 / (often**2).sum()
+
+
+def test_the_beginning_can_be_left_out():
+    rng = np.random.default_rng(5)
+    x = ar1(rng, 4000, 0.5)[:, 0] + 20.0 * np.exp(-np.arange(4000) / 100)
+    biased, right = weighted_mean(x), weighted_mean(x, equilibration=True)
+    assert 200 <= right.start <= 1500 and right.n == 4000 - right.start
+    assert abs(right.value[0]) < 4 * right.error[0] < 0.5 * abs(biased.value[0])
+
+
+@pytest.mark.parametrize(
+    ("values", "weights", "item", "message"),
+    [
+        (np.zeros(15), None, "values", "too few"),
+        (np.zeros((20, 0)), None, "values", "too few"),
+        ([1.0] * 19 + [np.nan], None, "values", "sample 19"),
+        (np.arange(20.0), np.ones(19), "weights", r"shape \(20,\)"),
+        (np.arange(20.0), np.full(20, np.inf), "weights", "sample 0"),
+        (np.arange(20.0), -np.ones(20), "weights", "negative"),
+        (np.arange(20.0), np.zeros(20), "weights", "positive"),
+    ],
+)
+def test_bad_input_is_refused(values, weights, item, message):
+    with pytest.raises(InputError, match=message) as caught:
+        weighted_mean(values, weights)
+    assert caught.value.item == item
+
+
+def test_both_kinds_of_weights_are_refused():
+    with pytest.raises(InputError, match="one of them"):
+        weighted_mean(np.arange(20.0), np.ones(20), log_weights=np.zeros(20))
+
+
+def test_one_sample_with_all_the_weight_is_warned_of():
+    weights = np.full(1000, 1e-6)
+    weights[7] = 1.0
+    with pytest.warns(UserWarning, match=r"worth 1\.0 independent.*heaviest has 100%"):
+        weighted_mean(np.random.default_rng(6).standard_normal(1000), weights)
+
+
+def test_a_series_that_never_changes_is_warned_of():
+    values = np.random.default_rng(7).standard_normal((100, 2))
+    values[:, 1] = 0.1
+    with pytest.warns(UserWarning, match=r"column \[1\] are the same"):
+        found = weighted_mean(values, np.linspace(1, 2, 100))
+    assert found.error[1] == 0 and found.value[1] == pytest.approx(0.1, rel=1e-14)
+    assert found.error[0] > 0
+
+
+def test_the_package_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymbar", None)
+    with pytest.raises(UnsupportedError, match=r"kcons\[free-energy\]"):
+        averages.weighted_mean(np.arange(20.0))
