@@ -4,6 +4,7 @@
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
 from importlib import import_module
@@ -17,6 +18,7 @@ _NAMES = {
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
+    "relaxed_scan": ("Scan", "scan"),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)
