@@ -4,6 +4,7 @@
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `windows`: many windows, by any executor
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
@@ -17,6 +18,10 @@ _NAMES = {
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
+    "windows.window": ("Settings", "Window"),
+    "windows.ase_windows": ("AseWindows",),
+    "windows.openmm_windows": ("OpenMMWindows",),
+    "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "averages": ("Mean", "weighted_mean"),
     "relaxed_scan": ("Scan", "scan"),
 }
