@@ -209,5 +209,9 @@ class NonFiniteError(KconsError, FloatingPointError):
         self.step = step
 
 
+class CalculatorError(KconsError, RuntimeError):
+    """A calculator raised an error of its own, which is its cause."""
+
+
 class UnsupportedError(KconsError, NotImplementedError):
     """The MD engine or method cannot do this; the message says what to use instead."""

@@ -215,7 +215,6 @@ class ConstraintSet(InCell):
         """c with A v = c for admissible velocities, shape (n_rows,); 0 where nothing moves by itself."""
         x = self._positions(x)
         y = self.whole(x)
-
         return self._rows(lambda c: self._rate(c, self._gather(c, x, y) if c.moving else None, time))
 
     def _rate(self, c: Constraint, r: FloatArray | None, time: float) -> FloatArray:
@@ -239,6 +238,11 @@ class ConstraintSet(InCell):
             return second - curvature - (c.time_terms(r, u, time)[1] if c.moving else 0.0)
 
         return self._of_rows(x, b_of)
+
+    def curvature(self, x: ArrayLike, v: ArrayLike, time: float = 0.0) -> FloatArray:
+        """v^T (d2q/dx2) v of position rows at fixed time, shape (n_rows,)."""
+        u = self._positions(v, "velocities")
+        return self._of_rows(x, lambda c, r: c.curvature(r, u[c.atoms], time))
 
     def tolerance(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """What |sigma| can reach in double precision: max(1e-14 scale, 2 eps sum |dq/dx_i| |x_i|), shape (n_rows,)."""
@@ -273,8 +277,7 @@ class ConstraintSet(InCell):
     def subset(self, rows: IntArray) -> tuple[ConstraintSet, IntArray]:
         """The set made of some rows over their own atoms only, and those atoms' numbers in this set.
 
-        Atoms along which whole rows are made whole belong to these. `rows` must be sorted. Targets, cell and
-        images are kept; nothing is checked again.
+        So do atoms along which whole rows are made whole. `rows` must be sorted; nothing is checked again.
         """
         rows = np.asarray(rows, dtype=np.int64)
         bounds = np.searchsorted(rows, self.starts)

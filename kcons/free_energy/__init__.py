@@ -1,7 +1,11 @@
 """Free energies along held coordinates, and relaxed scans.
 
+- `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
-- `gaussian_process`, `profile`: free energies from mean forces, and where to sample next
+- `mean_forces`: the mean force of one window
+- `profiles`: free energies from mean forces, and where to sample next
+- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
 
 from importlib import import_module
@@ -9,8 +13,14 @@ from typing import Any
 
 #: Public names by the module that has them, which is imported when one is asked for.
 _NAMES = {
+    "held_coordinates": ("HeldCoordinates", "Sample"),
+    "series": ("Recorder", "Series"),
+    "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
+    "ase_recorder": ("AseRecorder",),
+    "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
-    "profile": ("Profile", "integrate"),
+    "profiles.profile": ("Profile", "integrate"),
+    "relaxed_scan": ("Scan", "scan"),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)

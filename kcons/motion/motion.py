@@ -135,7 +135,7 @@ class Motion(Projector):
 
         `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilisation).
         """
-        return self._accelerate(x, v, f, time, feedback)[0]
+        return self.respond(x, v, f, time, feedback=feedback)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -143,18 +143,19 @@ class Motion(Projector):
         Where rows depend on each other, the solution of least norm; rows of fixed atoms come after the
         others and supply what is left.
         """
-        return self._accelerate(x, v, f, time)[1]
+        return self.respond(x, v, f, time)[1]
 
     def constraint_force(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """z = M a - f, the constraint force, shape (n_atoms, 3) (notes eq. 101)."""
-        lam = self._accelerate(x, v, f, time)[1]
+        lam = self.respond(x, v, f, time)[1]
         here = as_array(x, self._shape, "positions")
         z = self.constraint_set.jacobian(here, time).T @ lam
         return np.asarray(z).reshape(-1, 3)
 
-    def _accelerate(
-        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float, feedback: FloatArray | None = None
+    def respond(
+        self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
+        """`acceleration` and `multipliers` of one solve."""
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
         force = as_array(f, self._shape, "forces")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kcons.errors import InputError
-from kcons.free_energy.profile import integrate
+from kcons.free_energy.profiles.profile import integrate
 
 
 class Case(NamedTuple):

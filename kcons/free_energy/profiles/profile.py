@@ -3,7 +3,7 @@
 F(b) - F(a) is the integral of dF/dx. Two ways to it, both linear in the mean forces, so that the covariance of all
 differences is known and not only errors at points:
 
-- 'gp': a Gaussian process learned from the derivatives (`kcons.free_energy.gaussian_process`). Its band has what the
+- 'gp': a Gaussian process learned from the derivatives (`gaussian_process`). Its band has what the
   windows do not tell between them as well, and it knows where the next window helps most.
 - 'spline': the integral of the cubic spline through the mean forces (not-a-knot; periodic over a period). Fourth order
   in the distance of windows. Its band has the errors of the mean forces only.
@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.free_energy.gaussian_process import Axis, GradientProcess, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, learn
 from kcons.thermostats import Estimate
 
 Method = Literal["gp", "spline"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad_vec
 
-from kcons.free_energy.gaussian_process import Axis, GradientProcess, Points, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Points, learn
 
 AXES = {
     "line": Axis(-1.0, 3.0, False),

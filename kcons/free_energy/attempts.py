@@ -1,0 +1,186 @@
+"""The relaxations of a scan, kept one by one in a folder as they are done."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from ase import Atoms
+
+from kcons.constraints import Constraint
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, OccupiedError, UnreadableError
+from kcons.free_energy.grid import Grid, Point
+
+#: What is in a folder: the plan of the scan, and its relaxations.
+PLAN, PLACE = "plan.json", "relaxations"
+#: Atoms of a term of the model, filled up with this.
+_NONE = -9
+
+
+@dataclass
+class Attempt:
+    """One relaxation.
+
+    Attributes
+    ----------
+    number : int
+    point : tuple of int
+    source : int or None
+        The attempt whose structure it began from; None for the structure that was given.
+    positions : ndarray, shape (n_atoms, 3)
+    energy, largest : float
+        In eV; the largest force left on an atom, in eV/angstrom.
+    evaluations : int
+    error : str or None
+        Why it failed.
+    memory, terms
+        What was learned of the curvature, see `relaxation`.
+    """
+
+    number: int
+    point: Point
+    source: int | None
+    positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    energy: float = float("nan")
+    largest: float = float("nan")
+    evaluations: int = 0
+    error: str | None = None
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    terms: list[tuple[int, ...]] = field(default_factory=list)
+
+    def fill(self, positions: FloatArray, energy: float, largest: float, evaluations: int) -> None:
+        self.positions, self.energy, self.largest, self.evaluations = positions, energy, largest, evaluations
+
+
+class Attempts:
+    """A folder of attempts; without a folder nothing is kept.
+
+    Parameters
+    ----------
+    folder : Path or None
+    atoms : ase.Atoms
+    grid : Grid
+    held : sequence of Constraint
+    settings : mapping
+
+    Raises
+    ------
+    OccupiedError
+        The folder has another scan in it.
+    InputError
+        Coordinates that cannot be written to a file.
+    """
+
+    def __init__(
+        self, folder: Path | None, atoms: Atoms, grid: Grid, held: Sequence[Constraint], settings: Mapping[str, Any]
+    ) -> None:
+        self.folder = folder
+        if folder is None:
+            return
+        plan = {
+            "symbols": str(atoms.symbols),
+            "positions": atoms.positions.tolist(),
+            "cell": atoms.cell.array.tolist(),
+            "pbc": atoms.pbc.tolist(),
+            "calculator": type(atoms.calc).__name__,
+            "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
+            "values": [axis.tolist() for axis in grid.values],
+            "held": [item.todict() for item in held],
+            "settings": dict(settings),
+        }
+        place = folder / PLAN
+        if place.exists():
+            _refuse_another(place, plan)
+        (folder / PLACE).mkdir(parents=True, exist_ok=True)
+        _write(place, json.dumps(plan, indent=1).encode())
+
+    def _file(self, number: int) -> Path:
+        assert self.folder is not None
+        return self.folder / PLACE / f"{number:05d}.npz"
+
+    def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
+        """An attempt of an earlier run; None if there is none.
+
+        Raises
+        ------
+        UnreadableError
+            Its file is damaged, or of another scan.
+        """
+        if self.folder is None or not self._file(number).exists():
+            return None
+        try:
+            with self._file(number).open("rb") as file, np.load(file) as data:
+                head = json.loads(str(data["head"]))
+                found = Attempt(number, point, source, data["positions"], error=head["error"], memory=data["memory"])
+                found.terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
+                found.energy, found.largest = (float(v) for v in data["numbers"])
+                found.evaluations = head["evaluations"]
+                same = (tuple(head["point"]), head["source"]) == (point, source)
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise UnreadableError(f"{self._file(number)} cannot be read ({error}); remove it", item="folder") from error
+        if not same:
+            raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")
+        return found
+
+    def keep(self, attempt: Attempt) -> None:
+        """Write an attempt; the file is there as a whole, or not at all."""
+        if self.folder is None:
+            return
+        head = {
+            "point": list(attempt.point),
+            "source": attempt.source,
+            "evaluations": attempt.evaluations,
+            "error": attempt.error,
+        }
+        terms = np.full((len(attempt.terms), 5), _NONE, dtype=np.int64)
+        for row, term in zip(terms, attempt.terms, strict=True):
+            row[: len(term)] = term
+        place = self._file(attempt.number)
+        part = place.with_suffix(".part")
+        with part.open("wb") as file:
+            np.savez(
+                file,
+                head=np.array(json.dumps(head)),
+                positions=attempt.positions,
+                numbers=np.array([attempt.energy, attempt.largest]),
+                memory=attempt.memory,
+                terms=terms,
+            )
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, place)
+
+
+def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
+    try:
+        before = json.loads(place.read_text())
+    except ValueError as error:
+        raise UnreadableError(f"{place} cannot be read ({error}); take another folder", item="folder") from error
+    if not isinstance(before, dict):
+        raise UnreadableError(f"{place} is no plan of a scan; take another folder", item="folder")
+    unknown = sorted(set(before) ^ set(plan))
+    if unknown:
+        raise InputError(
+            f"{place} has unknown or missing entries: {', '.join(unknown)}; take another folder", item=unknown[0]
+        )
+    wrong = [name for name in plan if before[name] != json.loads(json.dumps(plan[name]))]
+    if wrong:
+        raise OccupiedError(
+            f"{place.parent} has another scan in it ({', '.join(wrong)} differ); take another folder", item="folder"
+        )
+
+
+def _write(place: Path, content: bytes) -> None:
+    part = place.with_suffix(".part")
+    with part.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, place)

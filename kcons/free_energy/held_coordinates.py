@@ -1,0 +1,335 @@
+"""What a held coordinate tells of the free energy: its multiplier, Z, and how Z changes along it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from kcons.constraints.arguments import as_array
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError
+from kcons.motion.motion import Motion
+
+#: A coordinate of which the other constraints leave less than this share of its Z depends on them.
+DEPENDENT = 1e-9
+
+
+class Sample(NamedTuple):
+    """Held coordinates at one configuration, each shape (d,) but for the numbers `time`, `log_det_z` and `off`.
+
+    Attributes
+    ----------
+    time : float
+    value : ndarray
+        The coordinates, as measured.
+    multiplier : ndarray
+        lambda of the constraint force A^T lambda: the force along the coordinate that holds it.
+    kinetic : ndarray
+        The part of `multiplier` that is quadratic in the velocities.
+    log_det_z : float
+        ln det Z; Z = A_q M_par^+ A_q^T with M_par^+ of all other constraints. det Z is det(A M^-1 A^T) of all rows by
+        that of the others.
+    gradient : ndarray
+        Half the derivative of ln det Z along each coordinate, the others and all constraints held.
+    off : float
+        The largest |sigma| of the coordinates.
+    """
+
+    time: float
+    value: FloatArray
+    multiplier: FloatArray
+    kinetic: FloatArray
+    log_det_z: float
+    gradient: FloatArray
+    off: float
+
+
+class HeldCoordinates:
+    """Coordinates that an engine holds, by name.
+
+    Only the clusters that they belong to are looked at, so that a sample costs the same in a large box.
+
+    Parameters
+    ----------
+    motion : Motion or ConstraintSet
+        What is held. For a dynamics class of ASE, ``dynamics.motion``.
+    coordinates : mapping of str to Constraint
+        Each a constraint of the set, named by an object of the same kind on the same atoms. One with n > 1 rows gives
+        n coordinates, ``name[0]`` to ``name[n - 1]``.
+    positions : array_like, shape (n_atoms, 3)
+        Where rank and clusters are found.
+    time : float
+        Time of `positions`, for targets that move.
+
+    Attributes
+    ----------
+    names : tuple of str
+    rows : ndarray of int, shape (d,)
+        Their rows in the set.
+    periods : ndarray, shape (d,)
+        2 pi for dihedrals; 0 for coordinates without a period.
+    atoms : ndarray of int
+        The atoms whose positions, velocities and forces matter.
+    motion : Motion or None
+        The engine of the other constraints of these clusters; None if there are none.
+
+    Raises
+    ------
+    InputError
+        A coordinate that is not held; a velocity constraint.
+    SingularGeometryError
+        A coordinate that depends on the other constraints, so that Z = 0.
+
+    References
+    ----------
+    den Otter and Briels, Mol. Phys. 98, 773 (2000); Ciccotti, Lelievre and Vanden-Eijnden, Commun. Pure Appl. Math.
+    61, 371 (2008); Sprik and Ciccotti, J. Chem. Phys. 109, 7737 (1998).
+    """
+
+    def __init__(
+        self,
+        motion: Motion | ConstraintSet,
+        coordinates: Mapping[str, Constraint],
+        positions: ArrayLike,
+        *,
+        time: float = 0.0,
+    ) -> None:
+        held = motion if isinstance(motion, ConstraintSet) else motion.sources[0]
+        x = as_array(positions, (held.n_atoms, 3), "positions")
+        if not coordinates:
+            raise InputError("no coordinates are named; give a mapping of names to constraints", item="coordinates")
+        names: list[str] = []
+        rows: list[int] = []
+        for name, coordinate in coordinates.items():
+            if not isinstance(coordinate, Constraint):
+                raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
+            found = _rows_of(held, coordinate, name)
+            names += [name] if len(found) == 1 else [f"{name}[{k}]" for k in range(len(found))]
+            rows += found
+        if len(set(rows)) < len(rows):
+            row = next(row for row in rows if rows.count(row) > 1)
+            twice = [name for name, its in zip(names, rows, strict=True) if its == row]
+            raise InputError(f"{' and '.join(twice)} are the same row {row} of the set", item=twice[0])
+        self.names = tuple(names)
+        self.rows: IntArray = np.array(rows, dtype=np.int64)
+        self._source = held
+        order = np.argsort(self.rows)
+        self._rank_of = np.argsort(order)
+        self._own, own_atoms = held.subset(self.rows[order])
+        self.periods = self._named(np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in self._own.constraints]))
+        others = np.setdiff1d(_joined_rows(held, self.rows), self.rows)
+        self._others, other_atoms = held.subset(others)
+        self.atoms: IntArray = np.union1d(own_atoms, other_atoms).astype(np.int64)
+        self._own_atoms = np.searchsorted(self.atoms, own_atoms)
+        self._other_atoms = np.searchsorted(self.atoms, other_atoms)
+        self._inverse_masses = 1 / held.masses[self.atoms, None]
+        self.motion = Motion(self._others, x[other_atoms], time=time) if len(others) else None
+        self._at(x[self.atoms], time)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __repr__(self) -> str:
+        beside = 0 if self.motion is None else self.motion.rank
+        return f"<HeldCoordinates: {', '.join(self.names)}, beside {beside} independent rows of their clusters>"
+
+    def sample(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> Sample:
+        """The coordinates at one configuration.
+
+        Parameters
+        ----------
+        x, v, f : array_like, shape (n_atoms, 3)
+            Positions, velocities and *applied* forces, without those of constraints, thermostat or friction.
+        time : float
+
+        Raises
+        ------
+        InputError
+            Wrong shapes.
+        NonFiniteError
+            NaN or infinity where the coordinates are.
+        SingularGeometryError
+            A coordinate has come to depend on the other constraints.
+        """
+        shape = (self._source.n_atoms, 3)
+        arrays = []
+        for array, item in ((x, "positions"), (v, "velocities"), (f, "forces")):
+            near = as_array(array, shape, item)[self.atoms]
+            finite = np.isfinite(near).all(axis=1)
+            if not finite.all():
+                atom = int(self.atoms[np.argmin(finite)])
+                raise NonFiniteError(f"{item} of atom {atom} are not finite at time {time:g}", item=item, atom=atom)
+            arrays.append(near)
+        here, speed, force = arrays
+        metric = self._at(here, time)
+        pushed = np.einsum("ian,an->i", metric.kept, force)
+        rest = self._targets(here, np.zeros_like(here), time, metric) if self._source.moving else np.zeros(len(self))
+        still = metric.inverse @ (rest - pushed)
+        moving = metric.inverse @ (self._targets(here, speed, time, metric) - pushed)
+        own = here[self._own_atoms]
+        return Sample(
+            time,
+            self._named(self._own.measure(own, time)),
+            moving,
+            moving - still,
+            float(np.linalg.slogdet(metric.z)[1]),
+            self._change_of_z(here, time, metric),
+            float(np.abs(self._own.value(own, time)).max()),
+        )
+
+    def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
+        """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).
+
+        The rows of M^-1 A^T (A M^-1 A^T)^-1 that belong to the coordinates: the shortest ones in the metric of the
+        masses.
+        """
+        here = as_array(x, (self._source.n_atoms, 3), "positions")
+        result = np.zeros((len(self), *here.shape))
+        result[:, self.atoms] = self._at(here[self.atoms], time).directions
+        return result
+
+    # -- pieces, on the atoms of the clusters ---------------------------------------------------
+
+    def _named(self, of_rows: FloatArray) -> FloatArray:
+        """From the order of rows in the set to that of the names."""
+        return of_rows[self._rank_of]
+
+    def _at(self, x: FloatArray, time: float) -> _Metric:
+        """Z and all that follows from the gradients at `x`; raises where a coordinate depends on other constraints."""
+        self._own.lattice = self._others.lattice = self._source.lattice
+        d, near = len(self), self._other_atoms
+        gradients = np.zeros((d, *x.shape))
+        dense = self._own.jacobian(x[self._own_atoms], time).toarray()
+        gradients[:, self._own_atoms] = self._named(dense).reshape(d, -1, 3)
+        kept = gradients * self._inverse_masses
+        free = np.einsum("ian,ian->i", gradients, kept)
+        reactions = np.zeros((d, 0))
+        if self.motion is not None:
+            rest = np.zeros((len(near), 3))
+            rows = self.motion.constraint_set
+            b = -rows.acceleration_target(x[near], rest, time) if rows.moving else None
+            answers = [self.motion.respond(x[near], rest, g[near], time, feedback=b) for g in gradients]
+            kept[:, near] = [acceleration for acceleration, _ in answers]
+            reactions = np.array([multipliers for _, multipliers in answers])
+        z = np.einsum("ian,jan->ij", gradients, kept)
+        z = (z + z.T) / 2
+        with np.errstate(all="ignore"):
+            share = z / np.sqrt(np.outer(free, free))
+        if not np.all(np.isfinite(share)):
+            raise NonFiniteError(f"the gradient of {', '.join(self.names)} is not finite", item="positions")
+        left, mixture = np.linalg.eigh(share)
+        if left[0] < DEPENDENT:
+            worst = [k for k in range(d) if abs(mixture[k, 0]) > 0.1]
+            raise SingularGeometryError(
+                f"{' and '.join(self.names[k] for k in worst)} depend{'s' if len(worst) == 1 else ''} on the other "
+                "constraints (Z = 0): nothing is left to move along; take out the constraints that fix it, or measure "
+                "another coordinate",
+                rows=self.rows[worst],
+                atoms=self.atoms[self._own_atoms],
+            )
+        inverse = np.linalg.inv(z)
+        return _Metric(z, inverse, kept, reactions, np.einsum("ij,jan->ian", inverse, kept))
+
+    def _seen(self, own: FloatArray, others: FloatArray | None, metric: _Metric) -> FloatArray:
+        """What a quantity of rows means for the coordinates once the other constraints have had their share."""
+        seen = self._named(own)
+        return seen if others is None else seen + metric.reactions @ others
+
+    def _targets(self, x: FloatArray, v: FloatArray, time: float, metric: _Metric) -> FloatArray:
+        """b of the coordinates, less what the other constraints' b gives them."""
+        own, near = self._own_atoms, self._other_atoms
+        others = None if self.motion is None else self.motion.constraint_set
+        return self._seen(
+            self._own.acceleration_target(x[own], v[own], time),
+            None if others is None else others.acceleration_target(x[near], v[near], time),
+            metric,
+        )
+
+    def _curvatures(self, x: FloatArray, u: FloatArray, time: float, metric: _Metric) -> FloatArray:
+        """u^T q'' u of the coordinates, followed on the surface of the other constraints."""
+        own, near = self._own_atoms, self._other_atoms
+        others = None if self.motion is None else self.motion.constraint_set
+        return self._seen(
+            self._own.curvature(x[own], u[own], time),
+            None if others is None else others.curvature(x[near], u[near], time),
+            metric,
+        )
+
+    def _change_of_z(self, x: FloatArray, time: float, metric: _Metric) -> FloatArray:
+        """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarised."""
+        along = metric.directions
+        result = np.zeros(len(self))
+        for s in range(len(self)):
+            result[s] += self._curvatures(x, along[s], time, metric)[s]
+            for j in range(s):
+                both = self._curvatures(x, along[s] + along[j], time, metric)
+                apart = self._curvatures(x, along[s] - along[j], time, metric)
+                mixed = (both - apart) / 4
+                result[s] += mixed[j]
+                result[j] += mixed[s]
+        return result
+
+
+class _Metric(NamedTuple):
+    """At one configuration, on n atoms.
+
+    `z`, `inverse` (d, d); `kept` (d, n, 3), M_par^+ times the gradients; `reactions` (d, rows), the multipliers with
+    which the other constraints answer a gradient; `directions` (d, n, 3).
+    """
+
+    z: FloatArray
+    inverse: FloatArray
+    kept: FloatArray
+    reactions: FloatArray
+    directions: FloatArray
+
+
+def _rows_of(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
+    """The rows of the set that `wanted` names."""
+    if not wanted.holonomic:
+        raise InputError(
+            f"{name} is the velocity constraint {wanted!r}, which holds no coordinate; name a position constraint",
+            item=name,
+        )
+    found = []
+    for k in range(wanted.n_rows):
+        for start, item in zip(held.starts, held.constraints, strict=False):
+            if item.family != wanted.family or item.width != wanted.width:
+                continue
+            same = np.all(item.atoms == wanted.atoms[k], axis=1)
+            if wanted.family == "Distance":
+                same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
+            for data in item.per_row:
+                ours, theirs = getattr(item, data), getattr(wanted, data)[k]
+                same &= np.all(ours == theirs, axis=tuple(range(1, ours.ndim)))
+            same &= all(getattr(item, f, None) is getattr(wanted, f, None) for f in wanted.functions)
+            rows = start + np.flatnonzero(same)
+            if len(rows):
+                found.append(int(rows[0]))
+                break
+        else:
+            raise InputError(
+                f"{name}, {wanted.row_name(k)}, is not among the {held.n_rows} rows that are held; hold it, or name a "
+                "constraint that is",
+                item=name,
+                atoms=wanted.atoms[k],
+            )
+    return found
+
+
+def _joined_rows(held: ConstraintSet, rows: IntArray) -> IntArray:
+    """All rows of the clusters that `rows` belong to, sorted."""
+    incidence = coo_array(held.incidence)
+    n = held.n_rows
+    links = coo_array(
+        (np.ones(incidence.nnz), (incidence.row, n + incidence.col)), shape=(n + held.n_atoms, n + held.n_atoms)
+    )
+    label = connected_components(links, directed=False)[1][:n]
+    return np.flatnonzero(np.isin(label, label[rows])).astype(np.int64)

@@ -1,0 +1,136 @@
+"""The mean force along held coordinates, from the multipliers that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.free_energy.averages import weighted_mean
+from kcons.free_energy.series import Series
+
+
+@dataclass(frozen=True, eq=False)
+class MeanForce:
+    """dF/dq at one window, F(q) = -kT ln P(q).
+
+    Attributes
+    ----------
+    names : tuple of str
+    value : ndarray, shape (d,)
+        Where the coordinates were held.
+    force : ndarray, shape (d,)
+        dF/dq.
+    covariance : ndarray, shape (d, d)
+        Of `force`, from the statistical inefficiency of the series.
+    raw : ndarray, shape (d,)
+        The plain mean of the multipliers, which is not dF/dq.
+    n : int
+        Samples.
+    n_effective : float
+        As many independent samples would give the same error.
+    """
+
+    names: tuple[str, ...]
+    value: FloatArray
+    force: FloatArray
+    covariance: FloatArray
+    raw: FloatArray
+    n: int
+    n_effective: float
+
+    @property
+    def error(self) -> FloatArray:
+        """Standard errors, shape (d,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"{name} = {q:.6g}: dF/dq = {f:.6g} +- {e:.2g} (raw multiplier {raw:.6g})"
+            for name, q, f, e, raw in zip(self.names, self.value, self.force, self.error, self.raw, strict=True)
+        )
+
+
+def local_mean_force(series: Series, kT: float, *, isokinetic_degrees_of_freedom: int | None = None) -> FloatArray:
+    """What is averaged with the weights of the series to give dF/dq, shape (n, d).
+
+    Parameters
+    ----------
+    series : Series
+    kT : float
+        Temperature times Boltzmann's constant, in the energy of the series.
+    isokinetic_degrees_of_freedom : int, optional
+        g of an isokinetic run, where <v v^T> is (g - 1)/g of its canonical value: the part of the multipliers that is
+        quadratic in the velocities is taken g/(g - 1) times.
+
+    Raises
+    ------
+    InputError
+        `kT` that is not positive, or g < 2.
+    """
+    if not kT > 0 or not np.isfinite(kT):
+        raise InputError(f"kT is {kT}; give a positive energy", item="kT")
+    force = series.multiplier + kT * series.gradient
+    g = isokinetic_degrees_of_freedom
+    if g is not None:
+        if g < 2:
+            raise InputError(
+                f"{g} degrees of freedom under an isokinetic thermostat have no temperature; at least 2 are needed",
+                item="isokinetic_degrees_of_freedom",
+            )
+        force = force + series.kinetic / (g - 1)
+    return force
+
+
+def mean_force(
+    series: Series, kT: float, *, isokinetic_degrees_of_freedom: int | None = None, discard: int = 0
+) -> MeanForce:
+    """dF/dq = <w (lambda + kT G)>/<w>, w = (det Z)^(-1/2), G half the gradient of ln det Z along each coordinate.
+
+    Parameters
+    ----------
+    series : Series
+        Of coordinates at rest, with velocities of temperature kT.
+    kT, isokinetic_degrees_of_freedom
+        As for `local_mean_force`.
+    discard : int
+        Samples of equilibration at the beginning.
+
+    Raises
+    ------
+    InputError
+        Too few samples; coordinates that moved.
+
+    References
+    ----------
+    Sprik and Ciccotti, J. Chem. Phys. 109, 7737 (1998), for one coordinate; den Otter and Briels, Mol. Phys. 98, 773
+    (2000), for several; the page on free energies has the derivation with other constraints.
+    """
+    if discard < 0 or discard >= len(series):
+        raise InputError(f"{discard} of {len(series)} samples are to be discarded; keep some", item="discard")
+    kept = series[discard:]
+    value = kept.value
+    moved = value - value[0]
+    turns = kept.periods > 0
+    moved[:, turns] -= kept.periods[turns] * np.round(moved[:, turns] / kept.periods[turns])
+    allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
+    if np.any(np.abs(moved) > allowed):
+        name = kept.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
+        raise InputError(
+            f"{name} moved by {np.abs(moved).max():.3g} during the samples; a mean force belongs to coordinates at "
+            "rest (the work of moving ones is Series.work)",
+            item=name,
+        )
+    force = local_mean_force(kept, kT, isokinetic_degrees_of_freedom=isokinetic_degrees_of_freedom)
+    mean = weighted_mean(force, kept.weights)
+    return MeanForce(
+        kept.names,
+        value[0] + moved.mean(axis=0),
+        mean.value,
+        mean.covariance,
+        kept.multiplier.mean(axis=0),
+        len(kept),
+        mean.n_effective,
+    )

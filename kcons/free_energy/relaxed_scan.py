@@ -1,0 +1,378 @@
+"""Relaxed scans: minima of the energy with one or two coordinates held at the points of a grid.
+
+Every point is relaxed from each of its neighbours, and again from a neighbour whose energy became lower, until nothing
+changes (the wavefront of TorsionDrive): both ways, as torsions are driven. The next value is reached by turning and
+moving groups as rigid pieces. What was learned of the curvature goes along from point to point.
+
+References
+----------
+Y. Qiu et al., J. Chem. Phys. 152, 244116 (2020).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from ase import Atoms
+from numpy.typing import ArrayLike
+
+from kcons.ase.binding import FORCES_ONLY, applied_forces
+from kcons.ase.constraints_object import Constraints
+from kcons.ase.topology import bonds_of
+from kcons.ase.translation import translated
+from kcons.constraints import Constraint
+from kcons.constraints.target import FloatArray
+from kcons.errors import (
+    CalculatorError,
+    ConstraintError,
+    InfeasibleError,
+    InputError,
+    KconsError,
+    NonFiniteError,
+)
+from kcons.free_energy.attempts import Attempt, Attempts
+from kcons.free_energy.grid import Grid, Point
+from kcons.free_energy.model_hessian import Internals
+from kcons.free_energy.relaxation import FIRST, relax
+from kcons.motion.minimisation import minimise
+from kcons.motion.motion import Motion
+
+#: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
+LOWER = 2.7e-4
+#: Atoms up to which curvatures are kept as a table; beyond, relaxations remember their last steps only.
+MOST_ATOMS = 150
+
+#: Relaxations to a point that failed after which it is given up.
+MOST_TRIES = 4
+
+#: Told of every attempt: points done, points in all, and a line about it.
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass
+class Scan:
+    """What a scan found.
+
+    Attributes
+    ----------
+    grid : Grid
+    atoms : ase.Atoms
+        As given, without calculator and constraints.
+    attempts : list of Attempt
+        All relaxations, in the order in which they were made.
+    best : dict
+        The attempt of lowest energy of each point that was reached.
+    """
+
+    grid: Grid
+    atoms: Atoms
+    attempts: list[Attempt] = field(default_factory=list)
+    best: dict[Point, Attempt] = field(default_factory=dict)
+
+    @property
+    def energies(self) -> FloatArray:
+        """In eV, shape of the grid; NaN where no relaxation succeeded."""
+        return self._table({point: attempt.energy for point, attempt in self.best.items()})
+
+    @property
+    def hysteresis(self) -> FloatArray:
+        """How much the last relaxations from the neighbours of each point differ in energy, in eV, shape of the grid.
+
+        Zero where they ended in the same minimum, or where there was one only.
+        """
+        spread: dict[Point, float] = {}
+        for point in self.best:
+            last: dict[Point | None, float] = {}
+            for attempt in self.attempts:
+                if attempt.point == point and attempt.error is None:
+                    origin = None if attempt.source is None else self.attempts[attempt.source].point
+                    last[origin] = attempt.energy
+            spread[point] = max(last.values()) - min(last.values())
+        return self._table(spread)
+
+    @property
+    def failed(self) -> dict[Point, str]:
+        """Points that were not reached, with the last error of each."""
+        errors = {a.point: a.error for a in self.attempts if a.error is not None}
+        return {p: errors.get(p) or "no relaxation was tried" for p in self.grid.points if p not in self.best}
+
+    @property
+    def evaluations(self) -> int:
+        """Calls of energy and forces in all."""
+        return sum(attempt.evaluations for attempt in self.attempts)
+
+    def structure(self, point: Point) -> Atoms:
+        """The minimum at a point, its values and energy in `info`.
+
+        Raises
+        ------
+        InputError
+            The point was not reached.
+        """
+        if point not in self.best:
+            raise InputError(
+                f"there is no structure at {point}: {self.failed.get(point, 'no such point')}", item="point"
+            )
+        found = self.atoms.copy()
+        found.positions[:] = self.best[point].positions
+        found.info["energy"] = self.best[point].energy
+        for name, v in zip(self.grid.names, self.grid.shown(point), strict=True):
+            found.info[name] = v
+        return found
+
+    def _table(self, entries: dict[Point, float]) -> FloatArray:
+        table = np.full(self.grid.shape, np.nan)
+        for point, entry in entries.items():
+            table[point] = entry
+        return table
+
+
+def scan(
+    atoms: Atoms,
+    coordinates: Constraint | Sequence[Constraint],
+    values: ArrayLike | Sequence[ArrayLike],
+    *,
+    held: Constraint | Iterable[Constraint] = (),
+    folder: Path | str | None = None,
+    fmax: float = 0.01,
+    both_ways: bool = True,
+    evaluations: int = 200,
+    progress: Progress | None = None,
+) -> Scan:
+    """Relax a structure with one or two coordinates held at each of their values in turn.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        With a calculator; not changed. What ASE constraints hold on it stays held.
+    coordinates : Constraint, or sequence of one or two
+        What is scanned, one row each: ``Dihedral([0, 1, 2, 3])``, or any other that depends on positions.
+    values : array_like, or one for each coordinate
+        Where they are held, in angstrom or radian.
+    held : sequence of Constraint
+        What else is held, at its targets or as it is in `atoms`.
+    folder : path, optional
+        Keeps every relaxation as soon as it is done. With the same arguments again, a scan goes on there.
+    fmax : float
+        The largest force along the constraints that may be left on an atom, in eV/angstrom.
+    both_ways : bool
+        Whether points are relaxed from all their neighbours, and not only from the one that is reached first.
+    evaluations : int
+        Calls of energy and forces after which a relaxation is given up.
+    progress : callable, optional
+        ``progress(done, points, line)`` after each relaxation.
+
+    Returns
+    -------
+    Scan
+        Points that failed are in `Scan.failed`; they do not stop the others.
+
+    Raises
+    ------
+    InputError
+        No calculator, unknown atoms, values that a coordinate cannot have, ...
+    ConstraintError
+        A coordinate that is undefined at the start, or depends on what else is held.
+    OccupiedError
+        The folder has another scan in it.
+    KconsError
+        The first failure, where no point at all could be relaxed.
+    """
+    items = [coordinates] if isinstance(coordinates, Constraint) else list(coordinates)
+    lists = [values] if isinstance(coordinates, Constraint) else list(values)  # type: ignore[arg-type]
+    grid = Grid(items, lists)  # type: ignore[arg-type]
+    for value, item in ((fmax, "fmax"), (evaluations, "evaluations")):
+        if not value > 0:
+            raise InputError(f"{item} is {value}; give a positive number", item=item)
+    surface = _Surface(atoms, grid, [held] if isinstance(held, Constraint) else list(held))
+    settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
+    attempts = Attempts(None if folder is None else Path(folder), atoms, grid, surface.held, settings)
+    return _Wavefront(surface, grid, attempts, settings, progress).run()
+
+
+class _Surface:
+    """Energy and forces of the atoms, and what is held at each point."""
+
+    def __init__(self, atoms: Atoms, grid: Grid, held: list[Constraint]) -> None:
+        if atoms.calc is None:
+            raise InputError("the atoms have no calculator; give them one: atoms.calc = ...", item="calculator")
+        self.grid = grid
+        self.atoms = atoms.copy()
+        self.atoms.calc = atoms.calc
+        forces_only = [item for item in atoms.constraints if isinstance(item, FORCES_ONLY)]
+        held = [*translated(atoms, [item for item in atoms.constraints if item not in forces_only]), *held]
+        self.atoms.set_constraint(forces_only)
+        self.start = self.atoms.get_positions()
+        kept = Constraints(held)
+        rank = self._engine(kept).rank
+        #: With the targets that were left open.
+        self.held = list(kept.constraints)
+        for n, item in enumerate(grid.coordinates):
+            # Says what is undefined at the start, and which atoms there are not.
+            with_it = self._engine(Constraints([*self.held, *(c.with_target(None) for c in grid.coordinates[: n + 1])]))
+            if with_it.rank != rank + n + 1:
+                raise ConstraintError(
+                    f"{item.row_name(0)} depends on what else is held; it cannot take other values. Leave out "
+                    "what holds it, or scan another coordinate",
+                    atoms=item.atoms[0].tolist(),
+                )
+            r = self.start[item.atoms]
+            for v in grid.values[n]:
+                item.with_target(float(v)).check(r, 0.0, 0)
+        measured = self._engine(Constraints([c.with_target(None) for c in grid.coordinates])).constraint_set
+        self.place = [float(v) for v in measured.measure(self.start)]
+        self._bonds = bonds_of(self.atoms)
+
+    def _engine(self, constraints: Constraints) -> Motion:
+        bare = self.atoms.copy()
+        bare.set_constraint()
+        bare.positions[:] = self.start
+        return constraints.engine(bare)
+
+    def evaluate(self, x: FloatArray) -> tuple[float, FloatArray]:
+        """Energy and forces."""
+        self.atoms.set_positions(x, apply_constraint=False)
+        try:
+            energy = float(self.atoms.get_potential_energy())
+            forces = applied_forces(self.atoms)
+        except InputError:
+            raise
+        except Exception as error:
+            raise CalculatorError(
+                f"the calculator failed ({type(error).__name__}: {error}); change its settings, or leave the value out"
+            ) from error
+        if not np.isfinite(energy):
+            raise NonFiniteError(f"the energy is not finite: {energy}", item="energy")
+        bad = ~np.isfinite(forces).all(axis=1)
+        if bad.any():
+            atom = int(np.argmax(bad))
+            raise NonFiniteError(f"the force on atom {atom} is not finite: {forces[atom]}", item="force", atom=atom)
+        return energy, forces
+
+    def relaxed(self, attempt: Attempt, source: Attempt | None, fmax: float, evaluations: int) -> None:
+        """Fill an attempt that starts from the structure of another, or from the first one."""
+        before = self.start if source is None else source.positions
+        constraints = [*self.held, *self.grid.held_at(attempt.point)]
+        motion = self._engine(Constraints(constraints))
+        try:
+            x = motion.restore_positions(before, bonds=self._bonds)
+        except InfeasibleError:
+            # In rings, other angles have to change, which the relaxation puts right.
+            x = motion.restore_positions(before, bonds=[])
+        if len(x) > MOST_ATOMS:
+            counted = _Counted(self)
+            found = minimise(motion, counted, x, tolerance=fmax, longest=FIRST, steps=evaluations)
+            energy, _ = self.evaluate(found.positions)
+            attempt.fill(found.positions, energy, found.largest, counted.evaluations)
+            return
+        internals = Internals(self.atoms.numbers, x, motion.lattice)
+        memory = None
+        if source is not None and len(source.memory):
+            memory = internals.taken_over(source.memory, source.terms)
+        done = relax(motion, self.evaluate, internals, x, fmax=fmax, memory=memory, evaluations=evaluations)
+        attempt.fill(done.positions, done.energy, done.largest, done.evaluations)
+        attempt.memory, attempt.terms = done.memory, internals.terms
+
+
+class _Counted:
+    """Forces alone, counted."""
+
+    def __init__(self, surface: _Surface) -> None:
+        self.surface, self.evaluations = surface, 0
+
+    def __call__(self, x: FloatArray, time: float) -> FloatArray:
+        self.evaluations += 1
+        return self.surface.evaluate(x)[1]
+
+
+class _Wavefront:
+    """Which point is relaxed next, and from where."""
+
+    def __init__(
+        self, surface: _Surface, grid: Grid, attempts: Attempts, settings: dict[str, float], progress: Progress | None
+    ) -> None:
+        self.surface, self.grid, self.attempts, self.progress = surface, grid, attempts, progress
+        self.fmax, self.evaluations = settings["fmax"], int(settings["evaluations"])
+        self.both_ways = bool(settings["both_ways"])
+        bare = surface.atoms.copy()
+        bare.set_constraint()
+        self.scan = Scan(grid, bare)
+        #: The attempt whose structure a point has handed on to its neighbours.
+        self._handed: dict[Point, int] = {}
+        self._queue: deque[tuple[Point, int | None]] = deque()
+        self._tried: set[tuple[Point, int | None]] = set()
+        self._first: KconsError | None = None
+
+    def run(self) -> Scan:
+        for point in sorted(self.grid.points, key=lambda p: self.grid.apart(p, self.surface.place)):
+            self._queue.append((point, None))
+            self._drain()
+            if self.scan.best:
+                break
+        while self._reach_the_rest():
+            self._drain()
+        if not self.scan.best:
+            assert self._first is not None
+            raise self._first
+        return self.scan
+
+    def _drain(self) -> None:
+        while self._queue:
+            point, source = self._queue.popleft()
+            if (point, source) in self._tried:
+                continue
+            if source is not None and self._handed[self.scan.attempts[source].point] != source:
+                continue  # a lower one is on its way
+            if not self.both_ways and point in self.scan.best:
+                continue
+            self._tried.add((point, source))
+            self._settle(self._made(point, source))
+
+    def _made(self, point: Point, source: int | None) -> Attempt:
+        attempts = self.scan.attempts
+        attempt = self.attempts.kept(len(attempts), point, source)
+        if attempt is None:
+            attempt = Attempt(len(attempts), point, source)
+            try:
+                self.surface.relaxed(attempt, None if source is None else attempts[source], self.fmax, self.evaluations)
+            except KconsError as error:
+                attempt.error = f"{self.grid.said(point)}: {type(error).__name__}: {error}"
+                self._first = self._first or error
+            self.attempts.keep(attempt)
+        attempts.append(attempt)
+        return attempt
+
+    def _settle(self, attempt: Attempt) -> None:
+        point, best = attempt.point, self.scan.best
+        if attempt.error is None:
+            handed = self._handed.get(point)
+            if point not in best or attempt.energy < best[point].energy:
+                best[point] = attempt
+            if handed is None or attempt.energy < self.scan.attempts[handed].energy - LOWER:
+                self._handed[point] = attempt.number
+                self._queue.extend((other, attempt.number) for other in self.grid.neighbours(point))
+        if self.progress is not None:
+            said = f"{attempt.energy:.6f} eV" if attempt.error is None else f"failed: {attempt.error}"
+            self.progress(len(best), len(self.grid.points), f"{self.grid.said(point)}: {said}")
+
+    def _reach_the_rest(self) -> bool:
+        """Ask for a point that was not reached from a reached one that has not been tried for it, the nearest one."""
+        missing = [point for point in self.grid.points if point not in self.scan.best]
+        pairs = [
+            (self.grid.apart(point, self.grid.at(other)), point, number)
+            for point in missing
+            for other, number in self._handed.items()
+            if (point, number) not in self._tried
+        ]
+        # From so far away that nothing has come of it.
+        tries = {point: sum(tried == point for tried, _ in self._tried) for point in missing}
+        pairs = [entry for entry in pairs if tries[entry[1]] < MOST_TRIES]
+        if not pairs:
+            return False
+        _, point, number = min(pairs)
+        self._queue.append((point, number))
+        return True

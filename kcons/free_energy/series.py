@@ -1,0 +1,216 @@
+"""Samples of held coordinates one after another, in memory and in files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
+from kcons.steppers.files import in_one_piece, stored_arrays
+from kcons.steppers.state import State, System
+
+#: What a sample has for each coordinate, and once.
+_VECTORS = ("value", "multiplier", "kinetic", "gradient")
+_NUMBERS = ("time", "log_det_z", "off")
+
+
+class Series:
+    """Samples of held coordinates; see `Sample` for what they are.
+
+    Parameters
+    ----------
+    names : sequence of str
+    periods : array_like, shape (d,), optional
+        Of the coordinates; 0 for none.
+
+    Attributes
+    ----------
+    time, log_det_z, off : ndarray, shape (n,)
+    value, multiplier, kinetic, gradient : ndarray, shape (n, d)
+
+    Examples
+    --------
+    >>> series = Series(["torsion"], [6.283185307179586])
+    >>> len(series), series.multiplier.shape
+    (0, (0, 1))
+    """
+
+    def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0) -> None:
+        self.names = tuple(names)
+        self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
+        self._samples: list[Sample] = []
+
+    def append(self, sample: Sample) -> None:
+        self._samples.append(sample)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __repr__(self) -> str:
+        return f"<Series: {len(self)} samples of {', '.join(self.names)}>"
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self._samples)
+
+    def __getitem__(self, samples: slice) -> Series:
+        """Some of the samples."""
+        part = Series(self.names, self.periods)
+        part._samples = self._samples[samples]
+        return part
+
+    def of(self, name: str) -> FloatArray:
+        """The multipliers of one coordinate, shape (n,)."""
+        if name not in self.names:
+            raise InputError(f"there is no coordinate {name!r}; there are {', '.join(self.names)}", item="name")
+        return self.multiplier[:, self.names.index(name)]
+
+    def _numbers(self, field: str) -> FloatArray:
+        return np.array([getattr(sample, field) for sample in self._samples], dtype=np.float64)
+
+    def _vectors(self, field: str) -> FloatArray:
+        return self._numbers(field).reshape(len(self), len(self.names))
+
+    @property
+    def time(self) -> FloatArray:
+        return self._numbers("time")
+
+    @property
+    def log_det_z(self) -> FloatArray:
+        return self._numbers("log_det_z")
+
+    @property
+    def off(self) -> FloatArray:
+        return self._numbers("off")
+
+    @property
+    def value(self) -> FloatArray:
+        return self._vectors("value")
+
+    @property
+    def multiplier(self) -> FloatArray:
+        return self._vectors("multiplier")
+
+    @property
+    def kinetic(self) -> FloatArray:
+        return self._vectors("kinetic")
+
+    @property
+    def gradient(self) -> FloatArray:
+        return self._vectors("gradient")
+
+    @property
+    def weights(self) -> FloatArray:
+        """(det Z)^(-1/2) by its largest value, shape (n,): what turns averages into those without the coordinates held.
+
+        For any observable O at the values held: ``sum(weights * O) / sum(weights)``.
+        """
+        log = -0.5 * self.log_det_z
+        return np.exp(log - log.max()) if len(log) else log
+
+    @property
+    def work(self) -> FloatArray:
+        """What moving targets have added to the energy, integral of lambda . dq by the trapezoid rule, shape (n,).
+
+        Second order in the interval from one sample to the next; record every step where it matters.
+        """
+        if not self._samples:
+            return np.zeros(0)
+        value, force = self.value, self.multiplier
+        moved = np.diff(value, axis=0)
+        turns = self.periods > 0
+        moved[:, turns] -= self.periods[turns] * np.round(moved[:, turns] / self.periods[turns])
+        return np.concatenate([[0.0], np.cumsum(np.sum((force[1:] + force[:-1]) / 2 * moved, axis=1))])
+
+    # -- files ----------------------------------------------------------------------------------
+
+    def save(self, file: str | PathLike[str]) -> None:
+        """Write all of it in NumPy's .npz format; an interrupted write leaves the older file."""
+        arrays = {field: getattr(self, field) for field in (*_NUMBERS, *_VECTORS)}
+        with in_one_piece(file) as opened:
+            np.savez(opened, names=np.array(self.names), periods=self.periods, **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, file: str | PathLike[str]) -> Series:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            The file holds no series, or not all of it is as it was written.
+        """
+        try:
+            with open(file, "rb") as opened:
+                data = stored_arrays(opened)
+            series = cls([str(name) for name in data["names"]], data["periods"])
+            d = len(series.names)
+            columns = [data[f].reshape(-1) for f in _NUMBERS] + [data[f].reshape(-1, d) for f in _VECTORS]
+            for row in zip(*columns, strict=True):
+                known: dict[str, Any] = dict(zip((*_NUMBERS, *_VECTORS), row, strict=True))
+                known |= {field: float(known[field]) for field in _NUMBERS}
+                series.append(Sample(**known))
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # a damaged archive raises whatever its bytes lead to
+            raise InputError(f"{file} holds no series written by Series.save: {error}", item="file") from error
+        return series
+
+    def write_xvg(self, file: str | PathLike[str]) -> None:
+        """Write text columns: time, then value and multiplier of each coordinate, ln det Z, and the work.
+
+        MDAnalysis reads it as an auxiliary: ``u.trajectory.add_auxiliary("held", "held.xvg")``.
+        """
+        columns, titles = [self.time], []
+        for k, name in enumerate(self.names):
+            columns += [self.value[:, k], self.multiplier[:, k]]
+            titles += [name, f"multiplier of {name}"]
+        columns += [self.log_det_z, self.work]
+        titles += ["ln det Z", "work"]
+        with in_one_piece(file) as opened:
+            opened.write(b'@ title "held coordinates"\n@ xaxis label "time"\n')
+            for k, title in enumerate(titles):
+                opened.write(f'@ s{k} legend "{title}"\n'.encode())
+            np.savetxt(opened, np.column_stack(columns), fmt="%.12g")
+
+
+class Recorder:
+    """An observer of `kcons.run` that keeps a `Series`.
+
+    Parameters
+    ----------
+    system : System
+        Whose constraints hold the coordinates.
+    coordinates : HeldCoordinates
+    series : Series, optional
+        Where to go on.
+
+    Attributes
+    ----------
+    series : Series
+    last : Sample or None
+    """
+
+    def __init__(self, system: System, coordinates: HeldCoordinates, series: Series | None = None) -> None:
+        self.system = system
+        self.coordinates = coordinates
+        self.series = Series(coordinates.names, coordinates.periods) if series is None else series
+        self.last: Sample | None = None
+
+    def __call__(self, state: State) -> None:
+        forces = state.forces
+        if forces is None:
+            forces = self.system.forces(state.positions, state.velocities, state.time, state.step)
+        self.last = self.coordinates.sample(state.positions, state.velocities, forces, state.time)
+        self.series.append(self.last)
+
+    @property
+    def multipliers(self) -> dict[str, float]:
+        """Those of the last sample, by name."""
+        return (
+            {} if self.last is None else dict(zip(self.coordinates.names, self.last.multiplier.tolist(), strict=True))
+        )

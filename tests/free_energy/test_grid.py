@@ -1,0 +1,52 @@
+"""Points of a scan, and what is next to what."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Dihedral, Distance
+from kcons.errors import InputError
+from kcons.free_energy.grid import Grid
+
+TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
+
+
+def test_a_whole_turn_is_a_ring():
+    grid = Grid([TURN], [np.radians(np.arange(-180, 181, 30))])
+    assert grid.shape == (12,) and grid.rings == [True]
+    assert grid.neighbours((0,)) == [(1,), (11,)]
+    assert grid.apart((0,), [np.pi]) == pytest.approx(0) and grid.apart((0,), [np.radians(150)]) == pytest.approx(1)
+    assert grid.shown((1,)) == pytest.approx([-150]) and grid.said((1,)) == "Dihedral(0, 1, 2, 3) = -150"
+    part = Grid([TURN], [np.radians([0, 30, 60])])
+    assert part.rings == [False] and part.neighbours((2,)) == [(1,)]
+
+
+def test_two_coordinates():
+    grid = Grid([TURN, LENGTH], [np.radians(np.arange(0, 360, 120)), [1.4, 1.2]])
+    assert grid.shape == (3, 2) and len(grid.points) == 6 and grid.rings == [True, False]
+    assert grid.neighbours((0, 0)) == [(1, 0), (2, 0), (0, 1)]
+    assert grid.at((0, 0)) == [0.0, 1.2]  # in ascending order
+    held = grid.held_at((2, 1))
+    assert held[0].target == pytest.approx([np.radians(240)]) and held[1].target == pytest.approx([1.4])
+    assert grid.names == ["Dihedral(0, 1, 2, 3)", "Distance(0, 1)"] and grid.in_degrees == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "values", "said"),
+    [
+        ([], [], "one or two coordinates, not 0"),
+        ([TURN, LENGTH, TURN], [[0], [1], [0]], "one or two coordinates, not 3"),
+        ([TURN], [[0], [1]], "1 coordinates have 2 lists of values"),
+        ([Distance([[0, 1], [1, 2]])], [[1]], "has 2 rows; a coordinate of a scan has one"),
+        ([LENGTH], [[]], "not a list of finite numbers"),
+        ([LENGTH], [[1, np.nan]], "not a list of finite numbers"),
+        ([LENGTH], [[[1, 2]]], "not a list of finite numbers"),
+        ([LENGTH], [["far"]], "values of Distance"),
+        ([LENGTH], [[1, 2, 1]], "two values of .* are the same"),
+        ([TURN], [np.radians([-180, 0, 200])], "span more than its period"),
+    ],
+)
+def test_bad_grids(coordinates, values, said):
+    with pytest.raises(InputError, match=said):
+        Grid(coordinates, values)

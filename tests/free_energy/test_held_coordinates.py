@@ -1,0 +1,330 @@
+"""Multipliers, Z and its change by name, against the dense theory and exact derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import ConstraintSet, Motion
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    Formula,
+    KnifeEdge,
+    MovingTarget,
+    Plane,
+)
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError
+from kcons.free_energy import HeldCoordinates
+
+N = 6
+CHAIN = np.array(
+    [[0.0, 0.1, 0.2], [1.1, 0.0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [2.2, -0.5, 2.4]]
+)
+MASSES = np.array([1.0, 12.0, 14.0, 16.0, 12.0, 1.5])
+
+
+class Jet:
+    """A number with its gradient and second derivatives: automatic differentiation, forward."""
+
+    def __init__(self, value, gradient, hessian):
+        self.value, self.gradient, self.hessian = value, gradient, hessian
+
+    def __sub__(self, other):
+        return Jet(self.value - other.value, self.gradient - other.gradient, self.hessian - other.hessian)
+
+    def __add__(self, other):
+        return Jet(self.value + other.value, self.gradient + other.gradient, self.hessian + other.hessian)
+
+    def __mul__(self, other):
+        both = np.outer(self.gradient, other.gradient)
+        return Jet(
+            self.value * other.value,
+            self.value * other.gradient + other.value * self.gradient,
+            self.value * other.hessian + other.value * self.hessian + both + both.T,
+        )
+
+    def through(self, value, first, second):
+        """A function of this number with the value and the derivatives given."""
+        square = np.outer(self.gradient, self.gradient)
+        return Jet(value, first * self.gradient, first * self.hessian + second * square)
+
+    def sqrt(self):
+        root = np.sqrt(self.value)
+        return self.through(root, 0.5 / root, -0.25 / root**3)
+
+    def inverse(self):
+        return self.through(1 / self.value, -1 / self.value**2, 2 / self.value**3)
+
+    def arccos(self):
+        sine = np.sqrt(1 - self.value**2)
+        return self.through(np.arccos(self.value), -1 / sine, -self.value / sine**3)
+
+
+COORDINATES = [
+    [Jet(CHAIN[a, k], np.eye(3 * N)[3 * a + k], np.zeros((3 * N, 3 * N))) for k in range(3)] for a in range(N)
+]
+
+
+def product(a, b, c, d):
+    """(x_a - x_b) . (x_c - x_d)."""
+    terms = [
+        (p - q) * (r - s)
+        for p, q, r, s in zip(COORDINATES[a], COORDINATES[b], COORDINATES[c], COORDINATES[d], strict=True)
+    ]
+    return terms[0] + terms[1] + terms[2]
+
+
+def length(a, b):
+    return product(a, b, a, b).sqrt()
+
+
+def angle(a, b, c):
+    return (product(a, b, c, b) * (length(a, b) * length(c, b)).inverse()).arccos()
+
+
+#: Coordinates, other constraints, and the same as jets in the same order.
+CASES = {
+    "one, alone": ({"r": Distance([[0, 3]])}, [], [length(0, 3)]),
+    "one beside bonds": (
+        {"r": Distance([[0, 3]])},
+        [Distance([[0, 1], [1, 2], [2, 3]])],
+        [length(0, 3), length(0, 1), length(1, 2), length(2, 3)],
+    ),
+    "an angle beside bonds": (
+        {"angle": Angle([[0, 1, 2]])},
+        [Distance([[0, 1], [1, 2], [2, 4]])],
+        [angle(0, 1, 2), length(0, 1), length(1, 2), length(2, 4)],
+    ),
+    "two that share an atom": (
+        {"far": Distance([[1, 5]]), "angle": Angle([[1, 2, 3]])},
+        [Distance([[1, 2], [3, 4]])],
+        [length(1, 5), angle(1, 2, 3), length(1, 2), length(3, 4)],
+    ),
+    "a square": (
+        {"s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 4]], target=None)},
+        [],
+        [product(0, 4, 0, 4)],
+    ),
+}
+
+
+def held(name: str) -> tuple[ConstraintSet, dict, list]:
+    coordinates, others, jets = CASES[name]
+    return ConstraintSet([*others, *coordinates.values()], CHAIN, MASSES), coordinates, jets
+
+
+class Exact:
+    """Gradients and second derivatives of c = (coordinates, other constraints), and what follows."""
+
+    def __init__(self, jets: list[Jet], d: int) -> None:
+        self.d = d
+        self.A = np.array([jet.gradient for jet in jets])
+        self.C = np.array([jet.hessian for jet in jets])
+        self.Mi = np.repeat(1 / MASSES, 3)
+        self.H = self.A * self.Mi @ self.A.T
+
+    def change(self, inside: slice, direction):
+        """d/ds of A M^-1 A^T of some rows."""
+        dA = self.C[inside] @ direction
+        half = dA * self.Mi @ self.A[inside].T
+        return half + half.T
+
+    def mean_force(self, force, kT):
+        """dF/dq at this point by the definition, for the measure of the other constraints alone.
+
+        [H^-1 A M^-1 grad V]_i - kT div [H^-1 A M^-1]_i, V = U - kT/2 ln det H_others.
+        """
+        inverse = np.linalg.inv(self.H)
+        rows = inverse @ self.A * self.Mi
+        other = slice(self.d, None)
+        gradient = -force.ravel()
+        if self.d < len(self.A):
+            H = self.H[other, other]
+            gradient = gradient - kT / 2 * np.array(
+                [np.trace(np.linalg.solve(H, self.change(other, e))) for e in np.eye(3 * N)]
+            )
+        divergence = np.zeros(len(self.A))
+        for j in range(len(self.A)):
+            divergence += inverse[:, j] * np.sum(self.Mi * np.diagonal(self.C[j]))
+            moved = self.change(slice(None), self.Mi * self.A[j])
+            divergence -= (inverse @ moved @ inverse)[:, j]
+        return (rows @ gradient - kT * divergence)[: self.d]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_mean_force_is_the_one_of_the_definition(case):
+    """lambda averaged over velocities, and kT G, against the divergence with exact second derivatives."""
+    constraint_set, coordinates, jets = held(case)
+    motion = Motion(constraint_set, CHAIN)
+    mine = HeldCoordinates(motion, coordinates, CHAIN)
+    kT = 0.7
+    force = np.random.default_rng(3).normal(size=(N, 3))
+    # <v v^T> = kT M_par^+: the sum over a basis of the tangent velocities, orthonormal in the metric of masses.
+    root = np.repeat(np.sqrt(MASSES), 3)
+    a = constraint_set.jacobian(CHAIN).toarray() / root
+    basis = np.linalg.svd(a)[2][len(a) :] / root
+    kinetic = sum(mine.sample(CHAIN, v.reshape(N, 3), force).kinetic for v in basis) * kT
+    sample = mine.sample(CHAIN, np.zeros((N, 3)), force)
+    exact = Exact(jets, len(mine)).mean_force(force, kT)
+    np.testing.assert_allclose(sample.multiplier + kinetic + kT * sample.gradient, exact, rtol=0, atol=2e-12)
+    assert np.abs(kinetic).min() > 1e-3 and (case == "one, alone" or np.abs(sample.gradient).min() > 1e-3)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_multipliers_are_those_of_the_engine(case):
+    constraint_set, coordinates, _ = held(case)
+    motion = Motion(constraint_set, CHAIN)
+    mine = HeldCoordinates(motion, coordinates, CHAIN)
+    rng = np.random.default_rng(1)
+    v, f = motion.project_velocities(CHAIN, rng.normal(size=(N, 3))), rng.normal(size=(N, 3))
+    sample = mine.sample(CHAIN, v, f)
+    np.testing.assert_allclose(sample.multiplier, motion.multipliers(CHAIN, v, f)[mine.rows], rtol=0, atol=1e-12)
+    still = motion.multipliers(CHAIN, np.zeros_like(v), f)[mine.rows]
+    np.testing.assert_allclose(sample.kinetic, sample.multiplier - still, rtol=0, atol=1e-12)
+    a = constraint_set.jacobian(CHAIN).toarray()
+    gram = a / np.repeat(MASSES, 3) @ a.T
+    others = np.setdiff1d(np.arange(constraint_set.n_rows), mine.rows)
+    ratio = np.linalg.slogdet(gram)[1] - np.linalg.slogdet(gram[np.ix_(others, others)])[1]
+    assert sample.log_det_z == pytest.approx(ratio, abs=1e-13)
+    assert sample.off < 1e-15
+    along = mine.directions(CHAIN).reshape(len(mine), -1)
+    wanted = np.zeros((constraint_set.n_rows, len(mine)))
+    wanted[mine.rows, np.arange(len(mine))] = 1
+    np.testing.assert_allclose(a @ along.T, wanted, rtol=0, atol=1e-13)
+
+
+def test_names_follow_the_mapping_and_not_the_set():
+    bond, turn, bend = Distance([[0, 1]]), Dihedral([[0, 1, 2, 3]]), Angle([[1, 2, 3], [2, 3, 4]])
+    constraint_set = ConstraintSet([bend, bond, turn], CHAIN, MASSES)
+    mine = HeldCoordinates(constraint_set, {"turn": turn, "bend": bend, "bond": Distance([[1, 0]])}, CHAIN)
+    assert mine.names == ("turn", "bend[0]", "bend[1]", "bond")
+    assert mine.rows.tolist() == [3, 0, 1, 2]
+    sample = mine.sample(CHAIN, np.zeros((N, 3)), np.zeros((N, 3)))
+    np.testing.assert_array_equal(sample.value, constraint_set.measure(CHAIN)[mine.rows])
+    assert mine.periods == pytest.approx([2 * np.pi, 0, 0, 0])
+    assert repr(mine) == "<HeldCoordinates: turn, bend[0], bend[1], bond, beside 0 independent rows of their clusters>"
+
+
+def test_only_the_clusters_of_the_coordinates_are_looked_at():
+    far = CHAIN + np.array([50.0, 0, 0])
+    x, m = np.vstack([CHAIN, far]), np.tile(MASSES, 2)
+    r = Distance([[0, 3]])
+    alone = HeldCoordinates(ConstraintSet([Distance([[0, 1], [1, 2]]), r], CHAIN, MASSES), {"r": r}, CHAIN)
+    among = HeldCoordinates(
+        ConstraintSet([Distance([[6, 7], [7, 8]]), Distance([[0, 1], [1, 2]]), r], x, m), {"r": r}, x
+    )
+    assert among.atoms.tolist() == [0, 1, 2, 3]
+    v, f = np.random.default_rng(0).normal(size=(2, 12, 3))
+    one, two = alone.sample(CHAIN, v[:6], f[:6]), among.sample(x, v, f)
+    np.testing.assert_array_equal(np.hstack(one), np.hstack(two))
+
+
+def test_redundant_constraints_beside_change_nothing():
+    """All ten distances of five atoms, nine of them independent, or nine alone."""
+    pairs = [[a, b] for a in range(5) for b in range(a)]
+    r = Distance([[4, 5]])
+    v, f = np.random.default_rng(5).normal(size=(2, N, 3))
+    samples = []
+    for rows in (pairs, pairs[:9]):
+        constraint_set = ConstraintSet([Distance(rows), r], CHAIN, MASSES)
+        samples.append(HeldCoordinates(constraint_set, {"r": r}, CHAIN))
+    assert [s.motion.rank for s in samples] == [9, 9]
+    tangent = Motion(ConstraintSet([Distance(pairs), r], CHAIN, MASSES), CHAIN).project_velocities(CHAIN, v)
+    one, two = (s.sample(CHAIN, tangent, f) for s in samples)
+    np.testing.assert_allclose(np.hstack(one[:-1]), np.hstack(two[:-1]), rtol=0, atol=1e-10)
+
+
+def test_fixed_atoms_have_no_share():
+    r, bend = Distance([[0, 3]]), Angle([[0, 3, 4]])
+    heavy = MASSES.copy()
+    heavy[[0, 4]] = 1e14
+    v, f = np.random.default_rng(2).normal(size=(2, N, 3))
+    v[[0, 4]] = 0
+    fixed = HeldCoordinates(ConstraintSet([FixedAtoms([0, 4]), r, bend], CHAIN, MASSES), {"r": r, "b": bend}, CHAIN)
+    plain = HeldCoordinates(ConstraintSet([r, bend], CHAIN, heavy), {"r": r, "b": bend}, CHAIN)
+    one, two = fixed.sample(CHAIN, v, f), plain.sample(CHAIN, v, f)
+    np.testing.assert_allclose(np.hstack(one), np.hstack(two), rtol=0, atol=1e-10)
+
+
+def test_wrapped_molecules_and_a_new_cell():
+    cell = np.diag([8.0, 9.0, 10.0])
+    r = Distance([[0, 3]])
+    rows = [Distance([[0, 1], [1, 2]]), r]
+    v, f = np.random.default_rng(4).normal(size=(2, N, 3))
+    moved = CHAIN + np.array([0, 1, 0, -1, 2, 0])[:, None] * cell[0]
+    whole = HeldCoordinates(ConstraintSet(rows, CHAIN, MASSES, cell=cell), {"r": r}, CHAIN).sample(CHAIN, v, f)
+    constraint_set = ConstraintSet(rows, moved, MASSES, cell=cell)
+    motion = Motion(constraint_set, moved)
+    mine = HeldCoordinates(motion, {"r": r}, moved)
+    np.testing.assert_allclose(np.hstack(whole), np.hstack(mine.sample(moved, v, f)), rtol=0, atol=1e-12)
+    motion.set_cell(1.25 * cell)
+    wider = CHAIN + np.array([0, 1, 0, -1, 2, 0])[:, None] * 1.25 * cell[0]
+    np.testing.assert_allclose(np.hstack(whole), np.hstack(mine.sample(wider, v, f)), rtol=0, atol=1e-12)
+
+
+def test_moving_targets_and_moving_constraints_beside():
+    """The multipliers of the engine with everything that moves; its static part is not called kinetic."""
+    start = float(np.linalg.norm(CHAIN[0] - CHAIN[3]))
+    r = Distance([[0, 3]], MovingTarget(lambda t: start + 0.3 * t + t * t))
+    bond = Distance([[0, 1]], MovingTarget(lambda t: float(np.linalg.norm(CHAIN[0] - CHAIN[1])) + 0.2 * t))
+    constraint_set = ConstraintSet([bond, r], CHAIN, MASSES)
+    motion = Motion(constraint_set, CHAIN)
+    mine = HeldCoordinates(motion, {"r": Distance([[0, 3]])}, CHAIN)
+    v, f = np.random.default_rng(6).normal(size=(2, N, 3))
+    v = motion.project_velocities(CHAIN, v)
+    sample = mine.sample(CHAIN, v, f)
+    np.testing.assert_allclose(sample.multiplier, motion.multipliers(CHAIN, v, f)[1:], rtol=0, atol=1e-12)
+    still = motion.multipliers(CHAIN, np.zeros((N, 3)), f)[1:]
+    np.testing.assert_allclose(sample.multiplier - sample.kinetic, still, rtol=0, atol=1e-12)
+
+
+#: Three planes through one line.
+PLANES = [(0.0, 0.0, 1.0), (0.0, 0.6, 0.8), (0.0, 1.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "others", "match"),
+    [
+        ({"r": Distance([[0, 2]])}, [Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])], r"r depends on the other"),
+        ({k: Plane([0], n) for k, n in zip("abc", PLANES, strict=True)}, [Distance([[0, 1]])], "a and b and c depend"),
+    ],
+)
+def test_coordinates_that_depend_on_others(coordinates, others, match):
+    constraint_set = ConstraintSet([*others, *coordinates.values()], CHAIN, MASSES)
+    with pytest.raises(SingularGeometryError, match=match + r".*Z = 0.*take out"):
+        HeldCoordinates(constraint_set, coordinates, CHAIN)
+
+
+def test_bad_input():
+    r, centre = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5])
+    constraint_set = ConstraintSet([r, centre, KnifeEdge(0, 1, (0, 0, 1))], CHAIN, MASSES)
+    for wrong, match in (
+        ({}, "no coordinates"),
+        ({"a": r, "b": Distance([[3, 0]])}, "a and b are the same row 0"),
+        ({"a": Distance([[0, 4]])}, r"a, Distance\(0, 4\), is not among the 3 rows"),
+        ({"a": Dihedral([[0, 1, 2, 3]])}, "not among"),
+        ({"edge": KnifeEdge(0, 1, (0, 0, 1))}, "velocity constraint.*holds no coordinate"),
+        ({"a": 3}, "no kcons constraint"),
+    ):
+        with pytest.raises(InputError, match=match):
+            HeldCoordinates(constraint_set, wrong, CHAIN)
+    mine = HeldCoordinates(constraint_set, {"centres": centre, "r": r}, CHAIN)
+    still = np.zeros((N, 3))
+    with pytest.raises(InputError, match=r"forces must have shape"):
+        mine.sample(CHAIN, still, still[:4])
+    broken = CHAIN.copy()
+    broken[0] = np.nan
+    with pytest.raises(NonFiniteError, match="positions of atom 0"):
+        mine.sample(broken, still, still)
+    broken = still.copy()
+    broken[3, 1] = np.inf
+    with pytest.raises(NonFiniteError, match="forces of atom 3"):
+        mine.sample(CHAIN, still, broken)
+    # What no coordinate touches may be anything.
+    broken = still.copy()
+    broken[2] = np.nan
+    assert np.isfinite(mine.sample(CHAIN, still, broken).multiplier).all()

@@ -1,0 +1,192 @@
+"""The estimator against closed forms, on configurations and velocities drawn from the exact distribution."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Distance, FixedAtoms, Formula, Plane
+from kcons.errors import InputError
+from kcons.free_energy import HeldCoordinates, Series, local_mean_force, mean_force, weighted_mean
+
+KT = 0.8
+SAMPLES = 1000
+
+
+def series_of(coordinates, others, masses, configurations, force, *, kT=KT, seed=0, sphere=False) -> Series:
+    """Samples at the configurations, with velocities of kT (or, on a `sphere`, of one kinetic energy)."""
+    rng = np.random.default_rng(seed)
+    constraint_set = ConstraintSet([*others, *coordinates.values()], configurations[0], masses)
+    motion = Motion(constraint_set, configurations[0])
+    held = HeldCoordinates(motion, coordinates, configurations[0])
+    series = Series(held.names, held.periods)
+    for x in configurations:
+        v = motion.project_velocities(x, rng.normal(size=x.shape) * np.sqrt(kT / masses)[:, None])
+        if sphere:
+            g = motion.degrees_of_freedom
+            v *= np.sqrt((g - 1) * kT / np.sum(masses[:, None] * v * v))
+        series.append(held.sample(x, v, force(x)))
+    return series
+
+
+def ring(r: float, n: int = SAMPLES):
+    """Two atoms, the first fixed at the origin, the second on a circle about it in the plane z = 0."""
+    angle = np.random.default_rng(1).uniform(0, 2 * np.pi, n)
+    x = np.zeros((n, 2, 3))
+    x[:, 1, 0], x[:, 1, 1] = r * np.cos(angle), r * np.sin(angle)
+    return x
+
+
+def spring(x):
+    """-grad of U = (r - 1)^4/4 + r."""
+    r = np.linalg.norm(x[1])
+    f = np.zeros_like(x)
+    f[1] = -((r - 1) ** 3 + 1) * x[1] / r
+    return f
+
+
+@pytest.mark.parametrize("mass", [1.0, 7.0])
+def test_a_length_in_a_plane(mass):
+    """F' = U' - kT/r, where Z does not change and the raw multipliers are right."""
+    r = 1.7
+    series = series_of(
+        {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.array([1.0, mass]), ring(r), spring
+    )
+    result = mean_force(series, KT)
+    assert abs(result.force[0] - (0.7**3 + 1 - KT / r)) < 3 * result.error[0] < 0.08
+    np.testing.assert_allclose(series.gradient, 0, atol=1e-12)
+    assert result.raw == pytest.approx(result.force, rel=1e-12)
+    assert "r = 1.7: dF/dq = " in str(result)
+
+
+def test_a_squared_length_has_a_gradient_term():
+    """F = U(sqrt(s)) - kT ln P: dF/ds = U'/(2 r) in a plane, the term being kT/(2 s)."""
+    r = 1.7
+    square = Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2", [[0, 1]], target=None)
+    series = series_of({"s": square}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.array([1.0, 2.0]), ring(r), spring)
+    result = mean_force(series, KT)
+    assert abs(result.force[0] - (0.7**3 + 1) / (2 * r)) < 3 * result.error[0] < 0.03
+    np.testing.assert_allclose(series.gradient, 1 / (2 * r * r), rtol=1e-12)
+    assert result.raw[0] < result.force[0] - 5 * result.error[0]
+
+
+def trimer(n: int = SAMPLES):
+    """Three atoms with two bonds of length 1, drawn as bonds held give them: uniform turns, weight sqrt(det H)."""
+    rng = np.random.default_rng(2)
+    found = []
+    while len(found) < n:
+        u, w = rng.normal(size=(2, 3))
+        u, w = u / np.linalg.norm(u), w / np.linalg.norm(w)
+        # det H of equal masses is 4 - cos^2.
+        if rng.uniform() * 2 < np.sqrt(4 - (u @ w) ** 2):
+            found.append(np.array([u, np.zeros(3), w]))
+    return np.array(found)
+
+
+def test_weights_take_the_metric_away():
+    """<cos^2> of three equal masses with two bonds held: raw 0.321021053874, weighted 1/3."""
+    x = trimer(20000)
+    cosine = np.einsum("ni,ni->n", x[:, 0], x[:, 2])
+    bonds = {"bonds": Distance([[0, 1], [1, 2]])}
+    held = HeldCoordinates(ConstraintSet([*bonds.values()], x[0], np.ones(3)), bonds, x[0])
+    series = Series(held.names)
+    for point in x[:200]:
+        series.append(held.sample(point, np.zeros((3, 3)), np.zeros((3, 3))))
+    np.testing.assert_allclose(np.exp(series.log_det_z), (4 - cosine**2)[:200], rtol=1e-12)
+    log_weights = -0.5 * np.log(4 - cosine**2)
+    np.testing.assert_allclose(series.weights, np.exp(log_weights[:200] + 0.5 * series.log_det_z.min()), rtol=1e-12)
+    raw, weighted = weighted_mean(cosine**2), weighted_mean(cosine**2, log_weights=log_weights)
+    assert abs(raw.value[0] - 0.321021053874) < 3 * raw.error[0]
+    assert abs(weighted.value[0] - 1 / 3) < 3 * weighted.error[0] < 0.008
+    assert abs(raw.value[0] - 1 / 3) > 4 * raw.error[0]
+
+
+@pytest.mark.parametrize("sphere", [False, True], ids=["canonical", "isokinetic"])
+def test_one_end_to_end_length_beside_two_bonds(sphere):
+    """Z varies with the coordinate; P(r) of two bonds held is r sqrt(det H(r)), a closed form."""
+    masses = np.array([1.0, 2.0, 3.0])
+    a, b, r = 1.0, 1.3, 1.6
+
+    def log_p(r):
+        """The measure sqrt(det H) on the bonds, over the angle: sin(theta) dtheta ~ r dr."""
+        cosine = (a * a + b * b - r * r) / (2 * a * b)
+        h = np.array([[1 / masses[0] + 1 / masses[1], cosine / masses[1]], [0, 1 / masses[1] + 1 / masses[2]]])
+        h[1, 0] = h[0, 1]
+        return np.log(r) + 0.5 * np.linalg.slogdet(h)[1]
+
+    step = 1e-5
+    exact = -KT * (log_p(r + step) - log_p(r - step)) / (2 * step) + 0.4 * r
+    cosine = (a * a + b * b - r * r) / (2 * a * b)
+    shape = np.array([[a, 0, 0], [0, 0, 0], [b * cosine, b * np.sqrt(1 - cosine**2), 0]])
+
+    def pull(x):
+        """-grad of U = 0.2 r^2."""
+        d = x[0] - x[2]
+        return np.array([-0.4 * d, np.zeros(3), 0.4 * d])
+
+    coordinates = {"end to end": Distance([[0, 2]])}
+    series = series_of(
+        coordinates, [Distance([[0, 1], [1, 2]])], masses, np.repeat(shape[None], 3 * SAMPLES, 0), pull, sphere=sphere
+    )
+    if sphere:
+        plain = mean_force(series, KT)
+        result = mean_force(series, KT, isokinetic_degrees_of_freedom=6)
+        assert abs(plain.force[0] - exact) > 4 * plain.error[0]
+    else:
+        result = mean_force(series, KT)
+    assert abs(result.force[0] - exact) < 3 * result.error[0] < 0.06
+    assert abs(series.gradient[0, 0]) * KT > 3 * result.error[0]
+
+
+def test_two_coordinates_with_z_off_the_diagonal():
+    """r and s = r^2 + x in a plane with a fixed centre: P of both in closed form."""
+    rng = np.random.default_rng(4)
+    r, s, mass = 1.4, 2.5, 2.0
+    masses = np.array([1.0, mass])
+    x = s - r * r
+    signs = rng.choice([-1, 1], 64)
+    points = np.zeros((64, 2, 3))
+    points[:, 1, 0], points[:, 1, 1] = x, signs * np.sqrt(r * r - x * x)
+    coordinates = {
+        "r": Distance([[0, 1]]),
+        "s": Formula("(x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2 + x2", [[0, 1]], target=None),
+    }
+    series = series_of(coordinates, [FixedAtoms([0]), Plane([1], (0, 0, 1))], masses, points, spring)
+
+    def free_energy(r, s):
+        """P(r, s) dr ds = 2 |d(x, y)/d(r, s)| e^(-U/kT); the Jacobian is r/|y|."""
+        x = s - r * r
+        return (r - 1) ** 4 / 4 + r - KT * np.log(r / np.sqrt(r * r - x * x))
+
+    h = 1e-6
+    exact = [
+        (free_energy(r + h, s) - free_energy(r - h, s)) / (2 * h),
+        (free_energy(r, s + h) - free_energy(r, s - h)) / (2 * h),
+    ]
+    # Nothing is left to move: every sample has it exactly.
+    np.testing.assert_allclose(local_mean_force(series, KT), np.tile(exact, (64, 1)), rtol=0, atol=1e-8)
+
+
+def test_bad_input():
+    series = series_of(
+        {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.ones(2), ring(1.7, 20), spring
+    )
+    for kT in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="kT is"):
+            mean_force(series, kT)
+    with pytest.raises(InputError, match="no temperature"):
+        mean_force(series, KT, isokinetic_degrees_of_freedom=1)
+    with pytest.raises(InputError, match="20 of 20 samples are to be discarded"):
+        mean_force(series, KT, discard=20)
+    pulled = Series(["r"])
+    for k, sample in enumerate(series):
+        pulled.append(sample._replace(value=sample.value + 0.1 * (k > 9)))
+    with pytest.raises(InputError, match=r"r moved by 0\.1"):
+        for sample in list(
+            series_of(
+                {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.ones(2), ring(1.8, 4), spring
+            )._samples
+        ):
+            series.append(sample)
+        mean_force(series, KT)

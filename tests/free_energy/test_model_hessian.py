@@ -1,0 +1,92 @@
+"""The model Hessian: its coordinates, its symmetries, and what it is worth."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import molecule
+
+from kcons.constraints.periodic.one_piece import lattice_of
+from kcons.free_energy.model_hessian import Internals
+
+
+@pytest.mark.parametrize("name", ["CH3CH2OH", "C2H2", "CH3SiH3", "2-butyne", "H2O"])
+def test_gradients_are_those_of_the_values(name):
+    atoms = molecule(name)
+    rng = np.random.default_rng(1)
+    x, d = atoms.positions, rng.normal(size=atoms.positions.shape)
+    internals = Internals(atoms.numbers, x)
+    h = 1e-5
+    slope = internals.change(internals.values(x + h * d), internals.values(x - h * d)) / (2 * h)
+    np.testing.assert_allclose(internals.jacobian(x) @ d.ravel(), slope, atol=1e-7)
+    assert len(internals.terms) == len(internals.constants) == len(slope)
+
+
+@pytest.mark.parametrize(("name", "free"), [("CH3CH2OH", 6), ("C2H2", 5), ("2-butyne", 7), ("H2O", 6)])
+def test_only_shifts_and_turns_cost_nothing(name, free):
+    """And the turn of butyne's ends against each other, between which a straight line leaves no dihedral."""
+    atoms = molecule(name)
+    x = atoms.positions
+    curvature = np.linalg.eigvalsh(Internals(atoms.numbers, x).hessian(x))
+    assert np.sum(np.abs(curvature) < 1e-8 * curvature.max()) == free
+    assert curvature.min() > -1e-10 * curvature.max()
+
+
+def test_a_cell_changes_nothing():
+    atoms = molecule("CH3OH")
+    x = atoms.positions
+    cell = np.diag([8.0, 9.0, 10.0])
+    moved = x + 4.2
+    wrapped = moved - np.floor(moved / np.diag(cell)) * np.diag(cell)
+    whole = Internals(atoms.numbers, x).hessian(x)
+    cut = Internals(atoms.numbers, wrapped, lattice_of(cell, True)).hessian(wrapped)
+    np.testing.assert_allclose(cut, whole, atol=1e-9)
+
+
+def test_data_go_from_terms_to_terms():
+    x = molecule("H2O2").positions
+    numbers = [8, 8, 1, 1]
+    first = Internals(numbers, x)
+    data = np.arange(2.0 * len(first.terms)).reshape(2, -1)
+    assert np.array_equal(first.taken_over(data, first.terms), data)
+    shuffled = first.terms[::-1]
+    assert np.array_equal(first.taken_over(data[:, ::-1], shuffled), data)
+    assert not first.taken_over(data[:, :1], [(7, 8)]).any()
+
+
+def test_a_dihedral_changes_by_the_shorter_way():
+    internals = Internals([8, 8, 1, 1], molecule("H2O2").positions)
+    turn = len(internals.terms) - 1
+    assert len(internals.terms[turn]) == 4
+    after, before = np.zeros(turn + 1), np.zeros(turn + 1)
+    after[turn], before[turn] = -3.1, 3.1
+    assert internals.change(after, before)[turn] == pytest.approx(2 * np.pi - 6.2)
+
+
+def test_single_atoms_have_no_terms():
+    apart = Internals([2, 2], np.array([[0.0, 0, 0], [0, 0, 30.0]]))
+    assert apart.terms == [] and not apart.hessian(Atoms("He2", [[0, 0, 0], [0, 0, 30.0]]).positions).any()
+
+
+@pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
+def test_it_is_near_the_hessian_of_gfn2():
+    """Stiff directions within a factor of two."""
+    from tblite.ase import TBLite
+
+    atoms = molecule("CH3OH")
+    atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
+    x = atoms.positions.copy()
+    h, true = 1e-3, []
+    for k in range(x.size):
+        ends = []
+        for sign in (1, -1):
+            atoms.positions[:] = x
+            atoms.positions.flat[k] += sign * h
+            ends.append(-atoms.get_forces().ravel())
+        true.append((ends[0] - ends[1]) / (2 * h))
+    model = np.linalg.eigvalsh(Internals(atoms.numbers, x).hessian(x))[8:]
+    found = np.linalg.eigvalsh(0.5 * (np.array(true) + np.array(true).T))[8:]
+    assert np.all((model / found > 0.5) & (model / found < 2.0))

@@ -1,0 +1,89 @@
+"""Relaxations on constraints: the minimum, its cost, and where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scan_systems import ANGLE, LENGTH, chain, threefold
+
+from kcons import ConstraintSet, Motion
+from kcons.constraints import Dihedral, Distance, FixedAtoms
+from kcons.errors import ConvergenceError
+from kcons.free_energy.model_hessian import Internals
+from kcons.free_energy.relaxation import relax
+from kcons.motion import minimise
+
+
+def forces_of(atoms):
+    def evaluate(x):
+        atoms.positions[:] = x
+        return atoms.get_potential_energy(), atoms.get_forces()
+
+    return evaluate
+
+
+def setting(rows, n=5):
+    atoms = chain(n, threefold, turns=[1.0] * (n - 3))
+    x = atoms.positions.copy()
+    motion = Motion(ConstraintSet(rows, x, atoms.get_masses()), x)
+    return atoms, motion, motion.restore_positions(x)
+
+
+def test_the_minimum_is_where_it_is():
+    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9), Distance([[1, 2]], 1.5)])
+    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-5)
+    assert found.energy == pytest.approx(0.5 * 30 * (1.5 - LENGTH) ** 2 + 0.2 * (1 + np.cos(2.7)), abs=1e-9)
+    assert found.largest <= 1e-5 and found.evaluations == atoms.calc.calls
+    motion.certify(found.positions)
+    arms = found.positions[[2, 4]] - found.positions[3]
+    angle = np.arccos(arms[0] @ arms[1] / np.prod(np.linalg.norm(arms, axis=1)))
+    assert angle == pytest.approx(ANGLE, abs=1e-5)
+
+
+def test_it_needs_far_fewer_calls_than_forces_alone():
+    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=8)
+    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-3)
+    evaluate = forces_of(atoms)
+    other = minimise(motion, lambda y, t: evaluate(y)[1], x, tolerance=1e-3, longest=0.2)
+    assert found.energy == pytest.approx(evaluate(other.positions)[0], abs=1e-5)
+    assert 2 * found.evaluations < other.evaluations
+
+
+def test_what_was_learned_goes_along():
+    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)], n=6)
+    internals = Internals(atoms.numbers, x)
+    first = relax(motion, forces_of(atoms), internals, x, fmax=1e-3)
+    assert first.memory.shape == (first.evaluations - 1, 2, len(internals.terms))
+    again = relax(motion, forces_of(atoms), internals, x, fmax=1e-3, memory=first.memory)
+    assert again.evaluations < first.evaluations
+
+
+def test_fixed_atoms_stay():
+    atoms, motion, x = setting([FixedAtoms([0, 4]), Distance([[1, 2]], 1.45)])
+    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-4)
+    assert np.array_equal(found.positions[[0, 4]], x[[0, 4]])
+    forces = motion.project_forces(found.positions, forces_of(atoms)(found.positions)[1])
+    assert np.abs(forces[[1, 2, 3]]).max() < 1e-3
+
+
+def test_everything_fixed_is_a_minimum():
+    atoms, motion, x = setting([FixedAtoms(range(5))])
+    found = relax(motion, forces_of(atoms), Internals(atoms.numbers, x), x, fmax=1e-4)
+    assert found.evaluations == 1 and found.largest == 0.0 and np.array_equal(found.positions, x)
+
+
+def test_forces_that_are_no_gradient_are_told():
+    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 0.9)])
+    evaluate = forces_of(atoms)
+    with pytest.raises(ConvergenceError, match="forces are not its gradient") as raised:
+        relax(
+            motion,
+            lambda y: (evaluate(y)[0], -evaluate(y)[1]),
+            Internals(atoms.numbers, x),
+            x,
+            fmax=1e-5,
+            evaluations=500,
+        )
+    assert raised.value.positions.shape == x.shape
+    with pytest.raises(ConvergenceError, match="3 evaluations; allow more"):
+        relax(motion, evaluate, Internals(atoms.numbers, x), x, fmax=1e-5, evaluations=3)

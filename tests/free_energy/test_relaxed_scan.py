@@ -1,0 +1,244 @@
+"""Relaxed scans: known profiles, both ways, failures, resuming."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.constraints import FixAtoms, Hookean
+from scan_systems import chain, threefold, two_wells
+
+from kcons.constraints import Angle, CustomVelocity, Dihedral, Distance, FixedAtoms
+from kcons.errors import (
+    CalculatorError,
+    ConstraintError,
+    ConvergenceError,
+    InputError,
+    OccupiedError,
+    SingularGeometryError,
+    UnsupportedError,
+)
+from kcons.free_energy import scan
+
+TURN = Dihedral([[0, 1, 2, 3]])
+RING = np.radians(np.arange(-180, 180, 30))
+
+
+def test_a_torsion_has_its_profile():
+    """Bonds and angles relax to where they cost nothing, the dihedral stays where it is held."""
+    atoms = chain(4, threefold)
+    before = atoms.positions.copy()
+    found = scan(atoms, TURN, RING, fmax=1e-3)
+    assert np.array_equal(atoms.positions, before) and not atoms.constraints
+    np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * RING)), atol=2e-7)
+    assert found.failed == {} and found.hysteresis.max() < 2e-7
+    for point, attempt in found.best.items():
+        phi = TURN.measure(attempt.positions[None, :4], 0.0)[0] - RING[point]
+        assert abs(phi - 2 * np.pi * np.round(phi / (2 * np.pi))) < 1e-13
+        assert attempt.largest <= 1e-3
+    assert found.evaluations - 1 <= atoms.calc.calls <= found.evaluations  # ASE remembers the last place
+    there = found.structure((3,))
+    assert there.info["Dihedral(0, 1, 2, 3)"] == pytest.approx(-90) and there.info["energy"] == found.energies[3]
+
+
+def test_two_coordinates():
+    atoms = chain(5, threefold)
+    grid = [np.radians(np.arange(-180, 180, 60)), np.radians([40.0, 60.0, 80.0])]
+    found = scan(atoms, [TURN, Dihedral([[1, 2, 3, 4]])], grid, fmax=2e-3)
+    a, b = np.meshgrid(*grid, indexing="ij")
+    np.testing.assert_allclose(found.energies, 0.4 + 0.2 * (np.cos(3 * a) + np.cos(3 * b)), atol=1e-6)
+    assert found.energies.shape == (6, 3) and found.failed == {}
+
+
+def lowest(a):
+    """Of `two_wells`, over the second dihedral."""
+    b = np.linspace(-np.pi, np.pi, 20001)
+    return np.min(0.1 * (1 - np.cos(2 * b)) + 0.6 * np.sin(a)[:, None] * np.cos(b - 0.4), axis=1)
+
+
+def test_both_ways_find_the_lower_of_two_minima():
+    """One way, the scan stays in a minimum that is not the lowest any more until that one is gone."""
+    values = np.radians(np.arange(-165, 180, 15))
+    atoms = chain(5, two_wells, turns=[np.radians(-150), 0.3])
+    one = scan(atoms, TURN, values, fmax=2e-3, both_ways=False)
+    both = scan(atoms, TURN, values, fmax=2e-3)
+    truth = lowest(values)
+    np.testing.assert_allclose(both.energies, truth, atol=3e-6)
+    assert np.max(one.energies - truth) > 0.02
+    assert both.hysteresis.max() > 0.02 and one.hysteresis.max() == 0.0
+    assert len(one.attempts) == len(values) < len(both.attempts)
+
+
+def test_distance_and_angle():
+    atoms = chain(4, threefold)
+    lengths = [1.2, 1.4, 1.6]
+    found = scan(atoms, Distance([[1, 2]]), lengths, fmax=1e-3)
+    np.testing.assert_allclose(found.energies, 15 * (np.array(lengths) - 1.4) ** 2, atol=2e-6)
+    found = scan(atoms, Angle([[0, 1, 2]]), np.radians([100, 110, 125]), fmax=1e-3)
+    np.testing.assert_allclose(found.energies, 2.5 * np.radians([-10, 0, 15]) ** 2, atol=2e-6)
+
+
+def test_what_else_is_held_stays():
+    """Constraints of kcons and of ASE; those that only add forces count in the energy."""
+    atoms = chain(5, threefold)
+    atoms.set_constraint(FixAtoms([0]))
+    place = atoms.positions[0].copy()
+    found = scan(atoms, Dihedral([[1, 2, 3, 4]]), [0.5, 0.6], held=Distance([[2, 3]], 1.5), fmax=2e-3)
+    for attempt in found.best.values():
+        np.testing.assert_allclose(attempt.positions[0], place, atol=1e-14)
+        assert abs(np.linalg.norm(attempt.positions[2] - attempt.positions[3]) - 1.5) < 1e-14
+    truth = 0.2 * (1 + np.cos(3 * np.array([0.5, 0.6]))) + 15 * 0.1**2
+    np.testing.assert_allclose(found.energies, truth, atol=2e-6)
+    atoms.set_constraint(Hookean(0, 4, k=1.0, rt=3.0))
+    pulled = scan(atoms, TURN, [0.5], fmax=2e-3)
+    assert pulled.energies[0] > 0.2 * (1 + np.cos(1.5)) + 0.01
+    assert [type(item) for item in atoms.constraints] == [Hookean]
+
+
+def test_one_failed_point_does_not_stop_the_others():
+    def fails(phi):
+        at = np.degrees(phi[0])
+        return RuntimeError("no convergence") if 50 < at < 70 else np.nan if -70 < at < -50 else None
+
+    atoms = chain(4, threefold, fails)
+    found = scan(atoms, TURN, RING)
+    assert set(found.failed) == {(4,), (8,)}
+    assert found.failed[8,].startswith("Dihedral(0, 1, 2, 3) = 60: CalculatorError: the calculator failed")
+    assert "RuntimeError: no convergence" in found.failed[8,]
+    assert "NonFiniteError: the force on atom 0 is not finite" in found.failed[4,]
+    good = np.isfinite(found.energies)
+    assert good.sum() == 10
+    np.testing.assert_allclose(found.energies[good], 0.2 * (1 + np.cos(3 * RING[good])), atol=2e-5)
+    with pytest.raises(InputError, match="no structure at"):
+        found.structure((4,))
+
+
+def test_a_failed_point_is_leapt_over():
+    """What lies behind it is reached from before it."""
+    atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 1.2 < phi[0] < 1.3 else None, turns=[1.0])
+    found = scan(atoms, TURN, [1.0, 1.25, 1.5, 1.6])
+    assert set(found.failed) == {(1,)} and np.isfinite(found.energies[2:]).all()
+
+
+def test_where_nothing_succeeds_the_first_error_is_raised():
+    atoms = chain(4, threefold, lambda phi: ValueError("broken"))
+    with pytest.raises(CalculatorError, match="broken") as raised:
+        scan(atoms, TURN, RING)
+    assert isinstance(raised.value.__cause__, ValueError)
+    with pytest.raises(ConvergenceError, match="2 evaluations; allow more"):
+        scan(chain(4, threefold), TURN, RING, evaluations=2, fmax=1e-6)
+
+
+class Stop(BaseException):
+    """As an interruption does."""
+
+
+def test_a_scan_goes_on_where_it_stopped(tmp_path):
+    """Nothing that was done is done again, and the end is the same to the last bit."""
+    values = np.radians(np.arange(-165, 180, 30))
+
+    def built():
+        return chain(5, two_wells, turns=[np.radians(-150), 0.3])
+
+    whole = scan(built(), TURN, values, folder=tmp_path / "whole")
+    calls = 0
+    for last in (3, 9):
+        atoms, lines = built(), []
+
+        def stop(finished, points, said, lines=lines, last=last):
+            lines.append(said)
+            if len(lines) == last:
+                raise Stop
+
+        with pytest.raises(Stop):
+            scan(atoms, TURN, values, folder=tmp_path / "cut", progress=stop)
+        calls += atoms.calc.calls
+    atoms = built()
+    found = scan(atoms, TURN, values, folder=tmp_path / "cut")
+    calls += atoms.calc.calls
+    assert whole.evaluations - 3 <= calls <= whole.evaluations == found.evaluations
+    assert np.array_equal(found.energies, whole.energies)
+    for point, attempt in whole.best.items():
+        assert np.array_equal(found.best[point].positions, attempt.positions)
+
+
+def test_a_folder_of_another_scan_is_refused(tmp_path):
+    atoms = chain(4, threefold)
+    scan(atoms, TURN, [0.5], folder=tmp_path)
+    with pytest.raises(OccupiedError, match="values"):
+        scan(atoms, TURN, [0.6], folder=tmp_path)
+    with pytest.raises(OccupiedError, match="settings"):
+        scan(atoms, TURN, [0.5], folder=tmp_path, fmax=0.02)
+    with pytest.raises(OccupiedError, match="held"):
+        scan(atoms, TURN, [0.5], folder=tmp_path, held=Distance([[0, 1]]))
+
+
+def test_bad_coordinates():
+    atoms = chain(4, threefold)
+    straight = atoms.copy()
+    straight.positions[:3] = [[0, 0, 0], [1.4, 0, 0], [2.8, 0, 0]]
+    straight.calc = atoms.calc
+    with pytest.raises(SingularGeometryError, match="collinear; bend them, or hold a dihedral of other atoms"):
+        scan(straight, TURN, RING)
+    with pytest.raises(ConstraintError, match=r"Distance\(0, 1\) depends on what else is held"):
+        scan(atoms, Distance([[0, 1]]), [1.2, 1.4], held=Distance([[0, 1]]))
+    with pytest.raises(ConstraintError, match=r"Distance\(0, 2\) depends"):
+        scan(atoms, Distance([[0, 2]]), [2.2], held=[Distance([[0, 1], [1, 2]]), Angle([[0, 1, 2]])])
+    with pytest.raises(ConstraintError, match=r"Distance\(0, 1\) depends"):
+        scan(atoms, Distance([[0, 1]]), [1.2], held=FixedAtoms([0, 1]))
+    with pytest.raises(ConstraintError, match=r"Distance\(1, 0\) depends"):
+        scan(atoms, [Distance([[0, 1]]), Distance([[1, 0]])], [[1.2], [1.2]])
+    with pytest.raises(InputError, match="atom 9"):
+        scan(atoms, Distance([[0, 9]]), [1.2])
+    with pytest.raises(InputError, match="length greater than zero"):
+        scan(atoms, Distance([[0, 1]]), [-1.0, 1.2])
+    with pytest.raises(InputError, match="no angle between 0 and pi"):
+        scan(atoms, Angle([[0, 1, 2]]), [120.0])
+    with pytest.raises(UnsupportedError, match="moves with time"):
+        scan(atoms, Distance([[0, 1]], lambda t: 1.0 + t), [1.2])
+    with pytest.raises(UnsupportedError, match="velocities"):
+        scan(atoms, TURN, RING, held=CustomVelocity([[0, 1]], lambda r, t: np.ones((len(r), 2, 3))))
+    with pytest.raises(InputError, match="fmax is 0; give a positive number"):
+        scan(atoms, TURN, RING, fmax=0)
+    with pytest.raises(InputError, match="no calculator"):
+        scan(Atoms("C4", positions=atoms.positions), TURN, RING)
+
+
+def test_a_value_that_cannot_be_reached_is_a_failure_of_its_point():
+    """Two bonds are held: beyond their sum there is no distance between the ends."""
+    atoms = chain(4, threefold)
+    found = scan(atoms, Distance([[0, 2]]), [2.2, 2.4, 3.5], held=Distance([[0, 1], [1, 2]], 1.4))
+    assert set(found.failed) == {(2,)}
+    assert found.failed[2,].startswith("Distance(0, 2) = 3.5: InfeasibleError")
+
+
+def test_large_structures_need_no_table(monkeypatch):
+    monkeypatch.setattr("kcons.free_energy.relaxed_scan.MOST_ATOMS", 3)
+    found = scan(chain(4, threefold), TURN, [0.5, 0.8], fmax=1e-3)
+    np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * np.array([0.5, 0.8]))), atol=1e-6)
+
+
+def test_a_molecule_with_emt():
+    atoms = molecule("H2O2")
+    atoms.calc = EMT()
+    found = scan(atoms, Dihedral([[2, 0, 1, 3]]), np.radians(np.arange(0, 360, 60)), fmax=0.02)
+    assert found.failed == {}
+    np.testing.assert_allclose(found.energies[1:3], found.energies[:3:-1], atol=1e-3)  # mirror images
+
+
+@pytest.mark.skipif(find_spec("tblite") is None, reason="tblite is an extra")
+def test_ethane_by_gfn2():
+    """Threefold, and few calls."""
+    from tblite.ase import TBLite
+
+    atoms = molecule("C2H6")
+    atoms.calc = TBLite(method="GFN2-xTB", verbosity=0)
+    found = scan(atoms, Dihedral([[2, 0, 1, 5]]), np.radians(np.arange(-180, 180, 30)))
+    barrier = found.energies - found.energies.min()
+    assert barrier.max() * 96.485 == pytest.approx(10.85, abs=0.05)
+    np.testing.assert_allclose(barrier, np.roll(barrier, 4), atol=1e-4)
+    assert found.evaluations <= 100 and len(found.attempts) >= 24

@@ -1,0 +1,109 @@
+"""Series and what records them in runs of the core."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import ConstraintSet, Motion, System, run
+from kcons.constraints import Dihedral, Distance, MovingTarget
+from kcons.errors import InputError
+from kcons.free_energy import HeldCoordinates, Recorder, Sample, Series
+from kcons.thermostats import Langevin
+
+X = np.array([[0.0, 0.1, 0.2], [1.1, 0.0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9]])
+M = np.array([1.0, 12.0, 14.0, 2.0])
+
+
+def force(x, t):
+    f = np.zeros_like(x)
+    f[0], f[3] = (x[3] - x[0]), (x[0] - x[3])
+    return f
+
+
+def recorded(coordinates, others=(), dt=0.01, steps=40, stepper=None):
+    motion = Motion(ConstraintSet([*others, *coordinates.values()], X, M), X)
+    system = System(motion, force)
+    recorder = Recorder(system, HeldCoordinates(motion, coordinates, X))
+    run(system, system.initial_state(X, np.zeros_like(X)), dt, steps, stepper=stepper, observers=[recorder])
+    return recorder
+
+
+def test_a_run_records_by_name():
+    turn = {"turn": Dihedral([[0, 1, 2, 3]])}
+    recorder = recorded(turn, [Distance([[0, 1], [1, 2], [2, 3]])], stepper=Langevin(1.0, 1.0, seed=1))
+    series = recorder.series
+    assert len(series) == 41 and series.multiplier.shape == (41, 1)
+    np.testing.assert_allclose(series.time, 0.01 * np.arange(41), atol=1e-12)
+    assert series.off.max() < 1e-12
+    assert recorder.multipliers == {"turn": series.of("turn")[-1]}
+    assert repr(series) == "<Series: 41 samples of turn>"
+    # A second recorder may go on where another stopped.
+    again = Recorder(recorder.system, recorder.coordinates, series)
+    assert again.series is series and again.multipliers == {}
+
+
+@pytest.mark.parametrize("coordinate", ["length", "torsion"])
+def test_work_is_the_energy_that_moving_targets_add(coordinate):
+    """To second order in the interval; energies of the run itself are of the same order."""
+    if coordinate == "length":
+        start = float(np.linalg.norm(X[0] - X[3]))
+        held, others = Distance([[0, 3]], MovingTarget(lambda t: start + 0.8 * t * t)), [Distance([[0, 1]])]
+    else:
+        # Through pi, where the dihedral jumps.
+        others = [Distance([[0, 1], [1, 2], [2, 3]])]
+        start = float(ConstraintSet([Dihedral([[0, 1, 2, 3]])], X, M).measure(X)[0])
+        held = Dihedral([[0, 1, 2, 3]], MovingTarget(lambda t: start + 2.0 * t * t))
+    off = []
+    for dt in (0.04, 0.02, 0.01):
+        motion = Motion(ConstraintSet([*others, held], X, M), X)
+        system = System(motion, force, potential=lambda x, t: 0.5 * np.sum((x[3] - x[0]) ** 2))
+        recorder = Recorder(system, HeldCoordinates(motion, {"q": held}, X))
+        first = system.initial_state(X, np.zeros_like(X))
+        last = run(system, first, dt, round(1.2 / dt), observers=[recorder])
+        off.append(abs(recorder.series.work[-1] - (system.total_energy(last) - system.total_energy(first))))
+    assert off[0] < 0.1 and recorder.series.work[-1] > 0.5
+    slopes = np.log2(np.array(off[:-1]) / off[1:])
+    assert np.all((slopes > 1.8) & (slopes < 2.2))
+
+
+def test_files_have_all_of_it(tmp_path):
+    series = recorded({"turn": Dihedral([[0, 1, 2, 3]]), "bond": Distance([[0, 1]])}, steps=8).series
+    series.save(tmp_path / "series.npz")
+    read = Series.load(tmp_path / "series.npz")
+    assert read.names == series.names and read.periods.tolist() == series.periods.tolist()
+    for field in Sample._fields:
+        np.testing.assert_array_equal(getattr(read, field), getattr(series, field))
+    np.testing.assert_array_equal(read[3:6].multiplier, series.multiplier[3:6])
+    empty = Series(["a", "b"])
+    empty.save(tmp_path / "empty.npz")
+    assert len(Series.load(tmp_path / "empty.npz")) == 0 and empty.work.shape == empty.weights.shape == (0,)
+
+
+def test_damaged_files_are_refused(tmp_path):
+    series = recorded({"bond": Distance([[0, 1]])}, steps=8).series
+    file = tmp_path / "series.npz"
+    series.save(file)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 255
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"series\.npz holds no series"):
+        Series.load(file)
+    with pytest.raises(FileNotFoundError):
+        Series.load(tmp_path / "nothing.npz")
+    with pytest.raises(InputError, match="no coordinate 'angle'; there are bond"):
+        series.of("angle")
+
+
+def test_mdanalysis_reads_the_text_as_an_auxiliary(tmp_path):
+    from MDAnalysis.auxiliary.XVG import XVGReader
+
+    series = recorded({"turn": Dihedral([[0, 1, 2, 3]]), "bond": Distance([[0, 1]])}, steps=8).series
+    series.write_xvg(tmp_path / "held.xvg")
+    text = (tmp_path / "held.xvg").read_text()
+    assert '@ s1 legend "multiplier of turn"' in text and '@ s5 legend "work"' in text
+    read = np.array([step.data for step in XVGReader(str(tmp_path / "held.xvg"), time_selector=0)])
+    assert read.shape == (9, 7)
+    np.testing.assert_allclose(read[:, 0], series.time, atol=1e-10)
+    np.testing.assert_allclose(read[:, 2], series.of("turn"), rtol=1e-10)
+    np.testing.assert_allclose(read[:, 4], series.of("bond"), rtol=1e-10)
