@@ -4,6 +4,7 @@
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `profiles`: free energies from mean forces, and where to sample next
 - `windows`: many windows, by any executor
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 """
@@ -23,6 +24,7 @@ _NAMES = {
     "windows.openmm_windows": ("OpenMMWindows",),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "averages": ("Mean", "weighted_mean"),
+    "profiles.profile": ("Profile", "integrate"),
     "relaxed_scan": ("Scan", "scan"),
 }
 

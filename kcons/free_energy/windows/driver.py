@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.mean_forces import MeanForce, mean_force
-from kcons.free_energy.profile import Profile, integrate
+from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Sampler, Settings, Window
 from kcons.steppers.files import in_one_piece, text
