@@ -30,25 +30,20 @@ def sampler(**more):
 @pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
 def test_a_window_far_from_the_structure(tmp_path, thermostat):
     """From 180 to 60 degrees in one go; the same file whenever it is made."""
-    windows = pickle.loads(pickle.dumps(sampler(held=[PIECES])))
-    start, periods = windows.begin()
+    start, periods = sampler().begin()
     assert start == pytest.approx([np.pi]) and periods == pytest.approx([2 * np.pi])
-    fixed = AseWindows(molecule("CH3OH"), CALCULATOR, {"turn": TURN}, [PIECES])
-    fixed.atoms.set_constraint()
     settings = Settings(**{**SHORT.__dict__, "thermostat": thermostat})
     window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
     atoms = molecule("CH3OH")
     atoms.set_constraint(FixAtoms([0]))  # so that the thermostats are not those of a free cluster
-    held = AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])
-    contents = []
+    held = pickle.loads(pickle.dumps(AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])))
     for name in ("one", "two"):
         held.sample(window, settings, tmp_path / name)
-        contents.append((tmp_path / name).read_bytes())
     series = Series.load(tmp_path / "one")
-    assert len(series) == 33 and series.off.max() < 1e-12
+    assert len(series) == 32 and series.off.max() < 1e-12
     np.testing.assert_allclose(series.value, np.pi / 3, atol=1e-12)
     assert np.array_equal(series.multiplier, Series.load(tmp_path / "two").multiplier)
-    assert series.isokinetic_degrees_of_freedom == (2 if thermostat == "isokinetic" else 0)
+    assert series.isokinetic_degrees_of_freedom == (3 if thermostat == "isokinetic" else 0)
 
 
 def test_a_calculator_that_fails_is_named(tmp_path):
@@ -70,7 +65,5 @@ def test_coordinates_that_cannot_be_held():
         sampler(held=[PIECES, Distance([[2, 3]])]).begin()
     with pytest.raises(UnsupportedError, match=r"bonds is .*one row"):
         AseWindows(molecule("CH3OH"), CALCULATOR, {"bonds": PIECES}).begin()
-    straight = molecule("CO2")
-    with pytest.raises(SingularGeometryError, match="collinear|undefined"):
+    with pytest.raises(SingularGeometryError, match=r"collinear|undefined"):
         AseWindows(molecule("C2H2"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 3]])}).begin()
-    assert len(straight) == 3

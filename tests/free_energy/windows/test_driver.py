@@ -90,12 +90,11 @@ def test_hysteresis_is_seen(tmp_path):
 
 
 def test_windows_are_added_where_they_help(tmp_path):
-    windows, first = run(tmp_path, PLACES[::2])
+    windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
     with ThreadPoolExecutor(2) as executor:
-        better = windows.improve(0.6, 20, executor=executor, at_once=2)
-    assert first.profile.error.max() > 0.6 and len(first.windows) == 4
-    assert 4 < len(better.windows) <= 20
-    assert better.profile.error.max() <= 0.6 or len(better.windows) == 20
+        better = windows.improve(0.5, 20, executor=executor, at_once=2)
+    assert first.profile.error.max() > 0.5 and len(first.windows) == 5
+    assert 5 < len(better.windows) < 20 and better.profile.error.max() <= 0.5
 
 
 def test_a_killed_worker_changes_nothing(tmp_path):
@@ -140,34 +139,21 @@ def test_killed_runs_go_on(tmp_path, kills):
     assert json.dumps(result.numbers()) == json.dumps(expected.numbers())
 
 
-def test_a_cluster_of_dask_that_loses_a_worker(tmp_path):
+def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
     _, expected = run(whole)
-    path = str(Path(__file__).parents[2] / "systems")
+    path = [str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     with (
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, preload=None
-        ) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
         distributed.Client(cluster.scheduler_address) as client,
     ):
-        client.run(lambda: sys.path.append(path))
-        client.register_plugin(_Path(path))
         fake = Fake(str(broken / "diary"), kills=("window-0003-up",), wait=0.05)
         result = Windows(fake, broken / "out", SETTINGS).run(PLACES, executor=client.get_executor(pure=False))
     assert diary(broken).count("window-0003-up") == 2
     assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
-
-
-class _Path:
-    """Tells workers that start later where the samplers of the tests are."""
-
-    idempotent = True
-    name = "path"
-
-    def __init__(self, path):
-        self.path = path
 
 
 def test_bad_input(tmp_path):
