@@ -20,6 +20,7 @@ _NAMES = {
     "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
+    "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "relaxed_scan": ("Scan", "scan"),
 }
 
