@@ -292,7 +292,7 @@ class Multibody(MultibodyFunctions):
         V, N = V[:rank], V[rank:].T
         S = N.T @ M @ N
         W, info = lapack.dpotrf(S) if rank < n else (S, 0)
-        if info or np.any(W.diagonal() ** 2 <= MASSLESS * S.diagonal()):
+        if info or (W.diagonal() ** 2 <= MASSLESS * S.diagonal()).any():
             raise SingularGeometryError(
                 f"at t = {t:.8g}, q = {shown(q)} the mass matrix is not positive along what the {rank} independent "
                 "constraints leave free: give the coordinates that move there a mass, or hold them"

@@ -443,6 +443,18 @@ def test_trial_steps_may_go_too_far():
     np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
 
 
+def test_what_ends_a_run_is_told_not_what_was_got_over():
+    """A trial step that fails once, and steps too small much later."""
+    calls = []
+
+    def force(q, v, t):
+        calls.append(t)
+        return v**2 if len(calls) != 12 else v * np.nan
+
+    with pytest.raises(ConvergenceError, match="the run ended at t ="):
+        Multibody([1.0], force).solve([0.0], [1.0], (0, 2))
+
+
 def test_steps_that_become_too_small():
     body = Multibody([1.0], lambda q, v, t: v**2)  # v = 1 / (1 - t)
     with pytest.raises(ConvergenceError, match=r"the run ended at t = (0\.9|1:).*Stiff forces: method='Radau'"):
