@@ -4,6 +4,7 @@
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
+- `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
 
 from importlib import import_module
@@ -16,6 +17,7 @@ _NAMES = {
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "averages": ("Mean", "weighted_mean"),
     "relaxed_scan": ("Scan", "scan"),
+    "system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)
