@@ -1,6 +1,7 @@
 """Free energies along held coordinates, and relaxed scans.
 
 - `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
@@ -15,6 +16,8 @@ _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
     "series": ("Recorder", "Series"),
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
+    "ase_recorder": ("AseRecorder",),
+    "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
     "relaxed_scan": ("Scan", "scan"),
     "system_calculator": ("SystemCalculator",),

@@ -1,5 +1,11 @@
-"""The same theory in other fields: flows of dynamical systems, and constrained growth.
+"""The same theory in other fields: multibody systems, flows of dynamical systems, and constrained growth.
 
+- `projected_steps`: integrators with a projection after each step
+- `multibody_functions`, `multibody`: mechanical systems in any coordinates, with a full mass matrix
 - `flows`: dynamical systems as flows
 - `growth`: models of growth, and constraints on them
 """
+
+from kcons.models.multibody import Multibody, MultibodySolution
+
+__all__ = ["Multibody", "MultibodySolution"]

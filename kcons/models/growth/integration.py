@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import BDF, DOP853, RK23, RK45, OdeSolver, Radau, solve_ivp
+from scipy.integrate import solve_ivp
 
-from kcons.constraints.arguments import numbers
-from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
+from kcons.models.projected_steps import projecting, solver_of, span_of, times_of
 
-METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
 Event = Callable[[float, FloatArray], float]
 
 
@@ -162,8 +161,8 @@ def solve(
     NonFiniteError
         Rates or sources that are not finite where the run has come to.
     """
-    solver = _solver(method)
-    t0, t1 = _span(t_span)
+    solver = solver_of(method)
+    t0, t1 = span_of(t_span)
     log_start = starting_logarithms(x0, log_x0)
     if log_start.shape != (system.n,):
         raise InputError(f"the start has shape {log_start.shape}, not ({system.n},)", item="x0")
@@ -183,9 +182,18 @@ def solve(
             holder["not finite"] = t, y
         return found
 
-    stepper = _projecting(solver, bound, holder, tolerance) if project else solver
+    def placed(t: float, y: FloatArray) -> FloatArray:
+        return bound.past_instants(t, bound.project(t, y))
+
+    def settled(t: float, y: FloatArray) -> bool:
+        slow = bound.settled(t, y, tolerance)
+        if slow is not None:
+            holder.update(slow=slow, time=t)
+        return slow is not None
+
+    stepper = projecting(solver, placed, settled) if project else solver
     slow = bound.settled(t0, log_start, tolerance) if project else None
-    wanted = None if t_eval is None else _times(t_eval, t0, t1)
+    wanted = None if t_eval is None else times_of(t_eval, t0, t1)
     if slow is not None:
         holder.update(slow=slow, time=t0)
         ode: Any = None
@@ -220,40 +228,6 @@ def _refuse_rates(system: ConstrainedGrowth, t: float, y: FloatArray) -> None:
             f"x = {np.array2string(p.x, precision=4)}; end the run before (an event), or mend the function",
             item=f"{what}s",
         )
-
-
-# -- one step at a time ------------------------------------------------------------------------------
-
-
-def _projecting(
-    solver: type[OdeSolver], system: ConstrainedGrowth, holder: dict[str, Any], tolerance: float
-) -> type[OdeSolver]:
-    """The solver, with a projection after each step, ended early once the motion has settled."""
-
-    class Projecting(solver):  # type: ignore[misc, valid-type]
-        t: float
-        y: FloatArray
-        status: str
-
-        def step(self) -> str | None:
-            message: str | None = super().step()
-            if self.status == "failed":
-                return message
-            y = system.past_instants(self.t, system.project(self.t, self.y))
-            if isinstance(self, BDF):
-                self.D[0] += y - self.y
-            else:
-                self.f = self.fun(self.t, y)
-            self.y = y
-            if self.status == "running":
-                slow = system.settled(self.t, y, tolerance)
-                if slow is not None:
-                    holder.update(slow=slow, time=self.t)
-                    self.status = "finished"
-            return message
-
-    Projecting.__name__ = solver.__name__
-    return Projecting
 
 
 # -- the result --------------------------------------------------------------------------------------
@@ -378,38 +352,6 @@ def _each(system: ConstrainedGrowth, times: FloatArray, log_y: FloatArray) -> Fl
 
 
 # -- input -------------------------------------------------------------------------------------------
-
-
-def _solver(method: str) -> type[OdeSolver]:
-    if method == "LSODA":
-        raise UnsupportedError(
-            "LSODA keeps its own copy of the state, which cannot be put back on the constraints; "
-            "use 'Radau' or 'BDF' for stiff systems"
-        )
-    if method not in METHODS:
-        raise InputError(f"there is no method {method!r}; choose from {', '.join(METHODS)}", item="method")
-    return METHODS[method]
-
-
-def _span(t_span: Sequence[float]) -> tuple[float, float]:
-    try:
-        t0, t1 = (float(t) for t in t_span)
-    except (TypeError, ValueError):
-        raise InputError(f"t_span is a pair of times, not {t_span!r}", item="t_span") from None
-    if not (np.isfinite(t0) and np.isfinite(t1)):
-        raise InputError("t_span is not finite", item="t_span")
-    return t0, t1
-
-
-def _times(t_eval: ArrayLike, t0: float, t1: float) -> FloatArray:
-    times = numbers(t_eval, "t_eval")
-    low, high = min(t0, t1), max(t0, t1)
-    if times.ndim != 1 or np.any(times < low) or np.any(times > high):
-        raise InputError("t_eval is one-dimensional and within t_span", item="t_eval")
-    steps = np.diff(times)
-    if np.any(steps <= 0 if t1 >= t0 else steps >= 0):
-        raise InputError("t_eval is not sorted from the start to the end of t_span", item="t_eval")
-    return times
 
 
 def _event_list(events: Event | Sequence[Event] | None) -> list[Event] | None:

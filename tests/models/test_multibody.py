@@ -1,0 +1,432 @@
+"""Multibody systems: published problems, closed forms, the same motion in other coordinates."""
+
+from __future__ import annotations
+
+import runpy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ellipj, ellipk
+
+from kcons import ConstraintSet, Motion, State, System
+from kcons.constraints import Distance, FixedAtoms, Sphere
+from kcons.errors import (
+    ConstraintError,
+    ContradictionError,
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    SingularGeometryError,
+)
+from kcons.models import Multibody
+from kcons.steppers import Extrapolation
+
+#: Steps of one size: no error is too large for it.
+FIXED = {"rtol": 1.0, "atol": 1e9}
+
+
+def steps_of(h):
+    return FIXED | {"first_step": h, "max_step": h}
+
+
+# -- Andrews' squeezing mechanism --------------------------------------------------------------------
+
+
+@cache
+def squeezer():
+    """The example, and its solution to 1e-12."""
+    script = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "27_squeezer.py"))
+    return script, script["squeezer"]().solve(script["START"], np.zeros(7), (0.0, 0.03), rtol=1e-12, atol=1e-14)
+
+
+def test_squeezer_ends_where_it_is_published_to():
+    script, found = squeezer()
+    # The solution is published with 16 digits, of which SciPy's integrators alone confirm nine, too.
+    np.testing.assert_allclose(found.q[-1], script["ANGLES"], rtol=1e-9, atol=0)
+    np.testing.assert_allclose(found.v[-1], script["VELOCITIES"], rtol=1e-7, atol=0)
+    np.testing.assert_allclose(-found.multipliers[-1], script["MULTIPLIERS"], rtol=2e-6, atol=0)
+
+
+def test_squeezer_is_on_its_constraints_at_each_step():
+    script, found = squeezer()
+    body = script["squeezer"]()
+    g, slip = np.abs([body.residuals(q, v) for q, v in zip(found.q, found.v, strict=True)]).max(axis=(0, 2))
+    # Lengths are some cm, angles up to 16; arms turn by 1,000 a second.
+    assert g < 10 * 16 * 0.03 * 2e-16 and slip < 1e3 * 0.03 * 1e-14
+    assert body.degrees_of_freedom(found.q[-1]) == 1
+
+
+def test_multipliers_of_the_squeezer_solve_the_equations_of_index_one():
+    script, found = squeezer()
+    for k in (0, len(found.t) // 2, -1):
+        q, v = found.q[k], found.v[k]
+        G = script["gradients"](q)
+        K = np.block([[script["mass"](q), -G.T], [G, np.zeros((6, 6))]])
+        literal = np.linalg.solve(K, np.concatenate([script["force"](q, v, 0.0), -script["bending"](q, v)]))
+        np.testing.assert_allclose(found.accelerations[k], literal[:7], rtol=0, atol=1e-11 * np.abs(literal[:7]).max())
+        np.testing.assert_allclose(found.multipliers[k], literal[7:], rtol=0, atol=1e-11 * np.abs(literal[7:]).max())
+
+
+def test_squeezer_without_derivatives():
+    """Gradients and what accelerations need by differences."""
+    script, found = squeezer()
+    times = [0.0, 0.004, 0.01]
+    exact = script["squeezer"]().solve(script["START"], np.zeros(7), (0, 0.01), times, rtol=1e-10, atol=1e-12)
+    for given in ((), (script["gradients"],)):
+        body = Multibody(script["mass"], script["force"], script["loops"], *given)
+        found = body.solve(script["START"], np.zeros(7), (0, 0.01), times, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.q, exact.q, rtol=0, atol=1e-7)
+        assert np.abs(script["loops"](found.q[-1])).max() < 1e-16
+
+
+# -- closed forms ------------------------------------------------------------------------------------
+
+LENGTH, GRAVITY, SWING = 0.5, 9.8, 2.0
+
+
+def pendulum(mass=(2.0, 2.0, 0.0)):
+    """A mass at (x, y), and the angle of its rod, which has none."""
+    return Multibody(
+        mass,
+        lambda q, v, t: np.array([0.0, -2.0 * GRAVITY, 0.0]),
+        lambda q: np.array([q[0] - LENGTH * np.sin(q[2]), q[1] + LENGTH * np.cos(q[2])]),
+        lambda q: np.array([[1.0, 0.0, -LENGTH * np.cos(q[2])], [0.0, 1.0, -LENGTH * np.sin(q[2])]]),
+        curvature=lambda q, v: LENGTH * v[2] ** 2 * np.array([np.sin(q[2]), -np.cos(q[2])]),
+    )
+
+
+def swinging(t):
+    """The angle of a pendulum that was let go at SWING."""
+    k, rate = np.sin(SWING / 2), np.sqrt(GRAVITY / LENGTH)
+    sn, cn, _, _ = ellipj(rate * np.asarray(t) + ellipk(k**2), k**2)
+    return 2 * np.arcsin(k * sn), 2 * rate * k * cn
+
+
+def hung(angle, rate=0.0):
+    q = np.array([LENGTH * np.sin(angle), -LENGTH * np.cos(angle), angle])
+    return q, rate * np.array([LENGTH * np.cos(angle), LENGTH * np.sin(angle), 1.0])
+
+
+def test_coordinates_without_mass():
+    """M is singular, and positive along what the constraints leave free."""
+    times = np.linspace(0, 3, 7)
+    found = pendulum().solve(*hung(SWING), (0, 3), times, rtol=1e-12, atol=1e-13)
+    angle, rate = swinging(times)
+    for k in range(7):
+        q, v = hung(angle[k], rate[k])
+        np.testing.assert_allclose(found.q[k], q, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(found.v[k], v, rtol=0, atol=1e-9)
+    tension = 2.0 * (GRAVITY * np.cos(angle) + LENGTH * rate**2)
+    pull = np.stack([-tension * np.sin(angle), tension * np.cos(angle)], axis=1)
+    np.testing.assert_allclose(found.multipliers, pull, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("method", "order"), [("DOP853", 8), ("RK45", 5), ("RK23", 3)])
+def test_order_is_that_of_the_method(method, order):
+    n = {"DOP853": 40, "RK45": 150, "RK23": 400}[method]
+    errors = []
+    for steps in (n, 2 * n):
+        found = pendulum().solve(*hung(SWING), (0, 1.5), method=method, **steps_of(1.5 / steps))
+        assert found.steps - steps in (0, 1)  # the last may be one of rounding
+        errors.append(np.abs(found.q[-1, 2] - swinging(1.5)[0]))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    ("method", "rtol"), [("DOP853", 1e-9), ("RK45", 1e-8), ("RK23", 1e-5), ("Radau", 1e-7), ("BDF", 1e-6)]
+)
+def test_every_method_stays_on_the_constraints(method, rtol):
+    body = pendulum()
+    found = body.solve(*hung(SWING), (0, 1), method=method, rtol=rtol, atol=0.1 * rtol)
+    assert np.abs(found.q[-1, 2] - swinging(1.0)[0]) < 1e3 * rtol
+    # Where projected velocities differ from those of the method, its next step starts from them.
+    g, slip = np.abs([body.residuals(q, v) for q, v in zip(found.q, found.v, strict=True)]).max(axis=(0, 2))
+    assert g < 1e-15 and slip < 1e-14
+
+
+def test_between_steps_as_well_and_backwards():
+    body = pendulum()
+    times = np.linspace(1, 0, 40)
+    there = body.solve(*hung(SWING), (0, 1), rtol=1e-11, atol=1e-12)
+    back = body.solve(there.q[-1], there.v[-1], (1, 0), times, rtol=1e-11, atol=1e-12)
+    np.testing.assert_array_equal(back.t, times)
+    np.testing.assert_allclose(back.q[:, 2], swinging(times)[0], rtol=0, atol=1e-8)
+    assert max(np.abs(body.residuals(q, v)).max() for q, v in zip(back.q, back.v, strict=True)) < 1e-14
+
+
+def bead(**options):
+    """On a line that turns at rate 2: r = cosh(2 t); the wall pushes with 2 m w r'."""
+    return Multibody(
+        [3.0, 3.0],
+        lambda q, v, t: np.zeros(2),
+        lambda q, t: np.array([q[1] * np.cos(2 * t) - q[0] * np.sin(2 * t)]),
+        time_dependent=True,
+        **options,
+    )
+
+
+def across(q, v, t):
+    return np.array(
+        [-4 * (v[1] * np.sin(2 * t) + v[0] * np.cos(2 * t)) - 4 * (q[1] * np.cos(2 * t) - q[0] * np.sin(2 * t))]
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"jacobian": lambda q, t: np.array([[-np.sin(2 * t), np.cos(2 * t)]]), "curvature": across}],
+    ids=["by differences", "exact"],
+)
+def test_constraints_that_move(options):
+    body = bead(**options)
+    q, v = body.project([1.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(v, [0.0, 2.0], rtol=0, atol=1e-12)
+    found = body.solve(q, v, (0, 1), [0.5, 1.0], rtol=1e-11, atol=1e-12)
+    r, rate = np.cosh(2 * found.t), 2 * np.sinh(2 * found.t)
+    along = np.stack([np.cos(2 * found.t), np.sin(2 * found.t)], axis=1)
+    np.testing.assert_allclose(found.q, r[:, None] * along, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.multipliers[:, 0], 2 * 3.0 * 2 * rate, rtol=1e-8)
+    assert np.abs(body.residuals(found.q[-1], found.v[-1], 1.0)).max() < 1e-14
+
+
+# -- the same motion in other coordinates ------------------------------------------------------------
+
+
+def cartesian_end(constraints, x, v, masses, until):
+    motion = Motion(ConstraintSet(constraints, x, masses), x)
+    gravity = np.array([0.0, -GRAVITY, 0.0]) * np.array(masses)[:, None]
+    system = System(motion, lambda x, t: gravity)
+    *_, end = Extrapolation(1e-12).states(system, State(x, v), until)
+    return end.positions
+
+
+def test_spherical_pendulum_in_angles():
+    """Polar angle from below and azimuth: the mass changes with the place."""
+
+    def force(q, v, t):
+        s, c = np.sin(q[0]), np.cos(q[0])
+        return np.array([s * c * v[1] ** 2 - GRAVITY * s, -2 * s * c * v[0] * v[1]])
+
+    body = Multibody(lambda q: np.diag([1.0, np.sin(q[0]) ** 2]), force)
+    q, v = np.array([1.0, 0.3]), np.array([0.5, 2.0])
+    found = body.solve(q, v, (0, 2), rtol=1e-12, atol=1e-12)
+
+    def place(q):
+        return np.array([[np.sin(q[0]) * np.cos(q[1]), -np.cos(q[0]), np.sin(q[0]) * np.sin(q[1])]])
+
+    a = np.array([np.cos(q[0]) * np.cos(q[1]), np.sin(q[0]), np.cos(q[0]) * np.sin(q[1])])
+    b = np.array([-np.sin(q[0]) * np.sin(q[1]), 0.0, np.sin(q[0]) * np.cos(q[1])])
+    end = cartesian_end([Sphere([0], [0, 0, 0], 1.0)], place(q), (v[0] * a + v[1] * b)[None], [1.0], 2.0)
+    np.testing.assert_allclose(place(found.q[-1]), end, rtol=0, atol=1e-9)
+
+
+def test_double_pendulum_in_angles():
+    """A full matrix that changes with the angles, against two rods."""
+    m, M, l, L = 1.0, 2.0, 0.7, 1.1
+
+    def mass(q):
+        c = m * l * L * np.cos(q[0] - q[1])
+        return np.array([[(m + M) * L**2, c], [c, m * l**2]])
+
+    def force(q, v, t):
+        s = m * l * L * np.sin(q[0] - q[1])
+        weight = GRAVITY * np.array([(m + M) * L * np.sin(q[0]), m * l * np.sin(q[1])])
+        return np.array([-s * v[1] ** 2, s * v[0] ** 2]) - weight
+
+    q = np.array([1.2, -0.4])
+    found = Multibody(mass, force).solve(q, np.zeros(2), (0, 1.5), rtol=1e-12, atol=1e-12)
+
+    def place(q):
+        x = np.zeros((3, 3))
+        x[1] = L * np.sin(q[0]), -L * np.cos(q[0]), 0.0
+        x[2] = x[1] + [l * np.sin(q[1]), -l * np.cos(q[1]), 0.0]
+        return x
+
+    rods = [FixedAtoms([0]), Distance([[0, 1], [1, 2]])]
+    end = cartesian_end(rods, place(q), np.zeros((3, 3)), [0.0, M, m], 1.5)
+    np.testing.assert_allclose(place(found.q[-1]), end, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau"])
+def test_a_linear_change_of_coordinates_changes_nothing(method):
+    """M = T^T D T, g(T y): the same steps, projections in the metric of M included, to rounding."""
+    rng = np.random.default_rng(5)
+    T, D = rng.normal(size=(3, 3)) + 2 * np.eye(3), np.array([1.0, 3.0, 0.5])
+
+    def force(x, v, t):
+        return np.array([0.0, -1.0, 0.3]) - 0.1 * v + np.sin(x)
+
+    def sphere(x):
+        return np.array([x @ x - 1.0, x[0] * x[1] - 0.1 * x[2]])
+
+    def gradient(x):
+        return np.array([2 * x, [x[1], x[0], -0.1]])
+
+    def bend(x, v):
+        return np.array([2 * v @ v, 2 * v[0] * v[1]])
+
+    plain = Multibody(D, force, sphere, gradient, curvature=bend)
+    full = Multibody(
+        T.T @ np.diag(D) @ T,
+        lambda y, w, t: T.T @ force(T @ y, T @ w, t),
+        lambda y: sphere(T @ y),
+        lambda y: gradient(T @ y) @ T,
+        curvature=lambda y, w: bend(T @ y, T @ w),
+    )
+    x, v = plain.project([0.9, 0.2, 0.4], [0.3, 0.5, -0.4])
+    # Radau solves its equations only to the tolerance: there it has to be small.
+    options = steps_of(0.05) if method == "DOP853" else {"rtol": 1e-11, "atol": 1e-12}
+    one = plain.solve(x, v, (0, 2), method=method, **options)
+    other = full.solve(np.linalg.solve(T, x), np.linalg.solve(T, v), (0, 2), method=method, **options)
+    close = 1e-12 if method == "DOP853" else 1e-8
+    np.testing.assert_allclose(other.q[-1] @ T.T, one.q[-1], rtol=0, atol=close)
+    np.testing.assert_allclose(other.multipliers[-1], one.multipliers[-1], rtol=0, atol=100 * close)
+    start = [x + np.array([0.1, -0.2, 0.1]), v + np.array([0.2, 0.0, 0.3])]
+    there, speed = plain.project(*start)
+    here, pace = full.project(*(np.linalg.solve(T, part) for part in start))
+    np.testing.assert_allclose(T @ here, there, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(T @ pace, speed, rtol=0, atol=1e-13)
+
+
+# -- dependent rows ----------------------------------------------------------------------------------
+
+
+def test_dependent_rows_share_the_force():
+    """A parallelogram: three equal rods hold a bar that two would hold; the third row depends on the others."""
+    body_of = {}
+    for feet in ((0.0, 1.0), (0.0, 0.5, 1.0)):
+
+        def rods(q, feet=feet):
+            x, y, turn = q
+            ends = [np.array([x + foot * np.cos(turn), y + foot * np.sin(turn)]) for foot in feet]
+            return np.array(
+                [end @ end - 2 * end[0] * foot + foot**2 - 1.0 for end, foot in zip(ends, feet, strict=True)]
+            )
+
+        body_of[len(feet)] = Multibody(
+            [1.0, 1.0, 0.1], lambda q, v, t: np.array([0.0, -1.0, -0.5]), rods, time_dependent=False
+        )
+    q, v = np.array([np.sin(0.5), -np.cos(0.5), 0.0]), np.array([np.cos(0.5), np.sin(0.5), 0.0])
+    two, three = (body_of[k].solve(q, v, (0, 1), [1.0]) for k in (2, 3))
+    assert body_of[3].degrees_of_freedom(q) == 1
+    np.testing.assert_allclose(three.q, two.q, rtol=0, atol=1e-8)
+    assert np.abs(body_of[3].constraints(three.q[0])).max() < 1e-15
+    # Both ways make the same forces; the shorter multipliers are those found.
+    G = body_of[3]._G(three.q[0], 1.0)
+    np.testing.assert_allclose(three.multipliers @ G, two.multipliers @ G[[0, 2]], rtol=0, atol=1e-7)
+    null = np.array([1.0, -2.0, 1.0])
+    assert abs(three.multipliers[0] @ null) < 1e-8 and np.abs(null @ G).max() < 1e-8
+
+
+def test_dependent_rows_that_disagree_are_refused():
+    body = Multibody(
+        [1.0, 1.0],
+        lambda q, v, t: np.zeros(2),
+        lambda q, t: np.array([q[0] - t, q[0] - 2 * t]),
+        time_dependent=True,
+    )
+    with pytest.raises(ContradictionError, match="Remove one of them"):
+        body.project([0.0, 0.0], [1.0, 0.0])
+
+
+# -- what is refused ---------------------------------------------------------------------------------
+
+
+def test_a_start_off_the_constraints_is_refused_and_can_be_mended():
+    body, (q, v) = pendulum(), hung(SWING)
+    off, slip = q + np.array([0.0, 0.01, 0.0]), v + np.array([0.1, 0.0, 0.0])
+    with pytest.raises(ConstraintError, match=r"constraint 1 is off by 0\.009.*body\.project") as caught:
+        body.solve(off, v, (0, 1))
+    assert caught.value.rows == (1,)
+    with pytest.raises(ConstraintError, match="constraint 0 is left by the velocities") as caught:
+        body.solve(q, slip, (0, 1))
+    place, speed = body.project(off, slip)
+    body.solve(place, speed, (0, 0.1))
+    # The smallest correction in the metric of M: orthogonal to what may move.
+    free = np.array([LENGTH * np.cos(place[2]), LENGTH * np.sin(place[2]), 1.0])
+    assert abs(free @ np.diag([2.0, 2.0, 0.0]) @ (slip - speed)) < 1e-15
+
+
+def test_no_mass_where_something_moves():
+    with pytest.raises(
+        SingularGeometryError, match=r"not positive along .* give the coordinates that move there a mass"
+    ):
+        pendulum((0.0, 0.0, 0.0)).solve(*hung(SWING), (0, 1))
+    indefinite = np.diag([2.0, 2.0, -5.0])
+    with pytest.raises(SingularGeometryError, match="not positive"):
+        pendulum(indefinite).motion(*hung(SWING))
+
+
+def test_a_crossing_of_two_ways_is_passed_straight_on():
+    """Where the planes z = 0 and z = x y touch, rows depend: the step that ends there is made shorter."""
+    body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), lambda q: np.array([q[2], q[2] - q[0] * q[1]]))
+    found = body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3), **steps_of(0.25))
+    np.testing.assert_allclose(found.q[-1], [2.0, 0.0, 0.0], rtol=0, atol=1e-12)
+    assert found.steps > 12
+    with pytest.raises(SingularGeometryError, match="only 1 constraints are independent, and 2 at the start"):
+        body._place(np.zeros(3), 0.0, 2)
+
+
+def test_a_constraint_that_ends_on_the_way_is_told():
+    def until_zero(q):
+        return np.array([min(q[0], 0.0) ** 4 * q[1], q[2]])
+
+    body = Multibody(np.ones(3), lambda q, v, t: np.zeros(3), until_zero)
+    with pytest.raises(
+        SingularGeometryError, match=r"at t = 1.* only 1 constraints are independent, and 2 at the start"
+    ):
+        body.solve([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], (0, 3))
+
+
+def test_positions_that_cannot_be_met():
+    body = Multibody([1.0, 1.0], lambda q, v, t: np.zeros(2), lambda q: np.array([q @ q + 1.0]))
+    with pytest.raises(ConvergenceError, match="constraint 0 stays off") as caught:
+        body.project([1.0, 0.5], [0.0, 0.0])
+    assert caught.value.row == 0 and caught.value.residual > 0.1
+
+
+def test_trial_steps_may_go_too_far():
+    """A force with an edge that the motion never reaches, and one that it does."""
+
+    def force(q, v, t):
+        with np.errstate(all="ignore"):
+            return -0.5 / np.sqrt(q)  # x = sqrt(1 - 2 t^2...) reaches 0 with infinite force
+
+    body = Multibody([1.0], force)
+    with pytest.raises(NonFiniteError, match="force is not finite at q"):
+        body.solve([1.0], [-1.0], (0, 10), first_step=1.5)
+
+    def wall(q, v, t):
+        with np.errstate(all="ignore"):
+            return 1e-3 / np.where(q > 0, q, np.nan) ** 2
+
+    found = Multibody([1.0], wall).solve([1.0], [-1.0], (0, 2.5), first_step=1.5)
+    energy = 0.5 * found.v[:, 0] ** 2 + 1e-3 / found.q[:, 0]
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+
+
+def test_steps_that_become_too_small():
+    body = Multibody([1.0], lambda q, v, t: v**2)  # v = 1 / (1 - t)
+    with pytest.raises(ConvergenceError, match=r"the run ended at t = (0\.9|1:).*Stiff forces: method='Radau'"):
+        body.solve([0.0], [1.0], (0, 2))
+
+
+@pytest.mark.parametrize(
+    ("change", "item"),
+    [
+        ({"q": [0.0, 0.0]}, "q"),
+        ({"q": [0.0, -LENGTH, np.nan]}, "q"),
+        ({"v": [0.0, np.inf, 0.0]}, "v"),
+        ({"v": np.zeros((3, 1))}, "v"),
+        ({"t_span": (0, np.nan)}, "t_span"),
+        ({"t_eval": [2.0]}, "t_eval"),
+        ({"method": "Euler"}, "method"),
+    ],
+)
+def test_bad_arguments_are_named(change, item):
+    q, v = hung(0.0)
+    arguments = {"q": q, "v": v, "t_span": (0, 1)} | change
+    with pytest.raises(InputError) as caught:
+        pendulum().solve(**arguments)
+    assert caught.value.item == item

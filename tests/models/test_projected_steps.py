@@ -1,0 +1,50 @@
+"""SciPy's integrators with a projection after each step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.models.projected_steps import METHODS, projecting, solver_of, span_of, times_of
+
+
+def turn(t, y):
+    return np.array([-y[1], y[0]])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_next_step_starts_from_the_projection(method):
+    seen = []
+
+    def project(t, y):
+        seen.append(y / np.linalg.norm(y))
+        return seen[-1]
+
+    found = solve_ivp(turn, (0, 2), [1.0, 0.0], projecting(solver_of(method), project), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(found.y[:, 1:].T, seen)
+    np.testing.assert_allclose(found.y[:, -1], [np.cos(2), np.sin(2)], rtol=0, atol=1e-3)
+    # What projects to another place moves the rest of the run.
+    moved = solve_ivp(turn, (0, 2), [1.0, 0.0], projecting(solver_of(method), lambda t, y: 2 * y / np.linalg.norm(y)))
+    np.testing.assert_allclose(np.linalg.norm(moved.y[:, 1:], axis=0), 2.0, rtol=1e-15)
+
+
+def test_a_motion_that_has_settled_ends():
+    stepper = projecting(METHODS["RK45"], lambda t, y: y, lambda t, y: t > 0.5)
+    found = solve_ivp(turn, (0, 2), [1.0, 0.0], stepper, max_step=0.1)
+    assert 0.5 < found.t[-1] < 0.7 and found.success
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(InputError, match="choose from RK23"):
+        solver_of("Euler")
+    with pytest.raises(UnsupportedError, match="use 'Radau' or 'BDF'"):
+        solver_of("LSODA")
+    for span in (3.0, (0.0, np.inf), (0.0, 1.0, 2.0), ("a", "b")):
+        with pytest.raises(InputError, match="t_span"):
+            span_of(span)
+    for times in ([0.0, 2.0], [0.5, 0.2], [[0.5]], [np.nan], [0.5, 0.5]):
+        with pytest.raises(InputError, match="t_eval"):
+            times_of(times, 0.0, 1.0)
+    np.testing.assert_array_equal(times_of([0.7, 0.2], 1.0, 0.0), [0.7, 0.2])
