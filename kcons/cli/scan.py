@@ -39,8 +39,8 @@ def add(commands: Any) -> None:
         help="minima of the energy with one or two coordinates held at given values",
         description="A relaxed scan: distances, angles or dihedrals are held exactly at each of their values, all else "
         "is relaxed, from all neighbouring points (torsions are driven both ways). Atoms are counted from 0, unless "
-        "--count-from 1 is given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; 2 "
-        "for wrong use, or if no point succeeded; 3 if some points failed.",
+        "--count-from 1 is given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; "
+        "2 for wrong use, or if no point succeeded; 3 if some points failed.",
     )
     scan.add_argument("structure", type=Path, help="any file that ASE reads; its last structure")
     for family, size in FAMILIES.items():
@@ -75,7 +75,7 @@ def add(commands: Any) -> None:
     forces.add_argument(
         "--calculator",
         default="gfn2",
-        help="gfn2 (default) or gfn1, by tblite; emt, lj, ...: a calculator of ASE by name; MODULE:NAME: what makes one; "
+        help="gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
         "FILE.xml: a System of OpenMM, with what it constrains",
     )
     forces.add_argument("--settings", default="{}", metavar="JSON", help="such as '{\"charge\": 1}', for what makes it")
@@ -170,9 +170,10 @@ def _structure(path: Path) -> Atoms:
     if not path.is_file():
         raise InputError(f"there is no file {path}", item="structure")
     try:
-        return ase.io.read(path)
+        found: Any = ase.io.read(path)
     except Exception as error:
         raise InputError(f"ASE cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
+    return found
 
 
 def _settings(given: str) -> dict[str, Any]:
@@ -207,8 +208,8 @@ def _calculator(name: str, settings: dict[str, Any]) -> Any:
         raise
     except Exception as error:
         raise InputError(
-            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, those "
-            "of ASE by name, MODULE:NAME, and FILE.xml for a System of OpenMM",
+            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, "
+            "those of ASE by name, MODULE:NAME, and FILE.xml for a System of OpenMM",
             item="calculator",
         ) from error
 
