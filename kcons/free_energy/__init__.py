@@ -4,6 +4,7 @@
 - `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `profiles`: free energies from mean forces, and where to sample next
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 - `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
@@ -19,6 +20,7 @@ _NAMES = {
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
+    "profiles.profile": ("Profile", "integrate"),
     "relaxed_scan": ("Scan", "scan"),
     "system_calculator": ("SystemCalculator",),
 }
