@@ -6,9 +6,9 @@
 
 With --full (needs tblite, geometric and sella, from the package index) every torsion is scanned at 24 values. Each of
 the three programs relaxes each point from the same structure, that of the neighbouring point with the group beyond the
-bond turned, until no force along the constraint is larger than FMAX on any atom; geomeTRIC's other criteria are off, all
-else is left as its authors set it. Counted are calls of energy and forces. geomeTRIC also runs a scan of its own, in
-which each point begins from the last one. Counts and energies depend on the machine by rounding only.
+bond turned, until no force along the constraint is larger than FMAX on any atom; geomeTRIC's other criteria are off,
+all else is left as its authors set it. Counted are calls of energy and forces. geomeTRIC also runs a scan of its own,
+in which each point begins from the last one. Counts and energies depend on the machine by rounding only.
 """
 
 from __future__ import annotations
