@@ -1,9 +1,12 @@
 """Free energies along held coordinates, and relaxed scans.
 
 - `held_coordinates`, `series`: multipliers and Z by name, and samples of them
+- `ase_recorder`, `openmm_reporter`: recording in ASE's and OpenMM's runs
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
+- `profiles`: free energies from mean forces, and where to sample next
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
+- `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
 
 from importlib import import_module
@@ -14,8 +17,12 @@ _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
     "series": ("Recorder", "Series"),
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
+    "ase_recorder": ("AseRecorder",),
+    "openmm_reporter": ("HeldCoordinatesReporter",),
     "averages": ("Mean", "weighted_mean"),
+    "profiles.profile": ("Profile", "integrate"),
     "relaxed_scan": ("Scan", "scan"),
+    "system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)

@@ -115,7 +115,7 @@ def mean_force(
     moved = value - value[0]
     turns = kept.periods > 0
     moved[:, turns] -= kept.periods[turns] * np.round(moved[:, turns] / kept.periods[turns])
-    allowed = 1e-6 * np.maximum(np.abs(value[0]), 1.0)
+    allowed = 1e-5 * np.maximum(np.abs(value[0]), 1.0)
     if np.any(np.abs(moved) > allowed):
         name = kept.names[int(np.argmax((np.abs(moved) > allowed).any(axis=0)))]
         raise InputError(

@@ -152,6 +152,12 @@ def hold(
 # -- what the System holds ------------------------------------------------------------------------
 
 
+def constraints_about(system: openmm.System, atoms: IntArray) -> list[Constraint]:
+    """The constraints of a System in the clusters of some atoms, as a `Distance` in nm; the System keeps them."""
+    table = _table(system)
+    return _as_rows(table, _sharing(table, atoms), angles=False)
+
+
 @dataclass
 class _Table:
     """The constraints of a System: pairs (n, 2), lengths in nm (n,), and cluster number of each particle."""

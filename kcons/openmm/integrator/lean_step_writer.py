@@ -151,18 +151,22 @@ class LeanStepWriter(StepWriter):
                 p.let("behind", "select(moved+abs(dt-dt_last), 0, behind)", "then v is what it is")
                 p.each("v_last", "v", "to come back to")
                 p.each("v", "select(behind, raw, v)", "go on as if nobody had looked")
-            with p.when("first_stage = 0", "a step"):
-                p.let_others_act()
-            with p.when("looked != 0", "forces may be known"):
+                with p.when("first_stage = 0", "a step"):
+                    p.let_others_act()
                 p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
                 with p.when("moved+stale != 0", "others did"):
                     p.each("x_last", "x", "start here")
                     p.each("force", "f", "applied forces")
-                p.each("u", "v+select(behind, 1, kick_share(first_stage))*dt*force/m", "the applied forces act (kick)")
-                with p.when("moved+stale != 0", "others did"):
+                    across = any(part.meets_system for part in self.parts)
+                    if across:
+                        p.each("u", "v", "v is needed to project the rows")
                     for part in self.parts:
                         part.begin(p)
+                    if across:
+                        p.each("v", "u", "v again")
+                p.each("u", "v+select(behind, 1, kick_share(first_stage))*dt*force/m", "the applied forces act (kick)")
             with p.when("looked = 0", "in the middle of many steps"):
+                p.let_others_act()
                 p.each("x_last", "x", "to come back to")
                 p.each("u", "v+dt*f/m", "the applied forces act (both half kicks)")
                 for part in self.parts:
@@ -183,8 +187,17 @@ class LeanStepWriter(StepWriter):
                 p.each("v", "raw+dt*kick_share(stage)*force/m", "the applied forces act (kick)")
                 self._project()
                 p.let("behind", "0", "unless all is well")
-            with p.when("failed = 0", "all solves converged"):
-                self._finish()
+                p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+                p.each("v_last", "select(failed, v_last, v)", "to see whether others change it")
+            with p.when("select(failed, 0, between) != 0", "nobody looks"):
+                if not self.single:
+                    p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
+                for part in self.parts:
+                    part.passed(p)
+            # Without blocks: the set-up of OpenMM goes along each way through them.
+            p.let("good_steps", "good_steps+delta(failed)", "count it if all solves converged")
+            p.let("behind", "select(failed, behind, lean)", "v, or raw, lacks half a kick")
+            p.let("looked", "select(failed, looked, 1-between)", "does somebody look?")
             with p.when("failed != 0", "a solve failed"):
                 p.each("x", "x_last", "back to where the step began")
                 p.each("v", "select(looked, v_last, u-0.5*dt*f/m)", "back to where the step began")
@@ -192,20 +205,6 @@ class LeanStepWriter(StepWriter):
                 p.let("behind", "select(looked, behind, 0)", "can it go on as if nobody had looked?")
                 p.let("looked", "1", "somebody does")
                 p.let("stale", "1", "forces are those of elsewhere")
-
-    def _finish(self) -> None:
-        p = self.program
-        p.let("good_steps", "good_steps+1", "count it")
-        p.let("behind", "lean", "v, or raw, lacks half a kick")
-        p.let("looked", "1-between", "does somebody look?")
-        with p.when("looked = 0", "nobody does"):
-            if not self.single:
-                p.each("v", "u+per_h*(x-xu)", "the constraint forces act on v as well")
-            for part in self.parts:
-                part.passed(p)
-        with p.when("looked != 0", "somebody does"):
-            p.each("x_last", "x", "where forces were computed")
-            p.each("v_last", "v", "to see whether others change it")
 
     def _drift_with(self, u: str, h: str) -> None:
         p = self.program

@@ -211,3 +211,21 @@ def test_leapfrog_at_rest_has_no_kinetic_energy(platform):
     assert np.abs(v).max() <= 1e-10
     # A kick of half a step alone is (0.01 100/4/2)^2 4 = 0.06 kJ/mol.
     assert context.getState(energy=True).getKineticEnergy()._value <= 1e-10
+
+
+def ways(program):
+    """Through its blocks, each left out or gone through once: what OpenMM lists when a Context is first used."""
+    outer, here = [], 1
+    for kind, _, _ in program.operations:
+        if kind in ("when", "usual", "loop"):
+            outer.append(here)
+            here = 1
+        elif kind == "end":
+            here = outer.pop() * (1 + here)
+    return here
+
+
+@pytest.mark.parametrize(("kind", "most"), [("row", 601), ("moving row", 601), ("carried", 181), ("part", 161)])
+def test_few_ways_through_the_program(kind, most):
+    """The set-up of a Context takes time for each."""
+    assert ways(held(kind)[0].program) <= most

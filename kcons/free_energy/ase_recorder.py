@@ -1,0 +1,100 @@
+"""Held coordinates recorded in ASE's dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from ase.md.md import MolecularDynamics
+
+from kcons.ase import ConstrainedDynamics, Constraints
+from kcons.constraints import Constraint
+from kcons.errors import InputError
+from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
+from kcons.free_energy.series import Series
+from kcons.motion.motion import Motion
+
+
+class AseRecorder:
+    """An observer of ASE's dynamics that keeps a `Series`, and shows the last sample on the atoms.
+
+    Attach it before whatever writes the trajectory, at the same interval. ``atoms.info`` then has each coordinate by
+    its name, ``"multiplier of <name>"`` and ``"ln det Z"``, which trajectories and extended XYZ files keep.
+
+    Parameters
+    ----------
+    dynamics : MolecularDynamics
+        Of kcons, or another one of ASE whose atoms carry a `kcons.ase.Constraints`. Times are in ASE's unit,
+        multipliers in eV by the unit of the coordinate.
+    coordinates : mapping of str to Constraint
+        As for `HeldCoordinates`.
+    constraint_forces : bool
+        Whether ``atoms.arrays["constraint_forces"]`` (eV/angstrom) is written too. Takes a solve of all rows.
+
+    Attributes
+    ----------
+    series : Series
+
+    Raises
+    ------
+    InputError
+        The atoms carry no constraints of kcons, or do not hold a coordinate.
+
+    Examples
+    --------
+    ``dynamics.attach(AseRecorder(dynamics, {"torsion": torsion}), interval=10)``
+    """
+
+    def __init__(
+        self,
+        dynamics: MolecularDynamics,
+        coordinates: Mapping[str, Constraint],
+        *,
+        constraint_forces: bool = False,
+    ) -> None:
+        self.dynamics = dynamics
+        self.coordinates = dict(coordinates)
+        self.constraint_forces = constraint_forces
+        self._motion = self._engine()
+        self._held = HeldCoordinates(self._motion, self.coordinates, dynamics.atoms.positions, time=dynamics.get_time())
+        self.series = Series(self._held.names, self._held.periods)
+        self.last: Sample | None = None
+
+    def _engine(self) -> Motion:
+        if isinstance(self.dynamics, ConstrainedDynamics):
+            return self.dynamics.motion
+        atoms = self.dynamics.atoms
+        found = [item for item in atoms.constraints if isinstance(item, Constraints)]
+        if len(found) != 1:
+            raise InputError(
+                f"the atoms carry {len(found) or 'no'} kcons.ase.Constraints objects; a coordinate is held by one "
+                "(kcons.ase.constrain), or by a dynamics class of kcons",
+                item="dynamics",
+            )
+        return found[0].engine(atoms)
+
+    def __call__(self) -> None:
+        atoms, time = self.dynamics.atoms, self.dynamics.get_time()
+        motion = self._engine()
+        if motion is not self._motion:  # masses, constraints or periodicity were changed
+            self._held = HeldCoordinates(motion, self.coordinates, atoms.positions, time=time)
+            self._motion = motion
+        forces = None
+        if isinstance(self.dynamics, ConstrainedDynamics):
+            forces = self.dynamics.state.forces
+        if forces is None:
+            forces = atoms.get_forces(apply_constraint=False)
+        x, v = atoms.positions, atoms.get_velocities()
+        self.last = self._held.sample(x, v, forces, time)
+        self.series.append(self.last)
+        for k, name in enumerate(self._held.names):
+            atoms.info[name] = float(self.last.value[k])
+            atoms.info[f"multiplier of {name}"] = float(self.last.multiplier[k])
+        atoms.info["ln det Z"] = self.last.log_det_z
+        if self.constraint_forces:
+            atoms.set_array("constraint_forces", motion.constraint_force(x, v, np.asarray(forces), time))
+
+    @property
+    def multipliers(self) -> dict[str, float]:
+        """Those of the last sample, by name."""
+        return {} if self.last is None else dict(zip(self._held.names, self.last.multiplier.tolist(), strict=True))

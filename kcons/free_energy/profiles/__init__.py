@@ -1,0 +1,5 @@
+"""Free energies from mean forces.
+
+- `gaussian_process`: a free energy learned from its gradient
+- `profile`: in one coordinate, and where to sample next
+"""

@@ -1,0 +1,162 @@
+"""Coordinates reported from OpenMM, however they are held."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app, unit
+from openmm_systems import DATA
+
+from kcons.constraints import Angle, Dihedral, Distance, MovingTarget
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy import HeldCoordinatesReporter, local_mean_force
+from kcons.openmm import CollectiveRows, Langevin, ProjectedIntegrator, Row, hold
+
+PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+FIELD = app.ForceField("amber14-all.xml", "implicit/gbn2.xml")
+PHI = [4, 6, 8, 14]
+
+
+def torsion(atoms=PHI):
+    force = openmm.CustomTorsionForce("theta")
+    force.addTorsion(*atoms, [])
+    return force
+
+
+def simulation_of(system, integrator, positions=PDB.positions):
+    simulation = app.Simulation(PDB.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(positions)
+    simulation.context.setVelocitiesToTemperature(300 * unit.kelvin, 3)
+    integrator.applyConstraints() if isinstance(integrator, ProjectedIntegrator) else None
+    integrator.applyVelocityConstraints() if isinstance(integrator, ProjectedIntegrator) else None
+    return simulation
+
+
+def peptide(constraints=app.HBonds):
+    return FIELD.createSystem(PDB.topology, constraints=constraints, removeCMMotion=False)
+
+
+@pytest.mark.parametrize("bonds", [app.HBonds, app.AllBonds], ids=["HBonds", "AllBonds"])
+def test_a_torsion_held_as_a_collective_variable(bonds):
+    """Multipliers are those that the rows compute by evaluations of their own."""
+    system = peptide(bonds)
+    rows = CollectiveRows(system, [torsion()], positions=PDB.positions)
+    integrator = ProjectedIntegrator(0.002, parts=[rows], ensemble=Langevin(300, 5))
+    integrator.setRandomNumberSeed(1)
+    simulation = simulation_of(system, integrator)
+    file = io.StringIO()
+    reporter = HeldCoordinatesReporter(file, 5, {"phi": Dihedral([PHI])})
+    simulation.reporters.append(reporter)
+    for _ in range(4):
+        simulation.step(5)
+        assert reporter.series.multiplier[-1, 0] == pytest.approx(rows.multipliers_at(simulation.context)[0], rel=1e-6)
+    simulation.step(80)
+    assert len(reporter.series) == 20
+    assert reporter.series.off.max() < 1e-10
+    lines = list(csv.reader(io.StringIO(file.getvalue())))
+    assert lines[0] == ['#"Step"', "Time (ps)", "phi", "multiplier of phi", "ln det Z", "work (kJ/mol)"]
+    assert [int(line[0]) for line in lines[1:]] == list(range(5, 101, 5))
+    assert float(lines[-1][3]) == pytest.approx(reporter.series.of("phi")[-1], rel=1e-10)
+    assert np.isfinite(local_mean_force(reporter.series, 2.49)).all()
+    if bonds is app.AllBonds:
+        assert abs(reporter.series.gradient).max() > 1e-3
+
+
+def test_the_same_coordinate_held_in_three_ways(tmp_path):
+    """By the System, as a collective variable, and by `hold`: one multiplier at one configuration."""
+    pair, angle = [8, 14], [6, 8, 14]
+    x = np.array(PDB.positions.value_in_unit(unit.nanometer))
+    found = {}
+    for way in ("System", "collective", "hold"):
+        system = peptide(app.HBonds)
+        parts = []
+        length = float(np.linalg.norm(x[pair[0]] - x[pair[1]]))
+        bend = openmm.CustomAngleForce("theta")
+        bend.addAngle(*angle, [])
+        if way == "System":
+            system.addConstraint(*pair, length)
+            parts = [CollectiveRows(system, [bend], positions=x)]
+        elif way == "collective":
+            bond = openmm.CustomBondForce("r")
+            bond.addBond(*pair, [])
+            parts = [CollectiveRows(system, [bond, bend], positions=x)]
+        else:
+            parts = [hold(system, [Distance([pair], length), Angle([angle])], x)]
+        integrator = ProjectedIntegrator(1e-6, parts=parts)
+        simulation = simulation_of(system, integrator, x)
+        simulation.context.setVelocities(np.zeros_like(x))
+        reporter = HeldCoordinatesReporter(
+            str(tmp_path / f"{way}.csv"), 1, {"bond": Distance([pair]), "angle": Angle([angle])}
+        )
+        simulation.reporters.append(reporter)
+        simulation.step(1)
+        found[way] = [reporter.series.multiplier[0], reporter.series.gradient[0], reporter.series.log_det_z[0]]
+    for way in ("collective", "hold"):
+        for one, other in zip(found["System"], found[way], strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_work_of_a_pulled_torsion():
+    """What moving the target adds to the energy: the sum of `CollectiveRows.work`, to second order."""
+    system = peptide()
+    rows = CollectiveRows(system, [Row(torsion(), rate=2.0)], positions=PDB.positions)
+    integrator = ProjectedIntegrator(0.0005, parts=[rows])
+    simulation = simulation_of(system, integrator)
+    reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI], MovingTarget(lambda t: 2.0 * t))})
+    simulation.reporters.append(reporter)
+    simulation.step(1)
+    start = rows.work(integrator)[0]
+    simulation.step(200)
+    gained = rows.work(integrator)[0] - start
+    assert reporter.series.work[-1] == pytest.approx(gained, rel=2e-3) and abs(gained) > 0.1
+
+
+def test_files_are_gone_on_with(tmp_path):
+    file = tmp_path / "held.csv"
+    for append in (False, True):
+        system = peptide()
+        rows = CollectiveRows(system, [torsion()], positions=PDB.positions)
+        simulation = simulation_of(system, ProjectedIntegrator(0.001, parts=[rows]))
+        simulation.reporters.append(HeldCoordinatesReporter(file, 2, {"phi": Dihedral([PHI])}, append=append))
+        simulation.step(4)
+    lines = file.read_text().splitlines()
+    assert [line.split(",")[0] for line in lines] == ['#"Step"', "2", "4", "2", "4"]
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match="reportInterval is 0"):
+        HeldCoordinatesReporter(io.StringIO(), 0, {"phi": Dihedral([PHI])})
+    system = peptide()
+    psi = [6, 8, 14, 16]
+    rows = CollectiveRows(system, [torsion(), torsion(psi)], positions=PDB.positions)
+    simulation = simulation_of(system, ProjectedIntegrator(0.001, parts=[rows]))
+    simulation.reporters.append(HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI])}))
+    with pytest.raises(InputError, match=r"holds 2 rows, and 1 are named.*beside"):
+        simulation.step(1)
+    simulation.reporters = [
+        HeldCoordinatesReporter(io.StringIO(), 1, {"phi": Dihedral([PHI])}, beside=[Dihedral([psi])])
+    ]
+    simulation.step(1)
+    assert len(simulation.reporters[0].series) == 1
+    simulation.reporters = [
+        HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 99]])}, beside=[Dihedral([psi])])
+    ]
+    with pytest.raises(InputError, match="no atom 99"):
+        simulation.step(1)
+    system = openmm.System()
+    for mass in (16.0, 1.0, 1.0, 0.0):
+        system.addParticle(mass)
+    system.setVirtualSite(3, openmm.ThreeParticleAverageSite(0, 1, 2, 0.8, 0.1, 0.1))
+    topology = app.Topology()
+    residue = topology.addResidue("HOH", topology.addChain())
+    for name in "OHHM":
+        topology.addAtom(name, None, residue)
+    simulation = app.Simulation(topology, system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatform(0))
+    simulation.context.setPositions([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0)])
+    simulation.reporters.append(HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[0, 3]], 0.1)}))
+    with pytest.raises(UnsupportedError, match="virtual site"):
+        simulation.step(1)
