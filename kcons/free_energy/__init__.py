@@ -6,6 +6,7 @@
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
+- `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
 
 from importlib import import_module
@@ -22,6 +23,7 @@ _NAMES = {
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "relaxed_scan": ("Scan", "scan"),
+    "system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)
