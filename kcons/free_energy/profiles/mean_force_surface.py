@@ -93,7 +93,7 @@ class Surface:
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        values, c = self._process.posterior((self._places([a, b]), [-1]))
+        values, c = self._process.posterior((self._places(np.stack([numbers(a, "a"), numbers(b, "b")])), [-1]))
         return Estimate(float(values[1] - values[0]), math.sqrt(max(float(c[0, 0] + c[1, 1] - 2 * c[0, 1]), 0.0)))
 
     def minima(self) -> list[Minimum]:
@@ -259,9 +259,9 @@ def _checked(
     covariances = given if given.ndim == 3 else given[:, :, None] ** 2 * np.eye(d)
     sizes = np.linalg.eigvalsh(covariances)
     skew = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
-    wrong = np.flatnonzero((sizes[:, 0] < -1e-9 * np.abs(sizes[:, -1])) | (skew > 1e-9 * np.abs(sizes).max(axis=1)))
-    if len(wrong):
-        raise InputError(f"the covariance of window {wrong[0]} is not symmetric and positive", item="errors")
+    bad = np.flatnonzero((sizes[:, 0] < -1e-9 * np.abs(sizes[:, -1])) | (skew > 1e-9 * np.abs(sizes).max(axis=1)))
+    if len(bad):
+        raise InputError(f"the covariance of window {bad[0]} is not symmetric and positive", item="errors")
     turns = (None,) * d if periods is None else tuple(periods)
     if len(turns) != d or any(p is not None and not p > 0 for p in turns):
         raise InputError(f"periods must be {d} positive numbers or None", item="periods")
