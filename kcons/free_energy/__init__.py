@@ -7,6 +7,7 @@
 - `profiles`: free energies from mean forces, and where to sample next
 - `windows`: many windows, by any executor
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
+- `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
 
 from importlib import import_module
@@ -25,7 +26,9 @@ _NAMES = {
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "averages": ("Mean", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
+    "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "relaxed_scan": ("Scan", "scan"),
+    "system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)

@@ -2,4 +2,5 @@
 
 - `gaussian_process`: a free energy learned from its gradient
 - `profile`: in one coordinate, and where to sample next
+- `mean_force_surface`: in several coordinates
 """
