@@ -185,6 +185,11 @@ class Windows:
         with in_one_piece(known) as opened:
             opened.write(text(mine).encode())
 
+    @property
+    def angles(self) -> list[bool]:
+        """Which coordinates are angles."""
+        return [bool(angle) for angle in self.sampler.angles]
+
     # -- running --------------------------------------------------------------------------------
 
     def run(
@@ -331,16 +336,15 @@ class Windows:
                 if not self.file(job).exists():
                     continue
                 try:
-                    sides[job.side] = mean_force(Series.load(self.file(job)), kT)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
+                        sides[job.side] = mean_force(Series.load(self.file(job)), kT)
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
                 found.append(_together(number, np.array(target), sides, self.sampler.kJ, self.sampler.scales))
         found.sort(key=lambda w: w.value.tolist())
-        result = FreeEnergy(self.sampler.names, self.periods, found, problems)
-        with in_one_piece(self.folder / "free_energy.json") as opened:
-            opened.write(text(result.numbers()).encode())
-        return result
+        return FreeEnergy(self.sampler.names, self.periods, found, problems)
 
 
 def _together(
@@ -390,4 +394,3 @@ def _processes(workers: int, jobs: int) -> ProcessPoolExecutor:
 def _one_thread() -> None:
     for name in ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    warnings.filterwarnings("ignore", message=".*worth .* independent ones.*")
