@@ -19,9 +19,10 @@ _NAMES = {
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
-    "averages": ("Mean", "weighted_mean"),
+    "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
+    "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
     "relaxed_scan": ("Scan", "scan"),
     "system_calculator": ("SystemCalculator",),
 }
