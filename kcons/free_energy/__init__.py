@@ -5,6 +5,7 @@
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
+- `windows`: many windows, by any executor
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 - `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
@@ -19,6 +20,10 @@ _NAMES = {
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
+    "windows.window": ("Settings", "Window"),
+    "windows.ase_windows": ("AseWindows",),
+    "windows.openmm_windows": ("OpenMMWindows",),
+    "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
