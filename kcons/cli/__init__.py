@@ -1,6 +1,6 @@
 """The command `kcons`.
 
 - `terminal`, `progress`: what is written to the terminal
-- `check`, `studies`, `warmup`: `kcons check`, `kcons hardcases`, `kcons stability`, `kcons warmup`
+- `check`, `scan`, `studies`, `warmup`: `kcons check`, `scan`, `hardcases`, `stability`, `warmup`
 - `main`: all others
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OccupiedError, UnreadableError
 from kcons.free_energy.grid import Grid, Point
+from kcons.steppers.files import in_one_piece, stored_arrays, text
 
 #: What is in a folder: the plan of the scan, and its relaxations.
 PLAN, PLACE = "plan.json", "relaxations"
@@ -99,7 +99,8 @@ class Attempts:
         if place.exists():
             _refuse_another(place, plan)
         (folder / PLACE).mkdir(parents=True, exist_ok=True)
-        _write(place, json.dumps(plan, indent=1).encode())
+        with in_one_piece(place) as file:
+            file.write(text(plan).encode())
 
     def _file(self, number: int) -> Path:
         assert self.folder is not None
@@ -116,13 +117,14 @@ class Attempts:
         if self.folder is None or not self._file(number).exists():
             return None
         try:
-            with self._file(number).open("rb") as file, np.load(file) as data:
-                head = json.loads(str(data["head"]))
-                found = Attempt(number, point, source, data["positions"], error=head["error"], memory=data["memory"])
-                found.terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
-                found.energy, found.largest = (float(v) for v in data["numbers"])
-                found.evaluations = head["evaluations"]
-                same = (tuple(head["point"]), head["source"]) == (point, source)
+            with self._file(number).open("rb") as file:
+                data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
+            head = json.loads(str(data["head"]))
+            found = Attempt(number, point, source, data["positions"], error=head["error"], memory=data["memory"])
+            found.terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
+            found.energy, found.largest = (float(v) for v in data["numbers"])
+            found.evaluations = head["evaluations"]
+            same = (tuple(head["point"]), head["source"]) == (point, source)
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise UnreadableError(f"{self._file(number)} cannot be read ({error}); remove it", item="folder") from error
         if not same:
@@ -142,9 +144,7 @@ class Attempts:
         terms = np.full((len(attempt.terms), 5), _NONE, dtype=np.int64)
         for row, term in zip(terms, attempt.terms, strict=True):
             row[: len(term)] = term
-        place = self._file(attempt.number)
-        part = place.with_suffix(".part")
-        with part.open("wb") as file:
+        with in_one_piece(self._file(attempt.number)) as file:
             np.savez(
                 file,
                 head=np.array(json.dumps(head)),
@@ -153,9 +153,6 @@ class Attempts:
                 memory=attempt.memory,
                 terms=terms,
             )
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, place)
 
 
 def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
@@ -175,12 +172,3 @@ def _refuse_another(place: Path, plan: Mapping[str, Any]) -> None:
         raise OccupiedError(
             f"{place.parent} has another scan in it ({', '.join(wrong)} differ); take another folder", item="folder"
         )
-
-
-def _write(place: Path, content: bytes) -> None:
-    part = place.with_suffix(".part")
-    with part.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, place)

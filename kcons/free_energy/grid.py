@@ -61,6 +61,12 @@ class Grid:
         return [item.row_name(0) for item in self.coordinates]
 
     @property
+    def keys(self) -> list[str]:
+        """Names without blanks for files: 'dihedral_0_1_2_3'."""
+        found = ["_".join([item.family.lower(), *map(str, item.atoms[0].tolist()[:6])]) for item in self.coordinates]
+        return [key + (f"_{n}" if key in found[:n] else "") for n, key in enumerate(found)]
+
+    @property
     def in_degrees(self) -> list[bool]:
         """Which coordinates are angles, shown in degrees."""
         return [item.held == ANGLE for item in self.coordinates]
@@ -84,6 +90,11 @@ class Grid:
     def said(self, point: Point) -> str:
         """For messages: 'Dihedral(0, 1, 2, 3) = 30'."""
         return ", ".join(f"{name} = {v:.6g}" for name, v in zip(self.names, self.shown(point), strict=True))
+
+    @property
+    def units(self) -> list[str]:
+        """Of the values as they are shown."""
+        return ["degrees" if turn else "angstrom" for turn in self.in_degrees]
 
     def held_at(self, point: Point) -> list[Constraint]:
         """The coordinates with their values at a point as targets."""

@@ -120,8 +120,8 @@ class Scan:
         found = self.atoms.copy()
         found.positions[:] = self.best[point].positions
         found.info["energy"] = self.best[point].energy
-        for name, v in zip(self.grid.names, self.grid.shown(point), strict=True):
-            found.info[name] = v
+        for key, v in zip(self.grid.keys, self.grid.shown(point), strict=True):
+            found.info[key] = v
         return found
 
     def _table(self, entries: dict[Point, float]) -> FloatArray:

@@ -292,7 +292,7 @@ class Multibody(MultibodyFunctions):
         V, N = V[:rank], V[rank:].T
         S = N.T @ M @ N
         W, info = lapack.dpotrf(S) if rank < n else (S, 0)
-        if info or np.any(W.diagonal() ** 2 <= MASSLESS * S.diagonal()):
+        if info or (W.diagonal() ** 2 <= MASSLESS * S.diagonal()).any():
             raise SingularGeometryError(
                 f"at t = {t:.8g}, q = {shown(q)} the mass matrix is not positive along what the {rank} independent "
                 "constraints leave free: give the coordinates that move there a mass, or hold them"
@@ -302,7 +302,8 @@ class Multibody(MultibodyFunctions):
     def _start(self, q: FloatArray, v: FloatArray, t: float) -> _Place:
         """The place of a start; refused where that is off the constraints."""
         place, c = self._place(q, t, None), self._c(q, t)
-        speed = largest(v) + np.abs(c) / place.size
+        gained = np.sqrt(largest(self._motion(place, v)[0]) * self.length)
+        speed = largest(v) + gained + np.abs(c) / place.size
         for miss, allowed, what in (
             (self._g(q, t), max(self.length, largest(q)) + 0 * place.size, "off"),
             (place.G @ v - c, speed, "left by the velocities, per unit of time,"),
@@ -348,11 +349,11 @@ class Multibody(MultibodyFunctions):
 
     def _tangent(self, place: _Place, v: FloatArray) -> FloatArray:
         """The nearest velocities that stay on the constraints."""
-        c = self._c(place.q, place.t)
+        c, speed = self._c(place.q, place.t), largest(v)
         for _ in range(2):  # the second time for what rounding left
             v = v + place.solve(np.zeros(len(v)), c - place.G @ v)
         off = np.abs(c - place.G @ v) / place.size
-        if not np.all(off <= ACCEPTED * (largest(v) + np.abs(c) / place.size)):
+        if not np.all(off <= ACCEPTED * (speed + np.abs(c) / place.size)):
             row = int(np.argmax(off))
             raise ContradictionError(
                 f"at t = {place.t:.8g} dependent constraints ask for different velocities: row {row} stays off by "

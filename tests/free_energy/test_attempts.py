@@ -36,7 +36,7 @@ def test_an_attempt_comes_back(tmp_path):
 
 def test_nothing_half_written_is_read(tmp_path):
     attempts = made(tmp_path)
-    (tmp_path / PLACE / "00000.part").write_bytes(b"PK\x03\x04")
+    (tmp_path / PLACE / "00000.npz.unfinished").write_bytes(b"PK\x03\x04")
     assert attempts.kept(0, (0,), None) is None
     (tmp_path / PLACE / "00000.npz").write_bytes(b"PK\x03\x04")
     with pytest.raises(UnreadableError, match=r"00000\.npz cannot be read .*; remove it"):

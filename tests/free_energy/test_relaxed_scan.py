@@ -42,7 +42,7 @@ def test_a_torsion_has_its_profile():
         assert attempt.largest <= 1e-3
     assert found.evaluations - 1 <= atoms.calc.calls <= found.evaluations  # ASE remembers the last place
     there = found.structure((3,))
-    assert there.info["Dihedral(0, 1, 2, 3)"] == pytest.approx(-90) and there.info["energy"] == found.energies[3]
+    assert there.info["dihedral_0_1_2_3"] == pytest.approx(-90) and there.info["energy"] == found.energies[3]
 
 
 def test_two_coordinates():

@@ -1,0 +1,235 @@
+"""The command `kcons scan`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kcons.cli.terminal import console, say_written, show
+from kcons.errors import InputError, UnsupportedError
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+    from kcons.constraints import Constraint
+
+#: Option -> atoms it takes.
+FAMILIES = {"distance": 2, "angle": 3, "dihedral": 4}
+#: The exit status where some points failed; 2 is wrong use, or no point at all.
+INCOMPLETE = 3
+
+
+class _Coordinate(argparse.Action):
+    """Coordinates in the order in which they are given, whatever their kind."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        family = (option_string or "").strip("-")
+        setattr(namespace, self.dest, [*(getattr(namespace, self.dest) or []), (family, values)])
+
+
+def add(commands: Any) -> None:
+    """Its options."""
+    scan = commands.add_parser(
+        "scan",
+        help="minima of the energy with one or two coordinates held at given values",
+        description="A relaxed scan: distances, angles or dihedrals are held exactly at each of their values, all else "
+        "is relaxed, from all neighbouring points (torsions are driven both ways). Atoms are counted from 0, unless "
+        "--count-from 1 is given; lengths are in angstrom, angles in degrees. Goes on where it stopped. Exit status 0; "
+        "2 for wrong use, or if no point succeeded; 3 if some points failed.",
+    )
+    scan.add_argument("structure", type=Path, help="any file that ASE reads; its last structure")
+    for family, size in FAMILIES.items():
+        scan.add_argument(
+            f"--{family}",
+            nargs=size,
+            type=int,
+            action=_Coordinate,
+            dest="coordinates",
+            metavar="ATOM",
+            help=f"{size} atoms; a second coordinate makes the scan two-dimensional" if size == 2 else f"{size} atoms",
+        )
+    value = {"nargs": "+", "type": float, "metavar": "VALUE"}
+    scan.add_argument("--from", dest="begin", help="first value, one for each coordinate (dihedrals: -180)", **value)
+    scan.add_argument("--to", dest="end", help="last value, one for each coordinate (dihedrals: 180)", **value)
+    scan.add_argument(
+        "--steps", nargs="+", type=int, metavar="N", help="from the first value to the last, one for each (default 24)"
+    )
+    scan.add_argument("--count-from", type=int, choices=(0, 1), default=0, help="number of the first atom (default 0)")
+    scan.add_argument("--fix", nargs="+", type=int, default=(), metavar="ATOM", help="atoms that stay where they are")
+    for family, size in FAMILIES.items():
+        scan.add_argument(
+            f"--hold-{family}",
+            nargs=size,
+            type=int,
+            action="append",
+            default=[],
+            metavar="ATOM",
+            help="held as it is" if size > 2 else "held as it is; may be repeated",
+        )
+    forces = scan.add_argument_group("energy and forces")
+    forces.add_argument(
+        "--calculator",
+        default="gfn2",
+        help="gfn2 (default) or gfn1, by tblite; emt, lj, ...: one of ASE by name; MODULE:NAME: what makes one; "
+        "FILE.xml: a System of OpenMM, with what it constrains",
+    )
+    forces.add_argument("--settings", default="{}", metavar="JSON", help="such as '{\"charge\": 1}', for what makes it")
+    scan.add_argument("--fmax", type=float, default=0.01, help="largest force left, eV/angstrom (default 0.01)")
+    scan.add_argument("--one-way", action="store_true", help="relax each point from the first neighbour only")
+    scan.add_argument("--out", type=Path, help="folder for all results (default ./scan-STRUCTURE)")
+    scan.set_defaults(run=_scan)
+
+
+def _scan(chosen: argparse.Namespace) -> int:
+    coordinates, values = _grid(chosen)
+    atoms = _structure(chosen.structure)
+    held = _held(chosen)
+    atoms.calc = _calculator(chosen.calculator, _settings(chosen.settings))
+    held += getattr(atoms.calc, "held", [])
+
+    from kcons.cli.progress import Bars
+    from kcons.free_energy import scan, scan_report
+
+    folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
+    with Bars() as watcher:
+        watcher.begin("relaxed scan", 1.0)
+        found = scan(
+            atoms,
+            coordinates,
+            values,
+            held=held,
+            folder=folder,
+            fmax=chosen.fmax,
+            both_ways=not chosen.one_way,
+            progress=lambda done, points, line: watcher.advance(done / points),
+        )
+        watcher.end()
+    show(scan_report.table(found), scan_report.summary(found), console())
+    say_written(scan_report.write(found, folder))
+    return INCOMPLETE if found.failed else 0
+
+
+def _made(family: str, atoms: Sequence[int], chosen: argparse.Namespace) -> Constraint:
+    from kcons import constraints
+
+    kind: Any = getattr(constraints, family.capitalize())
+    return kind([_counted(atoms, chosen)])
+
+
+def _counted(atoms: Sequence[int], chosen: argparse.Namespace) -> list[int]:
+    """Numbers from 0."""
+    numbers = [a - chosen.count_from for a in atoms]
+    if numbers and min(numbers) < 0:
+        raise InputError(f"there is no atom {min(atoms)}; atoms are counted from {chosen.count_from}", item="atoms")
+    return numbers
+
+
+def _held(chosen: argparse.Namespace) -> list[Constraint]:
+    from kcons.constraints import FixedAtoms
+
+    held: list[Constraint] = [FixedAtoms(_counted(chosen.fix, chosen))] if chosen.fix else []
+    return held + [_made(f, atoms, chosen) for f in FAMILIES for atoms in getattr(chosen, f"hold_{f}")]
+
+
+def _grid(chosen: argparse.Namespace) -> tuple[list[Constraint], list[Any]]:
+    import numpy as np
+
+    if not chosen.coordinates:
+        raise InputError(
+            "name what is scanned: --dihedral 0 1 2 3, --angle 0 1 2 or --distance 0 1", item="coordinates"
+        )
+    count = len(chosen.coordinates)
+    turns = all(family == "dihedral" for family, _ in chosen.coordinates)
+    begin = _for_each("--from", chosen.begin or ([-180.0] if turns else []), count)
+    end = _for_each("--to", chosen.end or ([180.0] if turns else []), count)
+    steps = _for_each("--steps", chosen.steps or [24], count)
+    coordinates, values = [], []
+    for (family, atoms), low, high, n in zip(chosen.coordinates, begin, end, steps, strict=True):
+        if n < 0 or (n == 0 and low != high):
+            raise InputError(f"--steps is {n}; give a positive number", item="steps")
+        axis = np.linspace(low, high, int(n) + 1)
+        coordinates.append(_made(family, atoms, chosen))
+        values.append(axis if family == "distance" else np.radians(axis))
+    return coordinates, values
+
+
+def _for_each(option: str, given: Sequence[float], count: int) -> list[float]:
+    if len(given) not in (1, count):
+        raise InputError(f"{option} has {len(given)} numbers for {count} coordinates; give one for each", item=option)
+    return list(given) * (count if len(given) == 1 else 1)
+
+
+def _structure(path: Path) -> Atoms:
+    import ase.io
+
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", item="structure")
+    try:
+        found: Any = ase.io.read(path)
+    except Exception as error:
+        raise InputError(f"ASE cannot read {path}: {type(error).__name__}: {error}", item="structure") from error
+    return found
+
+
+def _settings(given: str) -> dict[str, Any]:
+    try:
+        found = json.loads(given)
+    except ValueError as error:
+        raise InputError(
+            f"--settings is no JSON: {error}; give such as '{{\"charge\": 1}}'", item="settings"
+        ) from error
+    if not isinstance(found, dict):
+        raise InputError("--settings are names and values, such as '{\"charge\": 1}'", item="settings")
+    return found
+
+
+def _calculator(name: str, settings: dict[str, Any]) -> Any:
+    if name.endswith(".xml"):
+        return _of_system(Path(name), settings)
+    try:
+        if name in ("gfn1", "gfn2"):
+            if find_spec("tblite") is None:
+                raise UnsupportedError(f"{name} needs tblite: python -m pip install tblite")
+            from tblite.ase import TBLite
+
+            return TBLite(**{"method": f"GFN{name[-1]}-xTB", "verbosity": 0, **settings})
+        if ":" in name:
+            module, _, attribute = name.partition(":")
+            return getattr(import_module(module), attribute)(**settings)
+        from ase.calculators.calculator import get_calculator_class
+
+        return get_calculator_class(name)(**settings)
+    except UnsupportedError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, "
+            "those of ASE by name, MODULE:NAME, and FILE.xml for a System of OpenMM",
+            item="calculator",
+        ) from error
+
+
+def _of_system(path: Path, settings: dict[str, Any]) -> Any:
+    if not path.is_file():
+        raise InputError(f"there is no file {path}", item="calculator")
+    if find_spec("openmm") is None:
+        raise UnsupportedError("a System needs OpenMM: python -m pip install openmm")
+    import openmm
+
+    from kcons.free_energy import SystemCalculator
+
+    try:
+        system = openmm.XmlSerializer.deserialize(path.read_text())
+    except Exception as error:
+        raise InputError(f"{path} is no System of OpenMM: {error}", item="calculator") from error
+    if not isinstance(system, openmm.System):
+        raise InputError(f"{path} has a {type(system).__name__} in it, no System", item="calculator")
+    try:
+        return SystemCalculator(system, **settings)
+    except (TypeError, openmm.OpenMMException) as error:
+        raise InputError(f'--settings of a System are {{"platform": NAME}}: {error}', item="settings") from error

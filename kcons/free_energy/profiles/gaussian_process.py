@@ -1,0 +1,237 @@
+"""A free energy in d coordinates as a Gaussian process of which the gradient is known at points.
+
+Values and derivatives of a Gaussian process are jointly normal: with the covariance k(x, y) of the free energy, the
+covariance of its gradients is the second derivative of k (Rasmussen and Williams, Gaussian Processes for Machine
+Learning, 2006, section 9.4; for mean forces Stecher, Bernstein and Csanyi, J. Chem. Theory Comput. 10, 4079 (2014)).
+So no integral has to be done: differences of the free energy and their covariance are solutions of one linear system.
+
+The kernel is a product over coordinates of Matern kernels of u(x), an increasing function of the coordinate that is
+learned with it. Where the free energy changes quickly u does, and windows are proposed there. u' is a cubic B-spline
+with positive coefficients. A periodic coordinate is a circle, on which the distance is the chord.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve, cholesky
+from scipy.optimize import minimize
+
+from kcons.constraints.arguments import FloatArray
+from kcons.thermostats import Estimate
+
+#: Of the diagonal, added to the covariance: rounding of a matrix of that size.
+_ROUNDING = 1e-10
+#: Prior standard deviations of the logarithms of amplitude, of length, and of neighbouring local lengths.
+_WIDE, _LOCAL = 1.5, 0.5
+#: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
+_TREND = 10.0
+#: Lengths from which the search for the most likely ones starts, as parts of the range.
+_STARTS = (0.3, 0.1)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One coordinate.
+
+    Attributes
+    ----------
+    low, length : float
+        Where it begins, and its range; its period if it is periodic.
+    periodic : bool
+    coefficients : int
+        Of u': 1 for the same length everywhere, or 4 and more.
+    """
+
+    low: float
+    length: float
+    periodic: bool
+    coefficients: int = 1
+
+    def design(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Matrices of shape (n, coefficients) that give u and u' from the coefficients, in units of the range."""
+        part = (x - self.low) / self.length
+        k = self.coefficients
+        if k == 1:
+            return part[:, None], np.full((len(x), 1), 1.0 / self.length)
+        if self.periodic:
+            knots, basis = np.arange(-3, k + 4) / k, np.eye(k)[np.arange(k + 3) % k]
+            turns = np.floor(part)
+        else:
+            inner = np.linspace(0.0, 1.0, k - 2)
+            knots, basis = np.concatenate([np.zeros(3), inner, np.ones(3)]), np.eye(k)
+            turns = np.zeros(len(part))
+        spline = BSpline(knots, basis, 3)
+        integral = spline.antiderivative()
+        turn = integral(1.0) - integral(0.0)
+        place = part - turns
+        return integral(place) - integral(0.0) + turns[:, None] * turn, spline(place) / self.length
+
+
+def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
+    """Of the second value from the first."""
+    variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+    return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
+
+
+def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Matern 7/2 of squared distances, with two derivatives by them: the mean force is as smooth as Matern 5/2."""
+    a = np.sqrt(7 * square)
+    decay = np.exp(-a)
+    value = (1 + a + 0.4 * a**2 + a**3 / 15) * decay
+    return value, -0.7 * (1 + a + a**2 / 3) * decay, 49 / 60 * (1 + a) * decay
+
+
+class Points:
+    """Points of shape (n, d), with what of u(x) does not depend on its coefficients."""
+
+    def __init__(self, x: FloatArray, axes: Sequence[Axis]) -> None:
+        self.x = x
+        self.designs = [axis.design(column) for axis, column in zip(axes, x.T, strict=True)]
+
+
+#: Points, and which components are meant at each: -1 the free energy, j its derivative by coordinate j.
+Asked: TypeAlias = tuple[Points, Sequence[int]]
+
+
+class GradientProcess:
+    """What is known of a free energy from gradients at points.
+
+    Parameters
+    ----------
+    points : Points
+    gradients : ndarray, shape (n, d)
+    covariances : ndarray, shape (n, d, d)
+        Of the errors of each gradient.
+    axes : sequence of Axis
+    parameters : ndarray, shape (1 + number of coefficients,)
+        Logarithms of the amplitude, and of u' in units of the range.
+    trends : sequence of bool
+        Whether the free energy may also grow by a constant slope along a coordinate.
+    rotation : float
+        Size, relative to the gradient, of a field beside it whose components know nothing of each other: how far the
+        vectors are from being any gradient.
+    """
+
+    def __init__(
+        self,
+        points: Points,
+        gradients: FloatArray,
+        covariances: FloatArray,
+        axes: Sequence[Axis],
+        parameters: FloatArray,
+        trends: Sequence[bool],
+        rotation: float = 0.0,
+    ) -> None:
+        self.points, self.gradients, self.covariances = points, gradients, covariances
+        self.axes, self.parameters, self.trends = axes, parameters, trends
+        self._rotation = rotation
+        logarithms = np.split(parameters[1:], np.cumsum([axis.coefficients for axis in axes])[:-1])
+        self._factors = [np.exp(each) for each in logarithms]
+        size = max(float(np.sqrt(np.mean(g**2))) * axis.length for g, axis in zip(gradients.T, axes, strict=True))
+        level = float(np.mean([each.mean() for each in logarithms]))
+        self._variance = (size * math.exp(parameters[0] - level)) ** 2
+        steepest = float(np.abs(gradients).max())
+        self._slopes = [_TREND * steepest if free else 0.0 for free in trends]
+        n, d = gradients.shape
+        self._seen: Asked = (points, range(d))
+        prior = self._covariance(self._seen, self._seen)
+        prior[np.diag_indices(n * d)] += _ROUNDING * np.trace(prior) / (n * d)
+        noise = np.einsum("ipq,ij->piqj", covariances, np.eye(n)).reshape(n * d, n * d)
+        self._root = cholesky(prior + noise, lower=True, check_finite=False)
+        self._weights = cho_solve((self._root, True), gradients.T.ravel(), check_finite=False)
+
+    def log_likelihood(self) -> float:
+        """Of the gradients seen."""
+        y = self.gradients.T.ravel()
+        return -0.5 * float(y @ self._weights) - float(np.log(np.diag(self._root)).sum())
+
+    def _covariance(self, left: Asked, right: Asked) -> FloatArray:
+        """Prior covariance, component by component."""
+        (one, rows), (other, columns) = left, right
+        parts = [
+            _parts(axis.periodic, factors, one.designs[j], other.designs[j])
+            for j, (axis, factors) in enumerate(zip(self.axes, self._factors, strict=True))
+        ]
+
+        def block(p: int, q: int) -> FloatArray:
+            product = self._variance * math.prod(part[p == j][q == j] for j, part in enumerate(parts))
+            for j, slope in enumerate(self._slopes):
+                if slope and p in (-1, j) and q in (-1, j):
+                    ends = [
+                        z.x[:, j] - self.axes[j].low if c == -1 else np.ones(len(z.x))
+                        for z, c in ((one, p), (other, q))
+                    ]
+                    product = product + slope**2 * np.outer(*ends)
+            if self._rotation and p == q >= 0:
+                du, dw = (z.designs[p][1] @ self._factors[p] for z in (one, other))
+                alike = math.prod(part[0][0] for part in parts)
+                product = product + self._rotation**2 * self._variance * alike * np.outer(du, dw)
+            return np.asarray(product)
+
+        return np.block([[block(p, q) for q in columns] for p in rows])
+
+    def mean(self, x: FloatArray, components: Sequence[int]) -> FloatArray:
+        """Of `posterior` alone, shape (components, n)."""
+        cross = self._covariance((Points(x, self.axes), components), self._seen)
+        return (cross @ self._weights).reshape(len(components), len(x))
+
+    def posterior(self, *asked: tuple[FloatArray, Sequence[int]]) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of what is asked: places (n, d) and components there, one component after another.
+
+        Only differences of free energies have a meaning.
+        """
+        wanted = [(Points(x, self.axes), components) for x, components in asked]
+        cross = np.concatenate([self._covariance(each, self._seen) for each in wanted])
+        prior = np.block([[self._covariance(a, b) for b in wanted] for a in wanted])
+        return cross @ self._weights, prior - cross @ cho_solve((self._root, True), cross.T)
+
+
+def _parts(
+    periodic: bool, factors: FloatArray, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]
+) -> list[list[FloatArray]]:
+    """The kernel of one coordinate: [[itself, its derivative by the right], [by the left, by both]]."""
+    (u, du), (w, dw) = ([design @ factors for design in side] for side in (left, right))
+    away = u[:, None] - w[None, :]
+    if periodic:  # u grows by the mean of the coefficients in a period.
+        radius = float(factors.mean()) / (2 * math.pi)
+        square = (2 * radius * np.sin(away / (2 * radius))) ** 2
+        first, second = 2 * radius * np.sin(away / radius), 2 * np.cos(away / radius)
+    else:
+        square, first, second = away**2, 2 * away, np.full_like(away, 2.0)
+    value, slope, bend = _matern(square)
+    along, twice = slope * first, bend * first**2 + slope * second
+    return [[value, -along * dw], [along * du[:, None], -twice * du[:, None] * dw]]
+
+
+def learn(
+    x: FloatArray, gradients: FloatArray, covariances: FloatArray, axes: Sequence[Axis], trends: Sequence[bool]
+) -> GradientProcess:
+    """The process whose hyperparameters are most likely, in view of the gradients and of broad priors."""
+    counts = [axis.coefficients for axis in axes]
+    points = Points(x, axes)
+
+    def process(p: FloatArray) -> GradientProcess:
+        return GradientProcess(points, gradients, covariances, axes, p, trends)
+
+    def unlikely(p: FloatArray) -> float:
+        prior = 0.5 * (p[0] / _WIDE) ** 2
+        for own in np.split(p[1:], np.cumsum(counts)[:-1]):
+            prior += 0.5 * ((own.mean() + math.log(_STARTS[0])) / _WIDE) ** 2
+            prior += 0.5 * float(((np.diff(own) / _LOCAL) ** 2).sum())
+        try:
+            return prior - process(p).log_likelihood()
+        except np.linalg.LinAlgError:
+            return 1e30  # too smooth for double precision
+
+    # Steps of differences that are well above the rounding of the likelihood.
+    options = {"ftol": 1e-6, "maxiter": 100, "eps": 1e-4}
+    starts = [np.concatenate([[0.0], np.full(sum(counts), -math.log(part))]) for part in _STARTS]
+    bounds = [(-7.0, 7.0)] * (1 + sum(counts))
+    found = [minimize(unlikely, start, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
+    return process(min(found, key=lambda result: float(result.fun)).x)

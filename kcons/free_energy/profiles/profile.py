@@ -1,0 +1,339 @@
+"""Free energy along one coordinate from the mean forces of windows: thermodynamic integration with an error band.
+
+F(b) - F(a) is the integral of dF/dx. Two ways to it, both linear in the mean forces, so that the covariance of all
+differences is known and not only errors at points:
+
+- 'gp': a Gaussian process learned from the derivatives (`gaussian_process`). Its band has what the
+  windows do not tell between them as well, and it knows where the next window helps most.
+- 'spline': the integral of the cubic spline through the mean forces (not-a-knot; periodic over a period). Fourth order
+  in the distance of windows. Its band has the errors of the mean forces only.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from kcons.constraints.arguments import FloatArray, numbers
+from kcons.errors import InputError
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
+from kcons.thermostats import Estimate
+
+Method = Literal["gp", "spline"]
+
+#: Points of a profile unless they are given, and points at which a window may be proposed.
+_POINTS = 201
+#: Windows from which on lengths are learned that differ from place to place, and coefficients of those.
+_MANY, _COEFFICIENTS = 7, 4
+#: Standard errors by which a closed profile may miss its beginning before that is warned of.
+_CLOSES = 4.0
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Mean forces in the order of their places; integrals by both methods."""
+
+    x: FloatArray
+    f: FloatArray
+    e: FloatArray
+    period: float | None
+
+    @property
+    def end(self) -> float:
+        """Where the profile ends that begins at the first window."""
+        return float(self.x[-1] if self.period is None else self.x[0] + self.period)
+
+    @cached_property
+    def open_process(self) -> GradientProcess:
+        """A Gaussian process that need not close."""
+        axis = Axis(
+            float(self.x[0]),
+            self.end - float(self.x[0]),
+            self.period is not None,
+            _COEFFICIENTS if len(self.x) >= _MANY else 1,
+        )
+        return learn(self.x[:, None], self.f[:, None], self.e[:, None, None] ** 2, [axis], [True])
+
+    def process(self, closed: bool) -> GradientProcess:
+        free = self.open_process
+        if not closed:
+            return free
+        return GradientProcess(free.points, free.gradients, free.covariances, free.axes, free.parameters, [False])
+
+    def spline(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
+        """Integrals from the first window, and their covariance."""
+        knots, unit = self.x, np.eye(len(self.x))
+        if self.period is not None:
+            knots, unit = np.append(knots, self.end), np.vstack([unit, unit[:1]])
+        kind = "periodic" if self.period is not None else "not-a-knot"
+        integral = CubicSpline(knots, unit, bc_type=kind, extrapolate=False).antiderivative()
+        rule, whole = integral(at), integral(self.end)
+        variances = self.e**2
+        if closed:  # The most likely mean forces whose integral vanishes.
+            spread = variances if variances.any() else np.ones(len(variances))
+            gain = spread * whole / (whole @ (spread * whole))
+            rule = rule @ (np.eye(len(gain)) - np.outer(gain, whole))
+        return rule @ self.f, (rule * variances) @ rule.T
+
+    def values(self, method: Method, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
+        """Free energies up to a constant, and their covariance."""
+        if method == "spline":
+            return self.spline(at, closed)
+        return self.process(closed).posterior((at[:, None], [-1]))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A free energy along one coordinate.
+
+    Attributes
+    ----------
+    x : ndarray, shape (m,)
+    F : ndarray, shape (m,)
+        Free energy less that at `zero`. As it comes from mean forces, -kT ln of the probability density of x.
+    error : ndarray, shape (m,)
+        Standard errors of these differences.
+    covariance : ndarray, shape (m, m)
+        Of these differences.
+    zero : float
+    windows, mean_forces, mean_force_errors : ndarray, shape (n,)
+        What it was made of, in order. Mean forces are dF/dx.
+    closure : Estimate or None
+        Integral of dF/dx over the period, which should be 0, before the profile was closed.
+    method : {'gp', 'spline'}
+    """
+
+    x: FloatArray
+    F: FloatArray
+    error: FloatArray
+    covariance: FloatArray
+    zero: float
+    windows: FloatArray
+    mean_forces: FloatArray
+    mean_force_errors: FloatArray
+    closure: Estimate | None
+    method: Method
+    _known: _Windows
+    _closed: bool
+    _added: Callable[[FloatArray], FloatArray] | None = None
+
+    def difference(self, a: float, b: float) -> Estimate:
+        """F(b) - F(a) with its standard error."""
+        ends = _places([a, b], self._known, "ends of the difference")
+        F, covariance = self._known.values(self.method, ends, self._closed)
+        if self._added is not None:
+            F = F + self._added(ends)
+        return difference(F, covariance)
+
+    def without_jacobian(
+        self, jacobian: Literal["distance", "angle"] | Callable[[FloatArray], FloatArray], thermal_energy: float
+    ) -> Profile:
+        """The 'geometric' free energy, -kT ln(P(x)/J(x)) = F + kT ln J(x).
+
+        Two definitions are in use. F = -kT ln P(x) has in it how much room there is at x: two particles that do not
+        interact have F = -2 kT ln r. Divided by the Jacobian J, P is a density in Cartesian coordinates, and these
+        particles have a constant W = F + 2 kT ln r (the potential of mean force of the theory of liquids).
+        Differences of F give rates and populations along x; W goes to 0 at large distances.
+
+        Parameters
+        ----------
+        jacobian : {'distance', 'angle'} or callable
+            J = x^2 of a distance in three dimensions; J = sin x of an angle in radian; any other J(x), positive.
+        thermal_energy : float
+            kT in the unit of F.
+
+        Raises
+        ------
+        InputError
+            J is not positive somewhere; kT is not positive; this profile has a Jacobian taken out already.
+        """
+        if self._added is not None:
+            raise InputError("the Jacobian has been taken out of this profile already", item="jacobian")
+        if not (thermal_energy > 0 and math.isfinite(thermal_energy)):
+            raise InputError(f"kT is {thermal_energy}; give a positive number", item="thermal_energy")
+        known = {"distance": np.square, "angle": np.sin}
+        J = known.get(jacobian) if isinstance(jacobian, str) else jacobian
+        if J is None:
+            raise InputError(f"unknown jacobian {jacobian!r}; give 'distance', 'angle' or J(x)", item="jacobian")
+
+        def added(x: FloatArray) -> FloatArray:
+            factor = np.asarray(J(x), dtype=float)
+            if not (np.isfinite(factor) & (factor > 0)).all():
+                worst = x[np.argmin(np.where(np.isfinite(factor), factor, -np.inf))]
+                raise InputError(f"the Jacobian is not positive at {worst:g}", item="jacobian")
+            return thermal_energy * np.log(factor)
+
+        shift = added(np.append(self.x, self.zero))
+        return replace(self, F=self.F + shift[:-1] - shift[-1], _added=added)
+
+    def next_window(self, *, between: tuple[float, float] | None = None) -> float:
+        """Where one more window would tell most; see `next_windows`."""
+        return self.next_windows(1, between=between)[0]
+
+    def next_windows(self, count: int, *, between: tuple[float, float] | None = None) -> list[float]:
+        """Where more windows would tell most, if they were sampled as long as those that are there.
+
+        Each is put where the variance of all differences of free energy together is reduced most (Bayesian
+        quadrature: Kempkes and Perez de Alba Ortiz, arXiv 2601.08783), taking those before it as done. A window has
+        the error that its neighbours suggest. Where a profile was made by a spline, a Gaussian process is learned
+        from the same windows.
+
+        Parameters
+        ----------
+        count : int
+        between : tuple of two float, optional
+            Only the difference between these two places counts; all of the profile by default.
+
+        Raises
+        ------
+        InputError
+            `between` is not in the range of the windows.
+        """
+        known = self._known
+        grid = np.linspace(known.x[0], known.end, _POINTS)
+        aims = grid if between is None else _places(between, known, "between")
+        closed = self._closed and known.period is not None
+        covariance = known.process(closed).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
+        noise = np.interp(grid, known.x, known.e**2, period=known.period)
+        m = len(aims)
+        chosen = []
+        for _ in range(count):
+            shared = covariance[:m, m:]
+            variance = np.maximum(np.diag(covariance)[m:], 0.0) + noise
+            gain = ((shared - shared.mean(axis=0)) ** 2).sum(axis=0) / np.maximum(variance, np.finfo(float).tiny)
+            best = int(np.argmax(gain))
+            column = covariance[:, m + best]
+            covariance = covariance - np.outer(column, column) / variance[best]
+            chosen.append(float(grid[best]))
+        return chosen
+
+
+def integrate(
+    x: ArrayLike,
+    f: ArrayLike,
+    e: ArrayLike,
+    *,
+    method: Method = "gp",
+    period: float | None = None,
+    closed: bool = True,
+    zero: float | None = None,
+    at: ArrayLike | None = None,
+) -> Profile:
+    """Free energy along a coordinate from the mean forces of windows.
+
+    Parameters
+    ----------
+    x : array_like, shape (n,)
+        Places of the windows, in any order; radian for angles if f is per radian.
+    f : array_like, shape (n,)
+        dF/dx there: the slope of the free energy, not the force against it. Windows at one place are put together.
+    e : array_like, shape (n,)
+        Standard errors of f; 0 where it is exact.
+    method : {'gp', 'spline'}
+        Gaussian process, or cubic spline, which does not know how far it is off between windows.
+    period : float, optional
+        Of the coordinate: the profile goes once around, from the first window.
+    closed : bool
+        Whether a periodic profile is made to end where it begins. `closure` says how far it was from that.
+    zero : float, optional
+        Where F is 0; by default where it is lowest.
+    at : array_like, shape (m,), optional
+        Where F is given; by default at 201 points from the first window to the last.
+
+    Raises
+    ------
+    InputError
+        Fewer than 3 windows; a NaN or infinity; a negative error; windows further apart than the period; a place
+        outside of the windows; an unknown method.
+
+    Warns
+    -----
+    UserWarning
+        The integral over the period is more than 4 standard errors from 0: some mean force is wrong, or its error.
+    """
+    if method not in ("gp", "spline"):
+        raise InputError(f"unknown method {method!r}; give 'gp' or 'spline'", item="method")
+    known = _windows(x, f, e, period)
+    points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
+    closure = None
+    if period is not None:
+        closure = difference(*known.values(method, np.array([known.x[0], known.end]), False))
+        if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(known.f).max():
+            warnings.warn(
+                f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "
+                "should be 0: a window has not forgotten where it started from, or its error is too small",
+                UserWarning,
+                stacklevel=2,
+            )
+    close = closed and period is not None
+    if zero is None:
+        inner = np.linspace(known.x[0], known.end, _POINTS)
+        zero = float(inner[np.argmin(known.values(method, inner, close)[0])])
+    places = np.append(points, _places([zero], known, "zero"))
+    F, covariance = known.values(method, places, close)
+    less = covariance[:-1, :-1] - covariance[:-1, -1:] - covariance[-1:, :-1] + covariance[-1, -1]
+    error = np.sqrt(np.maximum(np.diag(less), 0.0))
+    return Profile(points, F[:-1] - F[-1], error, less, zero, known.x, known.f, known.e, closure, method, known, close)
+
+
+def _windows(x: ArrayLike, f: ArrayLike, e: ArrayLike, period: float | None) -> _Windows:
+    """Windows in order; those at one place are one, with the weights that their errors give them."""
+    arrays = [numbers(values, name) for values, name in ((x, "x"), (f, "f"), (e, "e"))]
+    for array, name in zip(arrays, "xfe", strict=True):
+        if array.ndim != 1 or array.shape != arrays[0].shape:
+            raise InputError(f"{name} must have shape {(arrays[0].size,)}, not {array.shape}", item=name)
+        if not np.isfinite(array).all():
+            raise InputError(
+                f"{name} of window {int(np.argmin(np.isfinite(array)))} is not finite; leave it out", item=name
+            )
+    place, force, error = arrays
+    if (error < 0).any():
+        raise InputError(f"the error of window {int(np.argmin(error))} is negative", item="e")
+    if period is not None:
+        if not (period > 0 and math.isfinite(period)):
+            raise InputError(f"the period is {period}; give a positive number", item="period")
+        if len(place) and np.ptp(place) > period * (1 + 1e-9):
+            raise InputError(
+                f"windows are {np.ptp(place):g} apart, further than the period {period:g}; check the units",
+                item="period",
+            )
+        place = place.min() + (place - place.min()) % period if len(place) else place
+        place = np.where(place - place.min() > period * (1 - 1e-9), place.min(), place) if len(place) else place
+    places, which = np.unique(place, return_inverse=True)
+    if len(places) < 3:
+        raise InputError(f"{len(places)} different windows are too few for a profile; give 3 or more", item="x")
+    # Errors of 0 among others: exact values count alone.
+    weights = (
+        1.0 / np.maximum(error, 1e-12 * max(float(error.max()), np.finfo(float).tiny)) ** 2
+        if error.any()
+        else np.ones(len(error))
+    )
+    total = np.bincount(which, weights)
+    together = np.bincount(which, weights * force) / total
+    errors = np.sqrt(np.bincount(which, (weights * error) ** 2)) / total
+    return _Windows(places, together, errors, period)
+
+
+def _places(at: ArrayLike, known: _Windows, item: str) -> FloatArray:
+    """Places within the range of the windows; into it by periods where there is one."""
+    points = numbers(at, item)
+    if points.ndim != 1 or not np.isfinite(points).all():
+        raise InputError(f"{item} must be a list of finite numbers", item=item)
+    low, high = float(known.x[0]), known.end
+    slack = 1e-9 * (high - low)
+    if known.period is not None:
+        outside = (points < low - slack) | (points > high + slack)
+        points = np.where(outside, low + (points - low) % known.period, points)
+    elif (points < low - slack).any() or (points > high + slack).any():
+        raise InputError(
+            f"{item} goes beyond the windows, which are between {low:g} and {high:g}; add a window there", item=item
+        )
+    return np.clip(points, low, high)

@@ -1,0 +1,79 @@
+"""An OpenMM System as an ASE calculator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import openmm
+from ase import Atoms, units
+from ase.calculators.calculator import Calculator, all_changes
+from openmm import unit
+
+from kcons.constraints import Distance
+from kcons.errors import InputError, UnsupportedError
+
+#: kJ/mol in eV.
+_KJ = units.kJ / units.mol
+
+
+class SystemCalculator(Calculator):
+    """Energy and forces of an OpenMM System.
+
+    Parameters
+    ----------
+    system : openmm.System
+        Particles in the order of the atoms. The cell is that of the atoms, if they have one.
+    platform : str, optional
+        Of OpenMM.
+
+    Attributes
+    ----------
+    held : list of Distance
+        What the System constrains, in angstrom; OpenMM has no forces for it, so a scan is to hold it:
+        ``scan(atoms, ..., held=atoms.calc.held)``.
+
+    Raises
+    ------
+    UnsupportedError
+        Virtual sites, which have no place of their own.
+    """
+
+    implemented_properties = ["energy", "forces"]
+
+    def __init__(self, system: openmm.System, platform: str | None = None) -> None:
+        super().__init__()
+        count = system.getNumParticles()
+        sites = [k for k in range(count) if system.isVirtualSite(k)]
+        if sites:
+            raise UnsupportedError(f"particle {sites[0]} is a virtual site; relax a System without such sites")
+        rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+        lengths = [length.value_in_unit(unit.angstrom) for _, _, length in rows]
+        self.held = [Distance([[i, j] for i, j, _ in rows], lengths)] if rows else []
+        self._count, self._periodic = count, system.usesPeriodicBoundaryConditions()
+        chosen = [] if platform is None else [openmm.Platform.getPlatformByName(platform)]
+        self._context = openmm.Context(system, openmm.VerletIntegrator(0.001), *chosen)
+
+    def calculate(
+        self,
+        atoms: Atoms | None = None,
+        properties: Iterable[str] = ("energy", "forces"),
+        system_changes: Iterable[str] = all_changes,
+    ) -> None:
+        """Fill `results`; called by ASE."""
+        super().calculate(atoms, list(properties), list(system_changes))
+        assert self.atoms is not None
+        if len(self.atoms) != self._count:
+            raise InputError(
+                f"the System has {self._count} particles and the structure {len(self.atoms)} atoms; give those of "
+                "one file",
+                item="system",
+            )
+        if self._periodic and self.atoms.pbc.all():
+            self._context.setPeriodicBoxVectors(*(self.atoms.cell.array / 10))
+        self._context.setPositions(self.atoms.positions / 10)
+        state: Any = self._context.getState(getEnergy=True, getForces=True)
+        energy = state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)
+        forces = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.angstrom)
+        self.results = {"energy": energy * _KJ, "forces": np.array(forces) * _KJ}

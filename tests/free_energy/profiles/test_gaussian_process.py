@@ -1,0 +1,120 @@
+"""A Gaussian process learned from gradients: its kernel is what it says, and its posterior what any solver gives."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Points, learn
+
+AXES = {
+    "line": Axis(-1.0, 3.0, False),
+    "warped line": Axis(-1.0, 3.0, False, 6),
+    "circle": Axis(-1.0, 3.0, True),
+    "warped circle": Axis(-1.0, 3.0, True, 5),
+}
+
+
+def process(axes, seed=0, n=4, trends=None, rough=True):
+    rng = np.random.default_rng(seed)
+    d = len(axes)
+    x = rng.uniform(-1.0, 2.0, (n, d))
+    noise = rng.standard_normal((n, d, d))
+    covariances = 0.01 * noise @ noise.transpose(0, 2, 1)
+    logs = 1.0 + 0.7 * rough * rng.standard_normal(1 + sum(axis.coefficients for axis in axes))
+    return GradientProcess(Points(x, axes), rng.standard_normal((n, d)), covariances, axes, logs, trends or [False] * d)
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_u_is_the_integral_of_its_slope_and_grows(name):
+    axis = AXES[name]
+    factors = np.exp(np.random.default_rng(1).standard_normal(axis.coefficients))
+    x = np.linspace(-1.0, 2.0, 7)
+    u, _ = (design @ factors for design in axis.design(x))
+    slope = lambda t: axis.design(np.array([t]))[1] @ factors  # noqa: E731
+    for left, right, grown in zip(x, x[1:], np.diff(u), strict=False):
+        # The slope is as smooth as a spline is: the adaptive rule halves at the knots.
+        assert grown == pytest.approx(quad_vec(slope, left, right, epsabs=1e-12)[0][0], rel=1e-9)
+        assert grown > 0
+    if axis.periodic:
+        turn, one = (axis.design(np.array([z]))[0] @ factors for z in (2.0 - 1e-13, 0.3))
+        assert turn == pytest.approx(factors.mean(), rel=1e-9)
+        assert axis.design(np.array([3.3]))[0] @ factors - one == pytest.approx(turn, rel=1e-9)
+
+
+@pytest.mark.parametrize("names", [[name] for name in AXES] + [["warped line", "circle"], ["line", "warped circle"]])
+def test_covariances_of_gradients_are_derivatives_of_those_of_the_free_energy(names):
+    axes = [AXES[name] for name in names]
+    d, h = len(axes), 1e-4
+    known = process(axes, trends=[True] * d)
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-0.9, 1.9, (2, 3, d))
+
+    def prior(one, p, other, q):
+        return known._covariance((Points(one, axes), [p]), (Points(other, axes), [q]))
+
+    for p in range(d):
+        step = h * np.eye(d)[p]
+        for q in (-1, *range(d)):
+            slope = (prior(x + step, -1, y, q) - prior(x - step, -1, y, q)) / (2 * h)
+            scale = np.abs(prior(x, p, y, q)).max()
+            assert prior(x, p, y, q) == pytest.approx(slope, abs=1e-5 * max(scale, 1.0))
+            assert prior(y, q, x, p) == pytest.approx(prior(x, p, y, q).T, rel=1e-12)
+
+
+@pytest.mark.parametrize("names", [["warped line"], ["line", "circle"]])
+def test_prior_is_a_covariance(names):
+    known = process([AXES[name] for name in names], n=12)
+    d = len(names)
+    x = np.random.default_rng(3).uniform(-1, 2, (9, d))
+    points = Points(x, known.axes)
+    everything = (points, [-1, *range(d)])
+    values = np.linalg.eigvalsh(known._covariance(everything, everything))
+    assert values.min() > -1e-10 * values.max()
+
+
+def test_a_period_further_nothing_is_different():
+    known = process([AXES["warped circle"]], n=6)
+    x = np.linspace(-1.0, 2.0, 8)[:, None]
+    here, there = (known.posterior((z, [-1, 0])) for z in (x, x + 3.0))
+    assert there[0] == pytest.approx(here[0], abs=1e-9 * np.abs(here[0]).max())
+    assert there[1] == pytest.approx(here[1], abs=1e-8 * np.abs(here[1]).max())
+
+
+def test_posterior_is_that_of_the_textbook():
+    """Gaussian conditioning by a solver that knows nothing of blocks (Rasmussen and Williams, eq. 2.25, 2.26)."""
+    axes = [AXES["warped line"], AXES["circle"]]
+    known = process(axes, n=5)
+    at = np.random.default_rng(4).uniform(-1, 2, (3, 2))
+    seen, wanted = (known.points, range(2)), (Points(at, axes), [-1])
+    noise = np.zeros((10, 10))
+    for i, block in enumerate(known.covariances):
+        noise[np.ix_([i, 5 + i], [i, 5 + i])] = block
+    prior = known._covariance(seen, seen)
+    prior += 1e-10 * np.trace(prior) / 10 * np.eye(10)
+    cross = known._covariance(wanted, seen)
+    y = np.concatenate([known.gradients[:, 0], known.gradients[:, 1]])
+    mean, covariance = known.posterior((at, [-1]))
+    assert mean == pytest.approx(cross @ np.linalg.solve(prior + noise, y), rel=1e-8)
+    expected = known._covariance(wanted, wanted) - cross @ np.linalg.solve(prior + noise, cross.T)
+    assert covariance == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
+    sign, log_determinant = np.linalg.slogdet(prior + noise)
+    likelihood = -0.5 * (y @ np.linalg.solve(prior + noise, y) + sign * log_determinant)
+    assert known.log_likelihood() == pytest.approx(likelihood, rel=1e-9)
+
+
+def test_lengths_are_learned():
+    """A function that is quick on one side: u' is larger there, and the likelihood higher than with one length."""
+    x = np.linspace(0.0, 4.0, 25)[:, None]
+    slopes = 8 * np.cos(8 * x) * np.exp(-((x / 1.0) ** 4)) + 0.1 * np.cos(x)
+    errors = np.full((25, 1, 1), 1e-4)
+    one, many = (learn(x, slopes, errors, [Axis(0.0, 4.0, False, k)], [True]) for k in (1, 8))
+    assert many.log_likelihood() > one.log_likelihood() + 10
+    u = many.axes[0].design(np.array([0.5, 3.5]))[1] @ np.exp(many.parameters[1:])
+    assert u[0] > 4 * u[1]
+    again = learn(x * 10, slopes / 10, errors / 100, [Axis(0.0, 40.0, False, 1)], [True])
+    assert again.parameters == pytest.approx(one.parameters, abs=0.02)  # no unit is preferred
+    assert math.isfinite(one.log_likelihood())

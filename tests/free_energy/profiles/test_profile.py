@@ -1,0 +1,258 @@
+"""Profiles from mean forces, against free energies in closed form."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from kcons.errors import InputError
+from kcons.free_energy.profiles.profile import integrate
+
+
+class Case(NamedTuple):
+    F: object
+    f: object
+    low: float
+    high: float
+    period: float | None = None
+
+    def grid(self, n):
+        """Windows at equal distances; around a circle, or to both ends."""
+        return np.linspace(self.low, self.high, n, endpoint=self.period is None)
+
+
+CASES = {
+    "Lennard-Jones": Case(lambda r: 4 * (r**-12 - r**-6), lambda r: 4 * (6 * r**-7 - 12 * r**-13), 0.95, 3.0),
+    "double well": Case(lambda x: 5 * (x**2 - 1) ** 2, lambda x: 20 * x * (x**2 - 1), -1.5, 1.5),
+    "torsion": Case(
+        lambda t: 7 * np.cos(t) + 3 * np.cos(2 * t) + 8 * np.cos(3 * t),
+        lambda t: -7 * np.sin(t) - 6 * np.sin(2 * t) - 24 * np.sin(3 * t),
+        -math.pi,
+        math.pi,
+        2 * math.pi,
+    ),
+    "Morse": Case(
+        lambda r: 50 * (1 - np.exp(-2 * (r - 1))) ** 2,
+        lambda r: 200 * (1 - np.exp(-2 * (r - 1))) * np.exp(-2 * (r - 1)),
+        0.7,
+        4.0,
+    ),
+}
+
+
+def made(case, n, error, seed, **options):
+    x = case.grid(n)
+    f = case.f(x) + error * np.random.default_rng(seed).standard_normal(n)
+    return integrate(x, f, np.full(n, error), period=case.period, **options)
+
+
+def off(profile, case):
+    """Error in standard errors of the whole profile at 5 places, made independent of each other."""
+    places = slice(20, 200, 40)
+    away = profile.F[places] - (case.F(profile.x[places]) - case.F(profile.zero))
+    root = np.linalg.cholesky(profile.covariance[places, places])
+    return np.linalg.solve(root, away)
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "error"), [("Lennard-Jones", 40, 0.5), ("double well", 13, 0.6), ("torsion", 18, 1.5)]
+)
+def test_errors_of_splines_are_as_large_as_they_say(name, n, error):
+    """Where windows are close enough for noise to be all of the error."""
+    case = CASES[name]
+    away = np.array(
+        [off(made(case, n, error, seed, method="spline", zero=case.grid(n)[3]), case) for seed in range(200)]
+    )
+    # 1000 differences; the number within one standard deviation has a standard deviation of 1.5 percent.
+    assert (np.abs(away) < 1).mean() == pytest.approx(0.683, abs=0.05)
+    assert (np.abs(away) < 1.96).mean() == pytest.approx(0.95, abs=0.025)
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
+)
+def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
+    """Few windows: what lies between them counts as well. 40 differences; their mean square has a standard deviation
+    of 0.22 if they are independent."""
+    case = CASES[name]
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(8)])
+    assert 0.4 < (away**2).mean() < 1.6
+    assert (np.abs(away) < 1.96).mean() >= 0.85
+
+
+@pytest.mark.parametrize("name", ["Lennard-Jones", "torsion"])
+def test_splines_are_of_fourth_order(name):
+    case, errors = CASES[name], []
+    counts = np.array([24, 48, 96])
+    for n in counts:
+        profile = made(case, n, 0.0, 0, method="spline", zero=case.grid(n)[0], at=case.grid(n))
+        errors.append(np.abs(profile.F - (case.F(profile.x) - case.F(profile.zero))).max())
+    slopes = -np.diff(np.log(errors)) / np.diff(np.log(counts))
+    assert slopes[-1] > 3.7, slopes
+
+
+def test_both_methods_agree_where_there_are_many_windows():
+    case = CASES["double well"]
+    one, other = (made(case, 21, 0.2, 3, method=method, zero=1.0) for method in ("gp", "spline"))
+    assert np.abs(one.F - other.F).max() < other.error.max()  # one smooths the noise, the other does not
+    assert one.error.max() == pytest.approx(other.error.max(), rel=0.1)
+    assert one.difference(1.0, 1.0).error == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("method", ["gp", "spline"])
+def test_differences_are_those_of_the_covariance(method):
+    profile = made(CASES["Morse"], 12, 0.4, 4, method=method)
+    a, b = 20, 150
+    found = profile.difference(profile.x[a], profile.x[b])
+    c = profile.covariance
+    assert found.value == pytest.approx(profile.F[b] - profile.F[a], abs=1e-6)
+    assert found.error == pytest.approx(math.sqrt(c[a, a] + c[b, b] - 2 * c[a, b]), rel=1e-4)
+    assert profile.F.min() == pytest.approx(0.0, abs=1e-6) and profile.zero == profile.x[np.argmin(profile.F)]
+
+
+def test_a_straight_line_is_known_from_three_windows():
+    profile = integrate([2.0, 0.0, 1.0], [3.0, 3.0, 3.0], [0.1, 0.1, 0.1], method="spline", zero=0.0, at=[0.0, 2.0])
+    # Simpson's rule: the errors of the ends count 1/3, that of the middle 4/3.
+    assert pytest.approx([0.0, 6.0]) == profile.F
+    assert profile.error[1] == pytest.approx(0.1 * math.sqrt(18) / 3)
+
+
+@pytest.mark.parametrize("method", ["gp", "spline"])
+def test_a_period_closes(method):
+    case, e = CASES["torsion"], 0.5
+    x = case.grid(16)
+    f = case.f(x) + 0.3 + e * np.random.default_rng(5).standard_normal(16)
+    profile = integrate(x, f, np.full(16, e), method=method, period=case.period)
+    # An equal weight for each window: the error of the integral is 2 pi e/sqrt(16).
+    assert profile.closure.error == pytest.approx(2 * math.pi * e / 4, rel=0.05)
+    assert profile.closure.value == pytest.approx(2 * math.pi * np.mean(f), rel=0.15)
+    assert profile.F[0] == pytest.approx(profile.F[-1], abs=1e-6)
+    left_open = integrate(x, f, np.full(16, e), method=method, period=case.period, closed=False)
+    assert left_open.F[-1] - left_open.F[0] == pytest.approx(left_open.closure.value, abs=1e-6)
+    assert left_open.closure == profile.closure
+    assert left_open.error.max() > profile.error.max()
+
+
+def test_a_period_that_does_not_close_is_warned_of():
+    case = CASES["torsion"]
+    x = case.grid(24)
+    with pytest.warns(UserWarning, match="which should be 0"):
+        integrate(x, case.f(x) + 3.0, np.full(24, 0.1), method="spline", period=case.period)
+
+
+def test_windows_of_a_circle_may_be_given_in_any_turn_and_order():
+    case = CASES["torsion"]
+    x = case.grid(16)
+    one = integrate(x, case.f(x), np.full(16, 0.1), method="spline", period=case.period, at=[0.3, 1.0], zero=0.0)
+    order = np.random.default_rng(6).permutation(16)
+    turned = np.where(x < -0.1, x + 2 * math.pi, x)[order]
+    other = integrate(
+        turned, case.f(turned), np.full(16, 0.1), method="spline", period=case.period, at=[0.3, 1.0], zero=0.0
+    )
+    assert pytest.approx(one.F, abs=1e-9) == other.F
+
+
+def test_windows_at_one_place_are_put_together():
+    x, f, e = [0.0, 0.0, 1.0, 2.0], [1.0, 2.0, 1.0, 1.0], [1.0, 0.5, 1.0, 1.0]
+    profile = integrate(x, f, e, method="spline")
+    assert profile.windows.tolist() == [0.0, 1.0, 2.0]
+    assert profile.mean_forces[0] == pytest.approx((1.0 + 4 * 2.0) / 5)
+    assert profile.mean_force_errors[0] == pytest.approx(1 / math.sqrt(5))
+
+
+def test_jacobians():
+    """Particles that do not interact: -kT ln P is -2 kT ln r, and W is constant. Of an angle, -kT ln sin."""
+    kT, r = 2.5, np.linspace(1.0, 4.0, 25)
+    free = integrate(r, -2 * kT / r, np.full(25, 1e-6), zero=2.0)
+    flat = free.without_jacobian("distance", kT)
+    assert pytest.approx(-2 * kT * np.log(free.x / 2.0), abs=1e-3) == free.F
+    assert pytest.approx(np.zeros(201), abs=1e-3) == flat.F
+    assert flat.difference(1.0, 4.0).value == pytest.approx(0.0, abs=1e-3)
+    assert (flat.covariance == free.covariance).all()
+    angle = np.linspace(0.5, 2.5, 25)
+    of_angle = integrate(angle, -kT / np.tan(angle), np.full(25, 1e-6)).without_jacobian("angle", kT)
+    assert np.ptp(of_angle.F) < 1e-3
+    own = free.without_jacobian(lambda x: x**3, kT)
+    assert pytest.approx(kT * np.log(own.x / 2.0), abs=1e-3) == own.F
+    with pytest.raises(InputError, match="already"):
+        flat.without_jacobian("distance", kT)
+    with pytest.raises(InputError, match="unknown jacobian"):
+        free.without_jacobian("length", kT)
+    with pytest.raises(InputError, match="positive number"):
+        free.without_jacobian("distance", 0.0)
+    with pytest.raises(InputError, match="not positive at 1"):
+        free.without_jacobian(lambda x: x - 1.0, kT)
+
+
+def rms(profile, case):
+    """Of all differences of free energy."""
+    away = profile.F - case.F(profile.x)
+    return float(np.std(away))
+
+
+@cache
+def adapted(name, start, to, error):
+    """Windows proposed one by one, and the errors on the way by the number of windows; over two seeds."""
+    case, found = CASES[name], {}
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        x = case.grid(start)
+        f = case.f(x) + error * rng.standard_normal(start)
+        while True:
+            profile = integrate(x, f, np.full(len(x), error), period=case.period)
+            found.setdefault(len(x), []).append(rms(profile, case))
+            if len(x) == to:
+                break
+            new = profile.next_window()
+            x = np.append(x, new)
+            f = np.append(f, case.f(new) + error * rng.standard_normal())
+    return {n: math.sqrt(np.mean(np.square(each))) for n, each in found.items()}
+
+
+def uniform(name, n, error, method="spline"):
+    case = CASES[name]
+    found = [rms(made(case, n, error, seed, method=method), case) for seed in range(2)]
+    return math.sqrt(np.mean(np.square(found)))
+
+
+def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
+    """Each window is sampled equally long. Splines are the better method for equal distances here."""
+    error = 0.009
+    assert adapted("Lennard-Jones", 7, 11, error)[11] < uniform("Lennard-Jones", 22, error)
+
+
+def test_next_windows_lie_apart_and_where_little_is_known():
+    x = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 4.0])
+    profile = integrate(x, np.cos(x), np.full(6, 0.01))
+    first, second = profile.next_windows(2)
+    assert 2.2 < first < 3.8 and abs(second - first) > 0.3
+    assert profile.next_window() == first
+    between = profile.next_window(between=(0.0, 1.0))
+    assert -0.01 <= between <= 1.5
+    with pytest.raises(InputError, match="between"):
+        profile.next_window(between=(0.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("x", "f", "e", "options", "item", "message"),
+    [
+        ([0.0, 1.0], [0.0, 1.0], [1.0, 1.0], {}, "x", "too few"),
+        ([0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0], {}, "x", "2 different windows"),
+        ([0.0, 1.0, 2.0], [0.0, np.nan, 2.0], [1.0, 1.0, 1.0], {}, "f", "window 1 is not finite"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0], [1.0, 1.0, 1.0], {}, "f", r"shape \(3,\)"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0, 1.0, -1.0], {}, "e", "window 2 is negative"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"method": "simpson"}, "method", "unknown method"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"zero": 3.0}, "zero", "beyond the windows"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"at": [-1.0]}, "at", "beyond the windows"),
+        ([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [1.0] * 3, {"period": -1.0}, "period", "positive"),
+        ([0.0, 90.0, 180.0], [0.0, 1.0, 2.0], [1.0] * 3, {"period": 2 * math.pi}, "period", "units"),
+    ],
+)
+def test_bad_input_is_refused(x, f, e, options, item, message):
+    with pytest.raises(InputError, match=message) as caught:
+        integrate(x, f, e, **options)
+    assert caught.value.item == item

@@ -1,0 +1,79 @@
+"""Table, plot and files of a scan."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cache
+
+import ase.io
+import numpy as np
+import pytest
+from scan_systems import chain, threefold, two_wells
+
+from kcons.cli.terminal import rendered
+from kcons.constraints import Dihedral, Distance
+from kcons.free_energy import scan, scan_report
+
+TURN = Dihedral([[0, 1, 2, 3]])
+
+
+@cache
+def line():
+    """Four values, the second of which fails."""
+    atoms = chain(4, threefold, lambda phi: RuntimeError("no") if 0.9 < phi[0] < 1.1 else None, turns=[0.5])
+    return scan(atoms, TURN, [0.5, 1.0, 1.5, 2.0])
+
+
+@cache
+def surface():
+    return scan(chain(4, threefold), [TURN, Distance([[1, 2]])], [np.radians([40, 60]), [1.3, 1.4, 1.5]])
+
+
+def test_table_and_summary():
+    shown = rendered(scan_report.table(line()))
+    rows = [row.split() for row in shown.splitlines()]
+    energies = 0.2 * (1 + np.cos(3 * np.array([0.5, 1.5, 2.0]))) * scan_report.KJ
+    assert next(row for row in rows if row and row[0] == "57.30")[:2] == ["57.30", "failed"]
+    last = next(row for row in rows if row and row[0] == "114.59")
+    assert float(last[1]) == pytest.approx(energies[2] - energies.min(), abs=2e-3)
+    said = scan_report.summary(line())
+    assert said.startswith("3 of 4 points") and "failed: Dihedral(0, 1, 2, 3) = 57.2958: CalculatorError" in said
+    two = rendered(scan_report.table(surface()))
+    assert "Distance(1, 2)" in two and "1.3000" in two and "40.00" in two
+
+
+def test_what_differs_by_the_way_is_said():
+    atoms = chain(5, two_wells, turns=[np.radians(-150), 0.3])
+    found = scan(atoms, TURN, np.radians(np.arange(-165, 180, 30)))
+    assert "from different neighbours the energy differs by up to" in scan_report.summary(found)
+    assert len(scan_report.plot(found).axes[0].lines) == 2
+
+
+def test_plots():
+    axes = scan_report.plot(line()).axes[0]
+    assert axes.get_xlabel() == "Dihedral(0, 1, 2, 3) / degrees"
+    x, y = axes.lines[0].get_data()
+    assert x[0] == pytest.approx(np.degrees(0.5)) and np.isnan(y[1]) and np.nanmin(y) == 0
+    assert axes.lines[1].get_xdata() == pytest.approx([np.degrees(1.0)])  # the cross of the point that failed
+    drawn, bar = scan_report.plot(surface()).axes
+    assert drawn.get_ylabel() == "Distance(1, 2) / angstrom" and bar.get_ylabel() == "energy / (kJ/mol)"
+    assert drawn.collections[0].get_array().shape == (3, 2)
+
+
+def test_files(tmp_path):
+    written = scan_report.write(line(), tmp_path / "new")
+    assert [path.name for path in written] == ["scan.json", "scan.csv", "scan.png", "scan.extxyz"]
+    numbers = json.loads(written[0].read_text())
+    assert numbers["coordinates"] == {"dihedral_0_1_2_3": "degrees"} and numbers["calls"] == line().evaluations
+    assert [point["energy_eV"] is None for point in numbers["points"]] == [False, True, False, False]
+    assert "CalculatorError" in numbers["points"][1]["error"]
+    rows = list(csv.DictReader(written[1].read_text().splitlines()))
+    assert float(rows[2]["energy_eV"]) == line().energies[2] and rows[1]["energy_eV"] == ""
+    frames = ase.io.read(written[3], ":")
+    assert len(frames) == 3
+    for frame, point in zip(frames, [(0,), (2,), (3,)], strict=True):
+        assert frame.get_potential_energy() == line().energies[point]
+        assert frame.info["dihedral_0_1_2_3"] == pytest.approx(np.degrees(line().grid.at(point)[0]))
+        assert np.abs(frame.positions - line().best[point].positions).max() < 1e-7
+    assert written[2].read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,72 @@
+"""Energies of an OpenMM System for scans."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+
+from kcons.constraints import Dihedral
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy import SystemCalculator, scan
+
+openmm = pytest.importorskip("openmm")
+
+
+def four_atoms(constrained=True):
+    """A chain with one torsion, 2 kJ/mol (1 + cos 3 phi), its bonds held or harmonic, in a zigzag."""
+    system = openmm.System()
+    for _ in range(4):
+        system.addParticle(12.0)
+    bonds, angles, turns = openmm.HarmonicBondForce(), openmm.HarmonicAngleForce(), openmm.PeriodicTorsionForce()
+    for k in range(3):
+        if constrained:
+            system.addConstraint(k, k + 1, 0.15)
+        else:
+            bonds.addBond(k, k + 1, 0.15, 2e5)
+    for k in range(2):
+        angles.addAngle(k, k + 1, k + 2, 1.9, 400.0)
+    turns.addTorsion(0, 1, 2, 3, 3, 0.0, 2.0)
+    for force in (bonds, angles, turns):
+        system.addForce(force)
+    x = [[0.0, 0, 0], [1.5, 0.1, 0], [2.0, 1.5, 0.1], [3.4, 1.6, 0.3]]
+    return system, Atoms("C4", positions=x)
+
+
+def test_energy_and_forces():
+    """Forces are the slope of the energy, in ASE's units."""
+    system, atoms = four_atoms(constrained=False)
+    atoms.calc = SystemCalculator(system, "Reference")
+    forces, x, h = atoms.get_forces(), atoms.positions.copy(), 1e-4
+    ends = []
+    for sign in (1, -1):
+        atoms.positions[:] = x
+        atoms.positions[1, 1] += sign * h
+        ends.append(atoms.get_potential_energy())
+    assert -(ends[0] - ends[1]) / (2 * h) == pytest.approx(forces[1, 1], rel=1e-6)
+    assert atoms.calc.held == []
+
+
+def test_a_scan_with_what_the_system_constrains():
+    system, atoms = four_atoms()
+    atoms.calc = SystemCalculator(system, "Reference")
+    values = np.radians(np.arange(-180, 180, 60))
+    found = scan(atoms, Dihedral([[0, 1, 2, 3]]), values, held=atoms.calc.held, fmax=1e-4)
+    truth = 2.0 * (1 + np.cos(3 * values)) * 0.01036427  # kJ/mol in eV
+    np.testing.assert_allclose(found.energies, truth, atol=1e-7)
+    for attempt in found.best.values():
+        lengths = np.linalg.norm(np.diff(attempt.positions, axis=0), axis=1)
+        np.testing.assert_allclose(lengths, 1.5, atol=1e-14)
+
+
+def test_bad_systems():
+    system, atoms = four_atoms()
+    atoms.calc = SystemCalculator(system, "Reference")
+    few = atoms[:3]
+    few.calc = atoms.calc
+    with pytest.raises(InputError, match="4 particles and the structure 3 atoms"):
+        few.get_potential_energy()
+    system.addParticle(0.0)
+    system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+    with pytest.raises(UnsupportedError, match="particle 4 is a virtual site"):
+        SystemCalculator(system)
