@@ -25,7 +25,6 @@ _NAMES = {
     "windows.openmm_windows": ("OpenMMWindows",),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
     "windows.plan_file": ("PlanFile", "read_plan"),
-    "averages": ("Mean", "weighted_mean"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
