@@ -9,6 +9,7 @@ from kcons.openmm.collective.forecast import Forecast, Measured
 from kcons.openmm.collective.small_algebra import Block
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
+from kcons.steppers.operations import Exchange
 
 
 class GroupRows(Part):
@@ -104,7 +105,10 @@ class GroupRows(Part):
             self._base = p.vector(f"base{c}", "positions as other parts leave them")
         if self.meets_system:
             p.vector(f"v_kept{c}", "velocities while v is used to project rows")
-            if not self._single:
+            # A bath acts between two halves of a drift: the second one does not begin where the step does.
+            ensemble = getattr(p.integrator, "ensemble", None)
+            operations = () if ensemble is None else ensemble.operations(scheme)
+            if not self._single or any(isinstance(operation, Exchange) for operation in operations):
                 self._start = p.vector(f"start{c}", "positions at the start of the drift")
 
     def _gradients(self, p: Program, *, sizes: bool, slopes: bool, products: bool = True) -> None:
