@@ -95,17 +95,6 @@ def test_names_of_modules_are_their_own():
 TESTS = ROOT / "tests"
 #: Modules without a test file of their own, and where they are tested. What gets one is taken out.
 TESTED_ELSEWHERE = {
-    **dict.fromkeys(
-        (
-            f"comparison/hard_cases/{theme}.py"
-            for theme in ("bodies", "chains", "growth_models", "inputs", "invariance", "long_runs", "motions")
-        ),
-        "comparison/hard_cases/test_cases_of_kcons.py",
-    ),
-    **dict.fromkeys(
-        (f"comparison/hard_cases/{theme}.py" for theme in ("rings", "starts", "steps", "thermostats")),
-        "comparison/hard_cases/test_cases_of_kcons.py",
-    ),
     "comparison/methods/peers/mici_leapfrog.py": "comparison/methods/peers/test_peer_methods.py",
     "comparison/methods/peers/shake.py": "comparison/methods/peers/test_peer_methods.py",
     "comparison/work_precision/whole_page.py": "comparison/work_precision/test_whole.py",
