@@ -24,9 +24,10 @@ _NAMES = {
     "windows.ase_windows": ("AseWindows",),
     "windows.openmm_windows": ("OpenMMWindows",),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
-    "averages": ("Mean", "weighted_mean"),
+    "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
+    "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
     "relaxed_scan": ("Scan", "scan"),
     "system_calculator": ("SystemCalculator",),
 }

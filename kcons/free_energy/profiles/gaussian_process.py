@@ -23,6 +23,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 
 from kcons.constraints.arguments import FloatArray
+from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
 _ROUNDING = 1e-10
@@ -70,6 +71,12 @@ class Axis:
         turn = integral(1.0) - integral(0.0)
         place = part - turns
         return integral(place) - integral(0.0) + turns[:, None] * turn, spline(place) / self.length
+
+
+def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
+    """Of the second value from the first."""
+    variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+    return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
 
 
 def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

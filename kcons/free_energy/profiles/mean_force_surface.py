@@ -7,7 +7,6 @@ much more likely the vectors are if their components need not belong to one free
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
 from kcons.thermostats import Estimate
 
 #: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
@@ -93,8 +92,7 @@ class Surface:
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""
-        values, c = self._process.posterior((self._places(np.stack([numbers(a, "a"), numbers(b, "b")])), [-1]))
-        return Estimate(float(values[1] - values[0]), math.sqrt(max(float(c[0, 0] + c[1, 1] - 2 * c[0, 1]), 0.0)))
+        return difference(*self._process.posterior((self._places(np.stack([numbers(a, "a"), numbers(b, "b")])), [-1])))
 
     def minima(self) -> list[Minimum]:
         """Minima inside of the range, lowest first; each is what a search from some window comes to."""
