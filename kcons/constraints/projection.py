@@ -323,7 +323,7 @@ def bott_duffin(
         u = np.linalg.solve(M @ P_par - unit * P_perp, _real_vector(f, n, "f") - M @ a_perp)
     except np.linalg.LinAlgError:
         raise InputError(
-            "the mass matrix is singular along what the constraints leave free; give what moves there a mass, or hold it",
+            "the mass matrix is singular along what the constraints leave free; give a mass to what moves there",
             item="masses",
         ) from None
     shape = np.shape(f)
