@@ -1,12 +1,14 @@
 """The theory, literally and densely: the oracle against which the fast engine is tested.
 
 Pure functions on arrays. A is s x 3N, one row a constraint; M is diagonal, given as the masses of the
-N atoms (or as 3N numbers); f and accelerations have length 3N or shape (N, 3) and come back as they came.
+N atoms (or as 3N numbers), or full, in coordinates of any number n in place of 3N: symmetric, positive definite.
+f and accelerations have length 3N or shape (N, 3) and come back as they came.
 Generalized inverses, solvability and the projectors P take complex matrices too (appendix A.1); a mechanical system
 is real, and its functions refuse complex numbers.
 Cost grows as the cube of 3N: for systems of up to some hundred atoms, and for reading.
 
-The mass-weighted matrix is B = A M^-1/2. Written with B+ in place of an inverse, every formula holds
+The mass-weighted matrix is B = A M^-1/2; of a full M, its Cholesky factor L, M = L L^T, stands for M^1/2, and
+B = A L^-T. Written with B+ in place of an inverse, every formula holds
 for dependent rows as well: z, the acceleration and M_par+ are unique, and lambda is the one of least norm.
 
 Equation numbers are those of the notes (G. R. Kneller, Systemes dynamiques); 'corrected' marks the
@@ -229,9 +231,9 @@ def parallel_projector(matrix: ArrayLike, rtol: float = RANK_TOLERANCE) -> Numbe
 def velocity_projector(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK_TOLERANCE) -> FloatArray:
     """M_par+ M = 1 - M^-1/2 B+ B M^1/2, the projector of velocities, orthogonal in the mass metric."""
     A = _real_matrix(matrix)
-    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
-    V = row_space(A / root_m, rtol)
-    return np.asarray(np.eye(A.shape[1]) - (V / root_m[:, None]) @ (V.T * root_m))
+    root = _Root(masses, A.shape[1])
+    V = row_space(root.weighted(A), rtol)
+    return np.asarray(np.eye(A.shape[1]) - root.from_weighted(V) @ root.times(V).T)
 
 
 def project_velocities(
@@ -239,10 +241,10 @@ def project_velocities(
 ) -> FloatArray:
     """The nearest velocities, in the mass metric, with A v = c: v - M^-1/2 B+ (A v - c)."""
     A = _real_matrix(matrix)
-    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    root = _Root(masses, A.shape[1])
     flat = _real_vector(v, A.shape[1], "v")
-    correction = pseudo_inverse(A / root_m, rtol).matrix @ (A @ flat - np.broadcast_to(_real(c, "c"), (len(A),)))
-    return (flat - correction / root_m).reshape(np.shape(v))
+    correction = pseudo_inverse(root.weighted(A), rtol).matrix @ (A @ flat - np.broadcast_to(_real(c, "c"), (len(A),)))
+    return np.asarray(flat - root.from_weighted(correction)).reshape(np.shape(v))
 
 
 # -- dynamics (eqs. 99-107) -------------------------------------------------------------------------
@@ -254,8 +256,9 @@ def constrained_inverse(matrix: ArrayLike, masses: ArrayLike, rtol: float = RANK
     With independent rows it is M^-1 - M^-1 A^T (A M^-1 A^T)^-1 A M^-1.
     """
     A = _real_matrix(matrix)
-    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
-    return parallel_projector(A / root_m, rtol) / np.outer(root_m, root_m)
+    root = _Root(masses, A.shape[1])
+    half = root.from_weighted(parallel_projector(root.weighted(A), rtol))
+    return root.from_weighted(half.T)
 
 
 def multipliers(
@@ -266,9 +269,9 @@ def multipliers(
     (A M^-1 A^T) lambda = b - A M^-1 f, solved by (B B^T)+ = (B+)^T B+.
     """
     A = _real_matrix(matrix)
-    m = _mass_diagonal(masses, A.shape[1])
-    B_plus = pseudo_inverse(A / np.sqrt(m), rtol).matrix
-    right = _real_vector(b, len(A), "b") - A @ (_real_vector(f, A.shape[1], "f") / m)
+    root = _Root(masses, A.shape[1])
+    B_plus = pseudo_inverse(root.weighted(A), rtol).matrix
+    right = _real_vector(b, len(A), "b") - A @ root.solve(_real_vector(f, A.shape[1], "f"))
     return np.asarray(B_plus.T @ (B_plus @ right))
 
 
@@ -277,10 +280,9 @@ def constraint_force(
 ) -> FloatArray:
     """The force z = A^T (A M^-1 A^T)^-1 (b - A M^-1 f) = M^1/2 B+ (b - A M^-1 f), as f (notes eq. 104)."""
     A = _real_matrix(matrix)
-    m = _mass_diagonal(masses, A.shape[1])
-    root_m = np.sqrt(m)
-    right = _real_vector(b, len(A), "b") - A @ (_real_vector(f, A.shape[1], "f") / m)
-    z = root_m * (pseudo_inverse(A / root_m, rtol).matrix @ right)
+    root = _Root(masses, A.shape[1])
+    right = _real_vector(b, len(A), "b") - A @ root.solve(_real_vector(f, A.shape[1], "f"))
+    z = root.times(pseudo_inverse(root.weighted(A), rtol).matrix @ right)
     return np.asarray(z).reshape(np.shape(f))
 
 
@@ -292,9 +294,9 @@ def acceleration(
     The notes lost the M^-1 in front of A^T. In mass-weighted form the second term is M^-1/2 B+ b.
     """
     A = _real_matrix(matrix)
-    root_m = np.sqrt(_mass_diagonal(masses, A.shape[1]))
+    root = _Root(masses, A.shape[1])
     free = constrained_inverse(A, masses, rtol) @ _real_vector(f, A.shape[1], "f")
-    driven = (pseudo_inverse(A / root_m, rtol).matrix @ _real_vector(b, len(A), "b")) / root_m
+    driven = root.from_weighted(pseudo_inverse(root.weighted(A), rtol).matrix @ _real_vector(b, len(A), "b"))
     return np.asarray(free + driven).reshape(np.shape(f))
 
 
@@ -305,16 +307,25 @@ def bott_duffin(
 
     M (a_par + A+ b) = f + z with a_par in V_par and z in V_perp. Both parts sit in one vector u, with
     a_par = P_par u and z = P_perp u, and (M P_par - P_perp) u = f - M A+ b has one solution. No mass-weighted
-    matrix and no multipliers: an independent way to the same answer.
+    matrix and no multipliers: an independent way to the same answer. A full M may be singular here, as long as it is
+    positive on V_par.
     """
     A = _real_matrix(matrix)
-    m = _mass_diagonal(masses, A.shape[1])
+    n = A.shape[1]
+    M = _mass_matrix(masses, n)
     P_perp = perpendicular_projector(A, rtol)
-    P_par = np.eye(len(m)) - P_perp
+    P_par = np.eye(n) - P_perp
     a_perp = pseudo_inverse(A, rtol).matrix @ _real_vector(b, len(A), "b")
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
-    unit = float(np.exp(np.mean(np.log(m))))
-    u = np.linalg.solve(m[:, None] * P_par - unit * P_perp, _real_vector(f, len(m), "f") - m * a_perp)
+    diagonal = np.diagonal(M)[np.diagonal(M) > 0]
+    unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
+    try:
+        u = np.linalg.solve(M @ P_par - unit * P_perp, _real_vector(f, n, "f") - M @ a_perp)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the mass matrix is singular along what the constraints leave free; give a mass to what moves there",
+            item="masses",
+        ) from None
     shape = np.shape(f)
     return BottDuffinSolution((P_par @ u + a_perp).reshape(shape), unit * (P_perp @ u).reshape(shape))
 
@@ -325,8 +336,8 @@ def gauss_function(trial: ArrayLike, masses: ArrayLike, f: ArrayLike) -> float:
     Among all accelerations with A a = b the true one has the least; there it is (1/2) z^T M^-1 z.
     """
     a = _real(trial, "trial").ravel()
-    m = _mass_diagonal(masses, len(a))
-    return float(0.5 * np.sum((m * a - _real_vector(f, len(a), "f")) ** 2 / m))
+    off = _mass_matrix(masses, len(a)) @ a - _real_vector(f, len(a), "f")
+    return float(0.5 * off @ _Root(masses, len(a)).solve(off))
 
 
 # -- pieces -----------------------------------------------------------------------------------------
@@ -387,6 +398,57 @@ def _mass_diagonal(masses: ArrayLike, n: int) -> FloatArray:
     if not np.all(np.isfinite(m) & (m > 0)):
         raise InputError("masses must be positive and finite; hold an atom by three rows instead", item="masses")
     return m
+
+
+class _Root:
+    """M^1/2: of a diagonal its square roots, of a full M the Cholesky factor L, M = L L^T."""
+
+    def __init__(self, masses: ArrayLike, n: int) -> None:
+        self.diagonal: FloatArray | None = None
+        if _real(masses, "masses").shape != (n, n) or n == 1:
+            self.mass = _mass_diagonal(masses, n)
+            self.diagonal = np.sqrt(self.mass)
+            return
+        try:
+            self.factor = np.linalg.cholesky(_mass_matrix(masses, n))
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "the mass matrix is not positive definite; where it is so along what the constraints leave free, "
+                "use bott_duffin, or kcons.models.Multibody",
+                item="masses",
+            ) from None
+
+    def weighted(self, A: FloatArray) -> FloatArray:
+        """B = A L^-T."""
+        if self.diagonal is not None:
+            return A / self.diagonal
+        return np.asarray(scipy.linalg.solve_triangular(self.factor, A.T, lower=True).T)
+
+    def from_weighted(self, x: FloatArray) -> FloatArray:
+        """L^-T x."""
+        if self.diagonal is not None:
+            return (x.T / self.diagonal).T
+        return np.asarray(scipy.linalg.solve_triangular(self.factor, x, lower=True, trans="T"))
+
+    def times(self, x: FloatArray) -> FloatArray:
+        """L x."""
+        return (x.T * self.diagonal).T if self.diagonal is not None else self.factor @ x
+
+    def solve(self, x: FloatArray) -> FloatArray:
+        """M^-1 x."""
+        if self.diagonal is not None:
+            return x / self.mass
+        return np.asarray(scipy.linalg.cho_solve((self.factor, True), x))
+
+
+def _mass_matrix(masses: ArrayLike, n: int) -> FloatArray:
+    """M as a matrix, shape (n, n), symmetric."""
+    M = _real(masses, "masses")
+    if M.shape != (n, n) or n == 1:
+        return np.diag(_mass_diagonal(masses, n))
+    if not np.all(np.isfinite(M)) or np.any(np.abs(M - M.T) > 1e-10 * np.max(np.abs(M))):
+        raise InputError("the mass matrix must be finite and symmetric", item="masses")
+    return M
 
 
 def _row_sizes(A: NumberArray) -> FloatArray:

@@ -5,6 +5,7 @@
 - `averages`: means of correlated samples with weights
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
+- `windows`: many windows, by any executor
 - `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
 - `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
 """
@@ -19,8 +20,15 @@ _NAMES = {
     "mean_forces": ("MeanForce", "local_mean_force", "mean_force"),
     "ase_recorder": ("AseRecorder",),
     "openmm_reporter": ("HeldCoordinatesReporter",),
-    "averages": ("Mean", "weighted_mean"),
+    "windows.window": ("Settings", "Window"),
+    "windows.ase_windows": ("AseWindows",),
+    "windows.openmm_windows": ("OpenMMWindows",),
+    "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
+    "windows.plan_file": ("PlanFile", "read_plan"),
+    "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
+    "profiles.mean_force_surface": ("Surface", "fit_surface"),
+    "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
     "relaxed_scan": ("Scan", "scan"),
     "system_calculator": ("SystemCalculator",),
 }

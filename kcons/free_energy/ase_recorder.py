@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from ase.md.md import MolecularDynamics
 
-from kcons.ase import ConstrainedDynamics, Constraints
+from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
 from kcons.constraints import Constraint
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
@@ -84,6 +84,8 @@ class AseRecorder:
             forces = self.dynamics.state.forces
         if forces is None:
             forces = atoms.get_forces(apply_constraint=False)
+        if isinstance(self.dynamics, IsokineticDynamics):  # known once it runs
+            self.series.isokinetic_degrees_of_freedom = self.dynamics.thermostat_degrees_of_freedom
         x, v = atoms.positions, atoms.get_velocities()
         self.last = self._held.sample(x, v, forces, time)
         self.series.append(self.last)

@@ -9,12 +9,15 @@ equilibration ends is where most independent samples are left (Chodera, J. Chem.
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from dataclasses import dataclass
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError, UnsupportedError
@@ -140,6 +143,60 @@ def weighted_mean(
             stacklevel=2,
         )
     return Mean(_mean(series, factors), covariance, np.sqrt(np.diag(covariance)), n, effective, inefficiency, start)
+
+
+class Agreement(NamedTuple):
+    """Whether two means are of the same quantities.
+
+    Attributes
+    ----------
+    chi_square : float
+    degrees_of_freedom : int
+    p_value : float
+        Probability of a difference as large as this by chance.
+    """
+
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float
+
+
+def agreement(one: ArrayLike, covariance: ArrayLike, other: ArrayLike, other_covariance: ArrayLike) -> Agreement:
+    """Chi square of the difference of two means: hysteresis between windows reached from one side and the other.
+
+    Held windows share no configurations, and so have no overlap that could be looked at: where a window has forgotten
+    how it was made, its mean force is the same from both sides.
+
+    Parameters
+    ----------
+    one, other : array_like, shape (d,) or ()
+    covariance, other_covariance : array_like, shape (d, d) or ()
+        Of the means. Where the sum of both is singular, only what has an error counts; a difference in what has none
+        has the probability 0.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not go together; a NaN or infinity.
+    """
+    arrays = [numbers(values, name) for values, name in ((one, "one"), (other, "other"))]
+    spreads = [numbers(values, "covariance") for values in (covariance, other_covariance)]
+    d = arrays[0].size
+    if any(a.size != d or a.ndim > 1 for a in arrays) or any(
+        c.shape not in ((d, d), ()) or c.size != d * d for c in spreads
+    ):
+        raise InputError(f"two means of {d} quantities need covariances of shape {(d, d)}", item="covariance")
+    if not all(np.isfinite(each).all() for each in (*arrays, *spreads)):
+        raise InputError("a mean or a covariance is not finite", item="covariance")
+    away = arrays[0].ravel() - arrays[1].ravel()
+    sizes, directions = np.linalg.eigh(sum(c.reshape(d, d) for c in spreads))
+    known = sizes > 1e-12 * max(float(sizes[-1]), 0.0)
+    parts = directions.T @ away
+    if (np.abs(parts[~known]) > 1e-9 * np.abs(np.concatenate(arrays, axis=None)).max()).any():
+        return Agreement(math.inf, d, 0.0)
+    square = float((parts[known] ** 2 / sizes[known]).sum())
+    count = int(known.sum())
+    return Agreement(square, count, float(chi2.sf(square, count)) if count else 1.0)
 
 
 def _checked(

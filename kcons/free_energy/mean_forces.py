@@ -53,48 +53,43 @@ class MeanForce:
         )
 
 
-def local_mean_force(series: Series, kT: float, *, isokinetic_degrees_of_freedom: int | None = None) -> FloatArray:
-    """What is averaged with the weights of the series to give dF/dq, shape (n, d).
+def local_mean_force(series: Series, kT: float) -> FloatArray:
+    """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G.
+
+    Of an isokinetic run the part of lambda that is quadratic in the velocities is taken g/(g - 1) times.
 
     Parameters
     ----------
     series : Series
     kT : float
         Temperature times Boltzmann's constant, in the energy of the series.
-    isokinetic_degrees_of_freedom : int, optional
-        g of an isokinetic run, where <v v^T> is (g - 1)/g of its canonical value: the part of the multipliers that is
-        quadratic in the velocities is taken g/(g - 1) times.
 
     Raises
     ------
     InputError
-        `kT` that is not positive, or g < 2.
+        `kT` that is not positive, or g = 1.
     """
     if not kT > 0 or not np.isfinite(kT):
         raise InputError(f"kT is {kT}; give a positive energy", item="kT")
     force = series.multiplier + kT * series.gradient
-    g = isokinetic_degrees_of_freedom
-    if g is not None:
-        if g < 2:
-            raise InputError(
-                f"{g} degrees of freedom under an isokinetic thermostat have no temperature; at least 2 are needed",
-                item="isokinetic_degrees_of_freedom",
-            )
-        force = force + series.kinetic / (g - 1)
-    return force
+    g = series.isokinetic_degrees_of_freedom
+    if g == 1:
+        raise InputError(
+            "1 degree of freedom under an isokinetic thermostat has no temperature; at least 2 are needed",
+            item="isokinetic_degrees_of_freedom",
+        )
+    return force + series.kinetic / (g - 1) if g else force
 
 
-def mean_force(
-    series: Series, kT: float, *, isokinetic_degrees_of_freedom: int | None = None, discard: int = 0
-) -> MeanForce:
+def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     """dF/dq = <w (lambda + kT G)>/<w>, w = (det Z)^(-1/2), G half the gradient of ln det Z along each coordinate.
 
     Parameters
     ----------
     series : Series
         Of coordinates at rest, with velocities of temperature kT.
-    kT, isokinetic_degrees_of_freedom
-        As for `local_mean_force`.
+    kT : float
+        Temperature times Boltzmann's constant, in the energy of the series.
     discard : int
         Samples of equilibration at the beginning.
 
@@ -123,7 +118,7 @@ def mean_force(
             "rest (the work of moving ones is Series.work)",
             item=name,
         )
-    force = local_mean_force(kept, kT, isokinetic_degrees_of_freedom=isokinetic_degrees_of_freedom)
+    force = local_mean_force(kept, kT)
     mean = weighted_mean(force, kept.weights)
     return MeanForce(
         kept.names,

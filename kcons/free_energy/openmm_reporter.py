@@ -20,6 +20,7 @@ from kcons.openmm.carried.carried_constraints import CarriedConstraints
 from kcons.openmm.carried.hold import constraints_about
 from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massless_atoms
 from kcons.openmm.collective.collective_rows import CollectiveRows
+from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.quantities import accepted, masses_of
 
 
@@ -98,6 +99,9 @@ class HeldCoordinatesReporter:
         assert self._held is not None and self._set is not None
         if self._set.lattice is not None:
             self._set.with_cell(cell_of(state.getPeriodicBoxVectors()))
+        ensemble = getattr(simulation.integrator, "ensemble", None)
+        if isinstance(ensemble, Isokinetic):
+            self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
         v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
         f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
         sample = self._held.sample(x, v, f, time)

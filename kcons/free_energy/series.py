@@ -28,6 +28,9 @@ class Series:
     names : sequence of str
     periods : array_like, shape (d,), optional
         Of the coordinates; 0 for none.
+    isokinetic_degrees_of_freedom : int, optional
+        g of an isokinetic run, which gives the velocities (g - 1)/g of their canonical variance; `local_mean_force`
+        puts that right. 0 for every other run.
 
     Attributes
     ----------
@@ -41,8 +44,9 @@ class Series:
     (0, (0, 1))
     """
 
-    def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0) -> None:
+    def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0, isokinetic_degrees_of_freedom: int = 0) -> None:
         self.names = tuple(names)
+        self.isokinetic_degrees_of_freedom = isokinetic_degrees_of_freedom
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
         self._samples: list[Sample] = []
 
@@ -60,7 +64,7 @@ class Series:
 
     def __getitem__(self, samples: slice) -> Series:
         """Some of the samples."""
-        part = Series(self.names, self.periods)
+        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
         part._samples = self._samples[samples]
         return part
 
@@ -133,7 +137,9 @@ class Series:
         """Write all of it in NumPy's .npz format; an interrupted write leaves the older file."""
         arrays = {field: getattr(self, field) for field in (*_NUMBERS, *_VECTORS)}
         with in_one_piece(file) as opened:
-            np.savez(opened, names=np.array(self.names), periods=self.periods, **arrays)  # type: ignore[arg-type]
+            arrays |= {"names": np.array(self.names), "periods": self.periods}
+            arrays["isokinetic_degrees_of_freedom"] = np.array(self.isokinetic_degrees_of_freedom)
+            np.savez(opened, **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, file: str | PathLike[str]) -> Series:
@@ -147,7 +153,8 @@ class Series:
         try:
             with open(file, "rb") as opened:
                 data = stored_arrays(opened)
-            series = cls([str(name) for name in data["names"]], data["periods"])
+            names = [str(name) for name in data["names"]]
+            series = cls(names, data["periods"], int(data["isokinetic_degrees_of_freedom"]))
             d = len(series.names)
             columns = [data[f].reshape(-1) for f in _NUMBERS] + [data[f].reshape(-1, d) for f in _VECTORS]
             for row in zip(*columns, strict=True):

@@ -452,6 +452,69 @@ def test_masses_per_atom_and_per_component_are_the_same() -> None:
     np.testing.assert_array_equal(flat.reshape(3, 3), projection.acceleration(p.A, p.masses, p.f, p.b))
 
 
+# -- a full mass matrix ------------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(problems(decades=0.5))
+def test_a_full_mass_matrix_is_a_diagonal_one_in_other_coordinates(p: Problem) -> None:
+    """x = T y: A T, T^T M T and T^T f for A, M and f; rows and their multipliers are the same."""
+    n = p.A.shape[1]
+    T = np.linalg.qr(p.rng.normal(size=(n, n)))[0] * p.rng.uniform(0.5, 2.0, n)
+    back = np.linalg.inv(T)
+    M = T.T @ (np.repeat(p.masses, 3)[:, None] * T)
+    M, A, f, v = 0.5 * (M + M.T), p.A @ T, p.f.ravel() @ T, p.rng.normal(size=n)
+    a = projection.acceleration(p.A, p.masses, p.f, p.b).ravel()
+    z = projection.constraint_force(p.A, p.masses, p.f, p.b).ravel()
+    spread = p.masses.max() / p.masses.min()
+    close = 1e-12 * spread * (1 + np.abs(a).max() + np.abs(z).max())
+    np.testing.assert_allclose(T @ projection.acceleration(A, M, f, p.b), a, rtol=0, atol=close)
+    np.testing.assert_allclose(projection.constraint_force(A, M, f, p.b), z @ T, rtol=0, atol=close)
+    lam = projection.multipliers(p.A, p.masses, p.f, p.b)
+    found = projection.multipliers(A, M, f, p.b)
+    np.testing.assert_allclose(found, lam, rtol=0, atol=1e-11 * spread * (1 + np.abs(lam).max(initial=0)))
+    np.testing.assert_allclose(
+        T @ projection.project_velocities(A, M, back @ v, 0.0 * p.b),
+        projection.project_velocities(p.A, p.masses, v),
+        rtol=0,
+        atol=close,
+    )
+    np.testing.assert_allclose(
+        T @ projection.velocity_projector(A, M) @ back, projection.velocity_projector(p.A, p.masses), atol=close
+    )
+    np.testing.assert_allclose(
+        T @ projection.constrained_inverse(A, M) @ T.T,
+        projection.constrained_inverse(p.A, p.masses),
+        rtol=0,
+        atol=close / p.masses.min(),
+    )
+    literal = projection.bott_duffin(A, M, f, p.b)
+    np.testing.assert_allclose(T @ literal.acceleration, a, rtol=0, atol=10 * close)
+    np.testing.assert_allclose(literal.constraint_force, z @ T, rtol=0, atol=10 * close)
+    trial = p.rng.normal(size=n)
+    assert projection.gauss_function(back @ trial, M, f) == pytest.approx(
+        projection.gauss_function(trial, p.masses, p.f), rel=1e-10
+    )
+
+
+def test_a_singular_mass_matrix_that_is_positive_where_something_moves() -> None:
+    """Two coordinates held to each other, of which one has no mass: both move as the other does."""
+    solution = projection.bott_duffin([[1.0, -1.0]], np.diag([2.0, 0.0]), [3.0, 1.0], [0.5])
+    np.testing.assert_allclose(solution.acceleration, [2.0, 1.5], rtol=1e-14)
+    np.testing.assert_allclose(solution.constraint_force, [1.0, -1.0], rtol=1e-14)
+    with pytest.raises(InputError, match=r"not positive definite.*bott_duffin"):
+        projection.acceleration([[1.0, -1.0]], np.diag([2.0, 0.0]), [3.0, 1.0], [0.5])
+    with pytest.raises(InputError, match="singular along what the constraints leave free"):
+        projection.bott_duffin([[1.0, 0.0]], np.diag([2.0, 0.0]), [3.0, 1.0], [0.5])
+
+
+@pytest.mark.parametrize("mass", [[[1.0, 0.5], [0.4, 1.0]], [[1.0, np.nan], [np.nan, 1.0]]])
+def test_bad_mass_matrices_are_refused(mass: list[list[float]]) -> None:
+    with pytest.raises(InputError, match="finite and symmetric") as caught:
+        projection.bott_duffin(np.ones((1, 2)), mass, np.zeros(2), [0.0])
+    assert caught.value.item == "masses"
+
+
 # -- closed forms -----------------------------------------------------------------------------------
 
 

@@ -381,6 +381,44 @@ MUTANTS = [
         "rtol)].T)",
         "tests/constraints/test_projection.py::test_complex_matrices",
     ),
+    # -- multibody systems --
+    (
+        "models/multibody.py",
+        "self.N.T @ (f - self.M @ a)",
+        "self.N.T @ f",
+        "tests/models/test_multibody.py::test_one_place_against_the_theory "
+        "tests/models/test_multibody.py::test_a_linear_change_of_coordinates_changes_nothing",
+    ),
+    (
+        "models/multibody.py",
+        "left[rank - 1] > DEPENDENT * left[0]",
+        "left[rank - 1] > 0.0",
+        "tests/models/test_multibody.py::test_a_crossing_of_two_ways_is_passed_straight_on",
+    ),
+    (
+        "models/multibody.py",
+        'latest["error"] = None',
+        'latest["error"] = latest.get("error")',
+        "tests/models/test_multibody.py::test_what_ends_a_run_is_told_not_what_was_got_over",
+    ),
+    (
+        "models/multibody.py",
+        "for _ in range(ITERATIONS):",
+        "for _ in range(1):",
+        "tests/models/test_multibody.py::test_a_start_off_the_constraints_is_refused_and_can_be_mended",
+    ),
+    (
+        "models/multibody_functions.py",
+        "self._g(q + s * v, t + s), 0.0",
+        "self._g(q + s * v, t), 0.0",
+        "tests/models/test_multibody.py::test_constraints_that_move",
+    ),
+    (
+        "models/projected_steps.py",
+        "self.D[0] += y - self.y",
+        "pass",
+        "tests/models/test_projected_steps.py::test_the_next_step_starts_from_the_projection",
+    ),
     # -- steppers, thermostats, arrays --
     (
         "motion/local_projections.py",

@@ -27,8 +27,8 @@ STEPPERS: list[Stepper] = EVERY
 USUAL = {"Rattle()", "Geodesic(substeps=4)", "Suzuki4()", "KahanLi6()", "BlanesMoan4()", "BlanesMoan6()"}
 #: Slopes are measured from this error (or 8 times the lowest allowed one) down: small enough for the leading term.
 START = {2: 3e-4, 4: 4e-9, 6: 0.0}
-#: From there on, these many times more steps each.
-FINER = (1.0, 1.12, 1.25, 1.4)
+#: From there on to so many times as many steps, the first where all errors are above the bound.
+FINER = (1.4, 1.25)
 #: So accurate that the leading term shows only below 30 times the bound of all others: for these the bound is what
 #: rounding really leaves, which is measured as well.
 FINEST = {
@@ -219,30 +219,34 @@ def slope(name: str, stepper: Stepper, index: int) -> tuple[float, Sequence[tupl
     reference, rounding = cases.load(name).solution[index], FINEST.get((name, repr(stepper)))
     lowest = 30 * (rounding or bound_of(name, index))
     first = max(START[stepper.order], 8 * lowest)
+    errors: dict[int, float] = {}
+
+    def at(n: int) -> float:
+        if n not in errors:
+            try:
+                errors[n] = error(name, stepper, reference, n)
+            except (ConvergenceError, NonFiniteError):
+                errors[n] = np.inf  # the step is too large
+        return errors[n]
+
     n = 1
-    while True:
+    while at(n) > first:
         assert n < 1e6, "the error does not go down"
-        try:
-            e = error(name, stepper, reference, n)
-            if e <= first:
-                break
-        except (ConvergenceError, NonFiniteError):
-            pass  # the step is too large
-        n *= 2
-    base = n * (e / first) ** (1 / stepper.order)
-    points = []
-    for factor in FINER:
-        try:
-            points.append((round(base * factor), error(name, stepper, reference, round(base * factor))))
-        except ConvergenceError:
-            continue
-    points = [(n, e) for n, e in dict(points).items() if e >= lowest]
-    assert len(points) >= 3, f"too few points above {lowest:.1e}: {points}"
+        # Half the step, or what the order says where that is less.
+        n = max(n + 1, round(n * min(2.0, 1.01 * (at(n) / first) ** (1 / stepper.order))))
+    base = n * max(0.5, (at(n) / first) ** (1 / stepper.order))
+    base = n if n < 1.04 * base else base
+    for most in FINER:
+        counts = sorted({round(base * factor) for factor in (1.0, most**0.5, most)})
+        points = [(n, at(n)) for n in counts if lowest <= at(n) < np.inf]
+        if len(points) == 3:
+            break
+    assert len(points) == 3, f"too few points above {lowest:.1e}: {points}"
     if rounding:
         assert rounding < bound_of(name, index)
         assert error(name, stepper, reference, 4 * points[-1][0]) <= rounding
-    counts, errors = np.array(points).T
-    return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0]), points
+    logarithms = np.log(points).T
+    return -float(np.polyfit(*logarithms, 1)[0]), points
 
 
 def check_order(name: str, stepper: Stepper, index: int) -> None:

@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import norm
+from scipy.stats import kstest, norm
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import averages
-from kcons.free_energy.averages import weighted_mean
+from kcons.free_energy.averages import agreement, weighted_mean
 
 
 def ar1(rng, n, memory, d=1):
@@ -121,3 +121,27 @@ def test_the_package_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymbar", None)
     with pytest.raises(UnsupportedError, match=r"kcons\[free-energy\]"):
         averages.weighted_mean(np.arange(20.0))
+
+
+def test_windows_that_agree_do_so_with_the_right_probability():
+    """p values of means that are the same are uniform; of means that are not, they vanish."""
+    rng = np.random.default_rng(8)
+    roots = [np.array([[1.0, 0.0], [0.9, 0.3]]), np.array([[0.5, 0.2], [0.0, 0.4]])]
+    covariances = [root @ root.T for root in roots]
+    drawn = [3.0 + rng.standard_normal((2000, 2)) @ root.T for root in roots]
+    found = [agreement(a, covariances[0], b, covariances[1]) for a, b in zip(*drawn, strict=True)]
+    assert all(each.degrees_of_freedom == 2 for each in found)
+    assert kstest([each.p_value for each in found], "uniform").pvalue > 0.01
+    assert agreement([3.0, 3.0], covariances[0], [3.0, 9.0], covariances[1]).p_value < 1e-4
+
+
+def test_agreement_of_single_numbers_and_of_exact_ones():
+    assert agreement(1.0, 0.04, 1.5, 0.0).chi_square == pytest.approx(6.25)
+    assert agreement([1.0], [[0.04]], [1.5], [[0.0]]).p_value == pytest.approx(0.01242, rel=1e-3)
+    assert agreement(1.0, 0.0, 1.0, 0.0) == (0.0, 0, 1.0)
+    assert agreement(1.0, 0.0, 1.1, 0.0).p_value == 0.0
+    one = np.diag([1.0, 0.0])
+    assert agreement([0.0, 2.0], one, [1.0, 2.0], one).degrees_of_freedom == 1
+    for wrong in (([0.0, 1.0], one, [0.0], [[1.0]]), ([0.0], one, [0.0], one), ([np.nan], [[1.0]], [0.0], [[1.0]])):
+        with pytest.raises(InputError):
+            agreement(*wrong)

@@ -131,7 +131,8 @@ def test_one_end_to_end_length_beside_two_bonds(sphere):
     )
     if sphere:
         plain = mean_force(series, KT)
-        result = mean_force(series, KT, isokinetic_degrees_of_freedom=6)
+        series.isokinetic_degrees_of_freedom = 6
+        result = mean_force(series, KT)
         assert abs(plain.force[0] - exact) > 4 * plain.error[0]
     else:
         result = mean_force(series, KT)
@@ -175,8 +176,10 @@ def test_bad_input():
     for kT in (0.0, -1.0, np.nan):
         with pytest.raises(InputError, match="kT is"):
             mean_force(series, kT)
+    series.isokinetic_degrees_of_freedom = 1
     with pytest.raises(InputError, match="no temperature"):
-        mean_force(series, KT, isokinetic_degrees_of_freedom=1)
+        mean_force(series, KT)
+    series.isokinetic_degrees_of_freedom = 0
     with pytest.raises(InputError, match="20 of 20 samples are to be discarded"):
         mean_force(series, KT, discard=20)
     pulled = Series(["r"])

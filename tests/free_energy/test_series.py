@@ -69,8 +69,10 @@ def test_work_is_the_energy_that_moving_targets_add(coordinate):
 
 def test_files_have_all_of_it(tmp_path):
     series = recorded({"turn": Dihedral([[0, 1, 2, 3]]), "bond": Distance([[0, 1]])}, steps=8).series
+    series.isokinetic_degrees_of_freedom = 7
     series.save(tmp_path / "series.npz")
     read = Series.load(tmp_path / "series.npz")
+    assert read.isokinetic_degrees_of_freedom == read[1:].isokinetic_degrees_of_freedom == 7
     assert read.names == series.names and read.periods.tolist() == series.periods.tolist()
     for field in Sample._fields:
         np.testing.assert_array_equal(getattr(read, field), getattr(series, field))

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 from kcons import ConstraintSet, Motion, State, System
-from kcons.constraints import Distance, FixedAtoms, Sphere
+from kcons.constraints import Distance, FixedAtoms, Sphere, projection
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
@@ -47,6 +47,8 @@ def test_squeezer_ends_where_it_is_published_to():
     np.testing.assert_allclose(found.q[-1], script["ANGLES"], rtol=1e-9, atol=0)
     np.testing.assert_allclose(found.v[-1], script["VELOCITIES"], rtol=1e-7, atol=0)
     np.testing.assert_allclose(-found.multipliers[-1], script["MULTIPLIERS"], rtol=2e-6, atol=0)
+    # What differs is not ours.
+    np.testing.assert_allclose(found.q[-1], script["alone"]("DOP853", 1e-13)[0], rtol=1e-11, atol=0)
 
 
 def test_squeezer_is_on_its_constraints_at_each_step():
@@ -289,6 +291,40 @@ def test_a_linear_change_of_coordinates_changes_nothing(method):
     np.testing.assert_allclose(T @ pace, speed, rtol=0, atol=1e-13)
 
 
+# -- the theory --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3, 5])
+@pytest.mark.parametrize("singular", [False, True])
+def test_one_place_against_the_theory(rank, singular):
+    """Accelerations, multipliers and projections, with a row too many, M full and perhaps singular."""
+    rng = np.random.default_rng(10 * rank + singular)
+    n = 5
+    G = rng.normal(size=(rank + 1, rank)) @ rng.normal(size=(rank, n)) if rank else np.zeros((1, n))
+    square = rng.normal(size=(n, n))
+    M = square @ square.T
+    if singular and rank:  # without mass along the first row, which cannot move alone
+        e = G[0] / np.linalg.norm(G[0])
+        M = (np.eye(n) - np.outer(e, e)) @ M @ (np.eye(n) - np.outer(e, e))
+        M = 0.5 * (M + M.T)
+    f, bend = rng.normal(size=n), G @ rng.normal(size=n)
+    body = Multibody(M, lambda q, v, t: f, lambda q: G @ q - 0.5 * bend * (q @ q), lambda q: G - np.outer(bend, q))
+    v = rng.normal(size=n)
+    a, multipliers = body.motion(np.zeros(n), v)
+    literal = projection.bott_duffin(G, M, f, bend * (v @ v))
+    close = 1e-9 * (1 + np.abs(a).max())
+    np.testing.assert_allclose(a, literal.acceleration, rtol=0, atol=close)
+    np.testing.assert_allclose(G.T @ multipliers, literal.constraint_force, rtol=0, atol=100 * close)
+    assert body.degrees_of_freedom(np.zeros(n)) == n - rank
+    if not (singular and rank):
+        np.testing.assert_allclose(
+            multipliers, projection.multipliers(G, M, f, bend * (v @ v)), rtol=0, atol=100 * close
+        )
+        q, moved = body.project(np.zeros(n), v)
+        np.testing.assert_array_equal(q, 0.0)
+        np.testing.assert_allclose(moved, projection.project_velocities(G, M, v), rtol=0, atol=1e-10)
+
+
 # -- dependent rows ----------------------------------------------------------------------------------
 
 
@@ -341,6 +377,7 @@ def test_a_start_off_the_constraints_is_refused_and_can_be_mended():
     assert caught.value.rows == (1,)
     with pytest.raises(ConstraintError, match="constraint 0 is left by the velocities") as caught:
         body.solve(q, slip, (0, 1))
+    body.solve(q, v + 1e-17, (0, 0.1))  # at rest but for rounding
     place, speed = body.project(off, slip)
     body.solve(place, speed, (0, 0.1))
     # The smallest correction in the metric of M: orthogonal to what may move.
@@ -404,6 +441,18 @@ def test_trial_steps_may_go_too_far():
     found = Multibody([1.0], wall).solve([1.0], [-1.0], (0, 2.5), first_step=1.5)
     energy = 0.5 * found.v[:, 0] ** 2 + 1e-3 / found.q[:, 0]
     np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+
+
+def test_what_ends_a_run_is_told_not_what_was_got_over():
+    """A trial step that fails once, and steps too small much later."""
+    calls = []
+
+    def force(q, v, t):
+        calls.append(t)
+        return v**2 if len(calls) != 12 else v * np.nan
+
+    with pytest.raises(ConvergenceError, match="the run ended at t ="):
+        Multibody([1.0], force).solve([0.0], [1.0], (0, 2))
 
 
 def test_steps_that_become_too_small():

@@ -60,8 +60,8 @@ def runs(monkeypatch, tmp_path):
     minimize = openmm.LocalEnergyMinimizer.minimize
 
     def elsewhere(context, tolerance=10, maxIterations=0, reporter=None):
-        """OpenMM's minimiser for OpenCL crashes on processors, whatever the integrator."""
-        if context.getPlatform().getName() != "OpenCL":
+        """On the CPU platform: that of OpenCL crashes on processors, that of Reference takes ten times as long."""
+        if context.getPlatform().getName() == "CPU":
             minimize(context, tolerance, maxIterations, reporter)
             return
         there = started(context.getSystem(), openmm.VerletIntegrator(0.001), state_of(context)[0], None, "CPU")

@@ -12,8 +12,6 @@ import pytest
 from openmm import app, unit
 from openmm_parts import HeldCoordinates
 
-from kcons.openmm.integrator.guard import positions_of, velocities_of
-
 DATA = Path(__file__).resolve().parents[1] / "data"
 #: What every test that is parametrised by platform runs on: they carry exact doubles and are on every machine.
 #: Platforms of a GPU, or OpenCL on the CPU, may be there as well; no test depends on whether they are.
@@ -50,7 +48,8 @@ def started(system, integrator, x, v=None, platform="Reference"):
 
 
 def state_of(context):
-    return positions_of(context), velocities_of(context)
+    state = context.getState(positions=True, velocities=True)
+    return np.asarray(state.getPositions(asNumpy=True)._value), np.asarray(state.getVelocities(asNumpy=True)._value)
 
 
 def total_energy(context):

@@ -23,6 +23,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 
 from kcons.constraints.arguments import FloatArray
+from kcons.thermostats import Estimate
 
 #: Of the diagonal, added to the covariance: rounding of a matrix of that size.
 _ROUNDING = 1e-10
@@ -72,6 +73,12 @@ class Axis:
         return integral(place) - integral(0.0) + turns[:, None] * turn, spline(place) / self.length
 
 
+def difference(values: FloatArray, covariance: FloatArray) -> Estimate:
+    """Of the second value from the first."""
+    variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+    return Estimate(float(values[1] - values[0]), math.sqrt(max(float(variance), 0.0)))
+
+
 def _matern(square: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Matern 7/2 of squared distances, with two derivatives by them: the mean force is as smooth as Matern 5/2."""
     a = np.sqrt(7 * square)
@@ -106,6 +113,9 @@ class GradientProcess:
         Logarithms of the amplitude, and of u' in units of the range.
     trends : sequence of bool
         Whether the free energy may also grow by a constant slope along a coordinate.
+    rotation : float
+        Size, relative to the gradient, of a field beside it whose components know nothing of each other: how far the
+        vectors are from being any gradient.
     """
 
     def __init__(
@@ -116,9 +126,11 @@ class GradientProcess:
         axes: Sequence[Axis],
         parameters: FloatArray,
         trends: Sequence[bool],
+        rotation: float = 0.0,
     ) -> None:
         self.points, self.gradients, self.covariances = points, gradients, covariances
         self.axes, self.parameters, self.trends = axes, parameters, trends
+        self._rotation = rotation
         logarithms = np.split(parameters[1:], np.cumsum([axis.coefficients for axis in axes])[:-1])
         self._factors = [np.exp(each) for each in logarithms]
         size = max(float(np.sqrt(np.mean(g**2))) * axis.length for g, axis in zip(gradients.T, axes, strict=True))
@@ -156,9 +168,18 @@ class GradientProcess:
                         for z, c in ((one, p), (other, q))
                     ]
                     product = product + slope**2 * np.outer(*ends)
+            if self._rotation and p == q >= 0:
+                du, dw = (z.designs[p][1] @ self._factors[p] for z in (one, other))
+                alike = math.prod(part[0][0] for part in parts)
+                product = product + self._rotation**2 * self._variance * alike * np.outer(du, dw)
             return np.asarray(product)
 
         return np.block([[block(p, q) for q in columns] for p in rows])
+
+    def mean(self, x: FloatArray, components: Sequence[int]) -> FloatArray:
+        """Of `posterior` alone, shape (components, n)."""
+        cross = self._covariance((Points(x, self.axes), components), self._seen)
+        return (cross @ self._weights).reshape(len(components), len(x))
 
     def posterior(self, *asked: tuple[FloatArray, Sequence[int]]) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of what is asked: places (n, d) and components there, one component after another.

@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
 from kcons.thermostats import Estimate
 
 Method = Literal["gp", "spline"]
@@ -131,8 +131,7 @@ class Profile:
         F, covariance = self._known.values(self.method, ends, self._closed)
         if self._added is not None:
             F = F + self._added(ends)
-        variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
-        return Estimate(float(F[1] - F[0]), math.sqrt(max(float(variance), 0.0)))
+        return difference(F, covariance)
 
     def without_jacobian(
         self, jacobian: Literal["distance", "angle"] | Callable[[FloatArray], FloatArray], thermal_energy: float
@@ -266,9 +265,7 @@ def integrate(
     points = np.linspace(known.x[0], known.end, _POINTS) if at is None else _places(at, known, "at")
     closure = None
     if period is not None:
-        F, covariance = known.values(method, np.array([known.x[0], known.end]), False)
-        variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
-        closure = Estimate(float(F[1] - F[0]), math.sqrt(max(float(variance), 0.0)))
+        closure = difference(*known.values(method, np.array([known.x[0], known.end]), False))
         if abs(closure.value) > _CLOSES * closure.error and abs(closure.value) > 1e-9 * period * np.abs(known.f).max():
             warnings.warn(
                 f"the mean force has the integral {closure.value:.4g} ± {closure.error:.2g} over the period, which "

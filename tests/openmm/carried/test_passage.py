@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import openmm
 import pytest
-from openmm_systems import GPUS, context_of, positions_of
+from openmm_systems import GPUS, context_of, state_of
 
 from kcons.openmm.carried.passage import CARRY_SCALE, Passage
 from kcons.openmm.integrator.precision import Precision
@@ -44,7 +44,7 @@ def sent(platform, some):
     passage.precision = Precision.of(context)
     context.setPositions(X)
     integrator.step(1)
-    return positions_of(context), messenger
+    return state_of(context)[0], messenger
 
 
 @pytest.mark.parametrize("platform", ["Reference", "CPU", *(p for p in GPUS if "single" not in str(p.id))])

@@ -1,0 +1,273 @@
+"""Free energy in several coordinates from the mean forces of windows, wherever these are.
+
+A Gaussian process learned from the vectors (`gaussian_process`): least squares on as many functions as there are
+components, with the errors and the lengths that make the vectors most likely. Only gradients can be fitted by it. How
+much more likely the vectors are if their components need not belong to one free energy is the check of consistency.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from kcons.constraints.arguments import FloatArray, numbers
+from kcons.errors import InputError
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
+from kcons.thermostats import Estimate
+
+#: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
+_ROTATIONS = np.geomspace(0.01, 3.0, 12)
+#: Probability below which that field is warned of.
+_CHANCE = 1e-3
+#: Distance, in parts of the range, below which two minima are one.
+_SAME = 1e-3
+
+
+class Consistency(NamedTuple):
+    """Whether the mean forces are a gradient.
+
+    Attributes
+    ----------
+    rotation : float
+        Most likely size of what is no gradient, relative to the gradient.
+    p_value : float
+        Probability of such a gain of likelihood by chance, if they are a gradient.
+    """
+
+    rotation: float
+    p_value: float
+
+
+class Minimum(NamedTuple):
+    """A minimum of a surface: where, F and the standard error of F, both against the zero of the surface."""
+
+    x: FloatArray
+    F: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A free energy in d coordinates.
+
+    Attributes
+    ----------
+    windows, mean_forces : ndarray, shape (n, d)
+    low, high : ndarray, shape (d,)
+        The range of the windows, or one period.
+    periods : tuple of float or None
+    zero : ndarray, shape (d,)
+        Where F is 0.
+    consistency : Consistency
+    """
+
+    windows: FloatArray
+    mean_forces: FloatArray
+    low: FloatArray
+    high: FloatArray
+    periods: tuple[float | None, ...]
+    zero: FloatArray
+    consistency: Consistency
+    _process: GradientProcess
+
+    def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """F and its standard error, both against `zero`, at places of shape (m, d).
+
+        Raises
+        ------
+        InputError
+            A place outside of the range of the windows.
+        """
+        places = self._places(x)
+        values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))
+        variance = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
+        return values[:-1] - values[-1], np.sqrt(np.maximum(variance, 0.0))
+
+    def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
+        """F(b) - F(a) with its standard error."""
+        return difference(*self._process.posterior((self._places(np.stack([numbers(a, "a"), numbers(b, "b")])), [-1])))
+
+    def minima(self) -> list[Minimum]:
+        """Minima inside of the range, lowest first; each is what a search from some window comes to."""
+        size = self.high - self.low
+        found: list[FloatArray] = []
+        for start in self.windows:
+            place = self._wrapped(_descended(self._process, start, self.low, self.high, self.periods))
+            open_ends = np.array([period is None for period in self.periods])
+            if (open_ends & ((place <= self.low) | (place >= self.high))).any():
+                continue
+            if all(np.abs(self._away(place - other) / size).max() > _SAME for other in found):
+                found.append(place)
+        if not found:
+            return []
+        F, errors = self.free_energy(found)
+        minima = [Minimum(x, float(value), float(error)) for x, value, error in zip(found, F, errors, strict=True)]
+        return sorted(minima, key=lambda minimum: minimum.F)
+
+    def _places(self, x: ArrayLike) -> FloatArray:
+        places = numbers(x, "x")
+        if places.ndim != 2 or places.shape[1] != len(self.low) or not np.isfinite(places).all():
+            raise InputError(f"places must be finite and have shape (m, {len(self.low)})", item="x")
+        slack = 1e-9 * (self.high - self.low)
+        for j, period in enumerate(self.periods):
+            outside = (places[:, j] < self.low[j] - slack[j]) | (places[:, j] > self.high[j] + slack[j])
+            if period is None and outside.any():
+                raise InputError(
+                    f"coordinate {j} of place {int(np.argmax(outside))} is beyond the windows, which are between "
+                    f"{self.low[j]:g} and {self.high[j]:g}",
+                    item="x",
+                )
+        return places
+
+    def _away(self, x: FloatArray) -> FloatArray:
+        """Differences, the shortest way round."""
+        return np.array([v if p is None else v - p * round(v / p) for v, p in zip(x, self.periods, strict=True)])
+
+    def _wrapped(self, x: FloatArray) -> FloatArray:
+        ends = zip(x, self.low, self.periods, strict=True)
+        return np.array([v if p is None else low + (v - low) % p for v, low, p in ends])
+
+
+def fit_surface(
+    x: ArrayLike,
+    f: ArrayLike,
+    errors: ArrayLike,
+    *,
+    periods: Sequence[float | None] | None = None,
+    zero: ArrayLike | None = None,
+) -> Surface:
+    """Free energy in d coordinates from the mean forces of n windows, on a grid or not.
+
+    The time goes with the third power of n d: some hundred windows in two coordinates take seconds to a minute.
+
+    Parameters
+    ----------
+    x : array_like, shape (n, d)
+        Places of the windows.
+    f : array_like, shape (n, d)
+        The gradient of the free energy there.
+    errors : array_like, shape (n, d) or (n, d, d)
+        Standard errors of f, or covariances of its components.
+    periods : sequence of d periods, optional
+        None for a coordinate that is not periodic.
+    zero : array_like, shape (d,), optional
+        Where F is 0; by default at the lowest window.
+
+    Raises
+    ------
+    InputError
+        Fewer than d + 2 windows; a NaN or infinity; shapes that do not go together; a covariance that is none;
+        windows further apart than a period.
+
+    Warns
+    -----
+    UserWarning
+        The mean forces are not the gradient of any free energy.
+    """
+    places, forces, covariances, turns = _checked(x, f, errors, periods)
+    d = places.shape[1]
+    low = places.min(axis=0)
+    high = np.array(
+        [top if p is None else start + p for top, start, p in zip(places.max(axis=0), low, turns, strict=True)]
+    )
+    axes = [Axis(float(a), float(b - a), p is not None) for a, b, p in zip(low, high, turns, strict=True)]
+    process = learn(places, forces, covariances, axes, [p is None for p in turns])
+    consistency = _consistency(process)
+    if consistency.p_value < _CHANCE:
+        warnings.warn(
+            f"the mean forces are no gradient: a field beside it of {consistency.rotation:.0%} of its size is more "
+            f"likely (p = {consistency.p_value:.1e}). Windows are in different states of what is not held, or their "
+            "errors are too small",
+            UserWarning,
+            stacklevel=2,
+        )
+    if zero is None:
+        lowest = places[np.argmin(process.mean(places, [-1])[0])]
+    else:
+        lowest = numbers(zero, "zero")
+        if lowest.shape != (d,) or not np.isfinite(lowest).all():
+            raise InputError(f"zero must be {d} finite numbers", item="zero")
+    surface = Surface(places, forces, low, high, turns, lowest, consistency, process)
+    surface._places(lowest[None])
+    return surface
+
+
+def _descended(
+    process: GradientProcess, start: FloatArray, low: FloatArray, high: FloatArray, periods: Sequence[float | None]
+) -> FloatArray:
+    """Where the free energy is lowest near `start`, in the range."""
+    size = high - low
+
+    def value(part: FloatArray) -> tuple[float, FloatArray]:
+        found = process.mean((low + part * size)[None], range(-1, len(low)))[:, 0]
+        return float(found[0]), found[1:] * size
+
+    bounds = [(0.0, 1.0) if period is None else (None, None) for period in periods]
+    found = minimize(value, (start - low) / size, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-13})
+    return np.asarray(low + found.x * size)
+
+
+def _consistency(process: GradientProcess) -> Consistency:
+    """By the ratio of likelihoods with and without a field that is no gradient, all lengths as they are."""
+    if len(process.axes) == 1:
+        return Consistency(0.0, 1.0)
+
+    def likelihood(rotation: float) -> float:
+        return GradientProcess(
+            process.points,
+            process.gradients,
+            process.covariances,
+            process.axes,
+            process.parameters,
+            process.trends,
+            rotation,
+        ).log_likelihood()
+
+    found = [likelihood(float(size)) for size in _ROTATIONS]
+    best = int(np.argmax(found))
+    gain = 2 * (found[best] - process.log_likelihood())
+    # The size cannot be negative: chance has it at 0 half of the time.
+    return Consistency(float(_ROTATIONS[best]), 0.5 * float(chi2.sf(gain, 1))) if gain > 0 else Consistency(0.0, 1.0)
+
+
+def _checked(
+    x: ArrayLike, f: ArrayLike, errors: ArrayLike, periods: Sequence[float | None] | None
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[float | None, ...]]:
+    places, forces, given = (numbers(values, name) for values, name in ((x, "x"), (f, "f"), (errors, "errors")))
+    if places.ndim != 2 or not places.shape[1] or len(places) < places.shape[1] + 2:
+        raise InputError(f"x has shape {places.shape}; give (n, d) with n of d + 2 or more", item="x")
+    n, d = places.shape
+    if forces.shape != (n, d):
+        raise InputError(f"f must have shape {(n, d)}, not {forces.shape}", item="f")
+    if given.shape not in ((n, d), (n, d, d)):
+        raise InputError(f"errors must have shape {(n, d)} or {(n, d, d)}, not {given.shape}", item="errors")
+    for array, name in ((places, "x"), (forces, "f"), (given, "errors")):
+        wrong = np.argwhere(~np.isfinite(array))
+        if len(wrong):
+            raise InputError(f"{name} of window {wrong[0, 0]} is not finite; leave it out", item=name)
+    if given.ndim == 2 and (given < 0).any():
+        raise InputError(f"an error of window {np.argwhere(given < 0)[0, 0]} is negative", item="errors")
+    covariances = given if given.ndim == 3 else given[:, :, None] ** 2 * np.eye(d)
+    sizes = np.linalg.eigvalsh(covariances)
+    skew = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
+    bad = np.flatnonzero((sizes[:, 0] < -1e-9 * np.abs(sizes[:, -1])) | (skew > 1e-9 * np.abs(sizes).max(axis=1)))
+    if len(bad):
+        raise InputError(f"the covariance of window {bad[0]} is not symmetric and positive", item="errors")
+    turns = (None,) * d if periods is None else tuple(periods)
+    if len(turns) != d or any(p is not None and not p > 0 for p in turns):
+        raise InputError(f"periods must be {d} positive numbers or None", item="periods")
+    for j, period in enumerate(turns):
+        spread = float(np.ptp(places[:, j]))
+        if not spread > 0 or (period is not None and spread > period * (1 + 1e-9)):
+            reason = (
+                "all windows are at one value of" if not spread > 0 else "windows are further apart than the period in"
+            )
+            raise InputError(f"{reason} coordinate {j}; check the units, or leave it out", item="x")
+    return places, forces, covariances, turns

@@ -1,0 +1,278 @@
+"""Free energies from the work of steered pulls.
+
+The work that a moving target does over a pull is the integral of its force along its path. Averages of exp(-W/kT) over
+pulls from equilibrium give the difference of free energy (Jarzynski, Phys. Rev. Lett. 78, 2690 (1997)); pulls both ways
+are tied by P_F(W)/P_B(-W) = exp((W - F)/kT) (Crooks, Phys. Rev. E 60, 2721 (1999)), which BAR solves with the least
+error (Bennett, J. Comput. Phys. 22, 245 (1976); Shirts et al., Phys. Rev. Lett. 91, 140601 (2003)).
+
+A coordinate that is held rather than pulled by a spring is where its target is: no other ensemble has to be unfolded.
+What is found is the free energy of the held system. That of the coordinate, -kT ln P, has -kT ln <Z^(-1/2)> beside it,
+which `work_profile` adds if the weights of the series are given.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import expit, logsumexp
+
+from kcons.constraints.arguments import FloatArray, IntArray, numbers
+from kcons.errors import InputError
+from kcons.free_energy.averages import FEW_INDEPENDENT, pymbar
+from kcons.thermostats import Estimate
+
+#: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
+FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """What pulls say of F(end) - F(start).
+
+    Attributes
+    ----------
+    jarzynski : Estimate
+        -kT ln <exp(-W/kT)> over the forward pulls.
+    cumulant : Estimate
+        <W> - var(W)/2kT: exact where works are normally distributed.
+    bias : float
+        By how much `jarzynski` is too high in the mean, to first order in 1/n (Gore, Ritort and Bustamante, Proc.
+        Natl. Acad. Sci. USA 100, 12564 (2003)).
+    n_effective : float
+        Forward pulls that count: (sum w)^2/sum w^2 with w = exp(-W/kT).
+    dissipated : float
+        Mean forward work less the best estimate.
+    jarzynski_backward, cumulant_backward, bias_backward, n_effective_backward
+        The same from the backward pulls, of the same difference; None without them.
+    bar : Estimate or None
+        From pulls both ways.
+    crossing : Estimate or None
+        Where normal distributions of the works W and -W_backward cross. None if all works of a direction are the same.
+    overlap : float or None
+        0 if no forward pull could have been a backward one, 1 if all could.
+    """
+
+    jarzynski: Estimate
+    cumulant: Estimate
+    bias: float
+    n_effective: float
+    dissipated: float
+    jarzynski_backward: Estimate | None = None
+    cumulant_backward: Estimate | None = None
+    bias_backward: float | None = None
+    n_effective_backward: float | None = None
+    bar: Estimate | None = None
+    crossing: Estimate | None = None
+    overlap: float | None = None
+
+    @property
+    def best(self) -> Estimate:
+        """BAR if there are pulls both ways, else Jarzynski's."""
+        return self.jarzynski if self.bar is None else self.bar
+
+
+def pull_free_energy(
+    forward: ArrayLike, backward: ArrayLike | None = None, *, thermal_energy: float, seed: int = 0
+) -> Pulled:
+    """Difference of free energy from the works of pulls.
+
+    Errors are those of a bootstrap over pulls; that of BAR is its asymptotic one.
+
+    Parameters
+    ----------
+    forward : array_like, shape (n,)
+        Work done on the system by pulls from start to end, each from equilibrium at the start.
+    backward : array_like, shape (m,), optional
+        Work done on the system by pulls from end to start, each from equilibrium at the end.
+    thermal_energy : float
+        kT in the unit of the works.
+    seed : int
+        Of the bootstrap.
+
+    Raises
+    ------
+    InputError
+        Fewer than 5 pulls in a direction; a NaN or infinity; kT is not positive.
+    UnsupportedError
+        Pulls both ways, and pymbar is not installed.
+
+    Warns
+    -----
+    UserWarning
+        Fewer than 10 forward pulls count and there are none back, or pulls both ways overlap by less than 3 percent.
+    """
+    ahead = _works(forward, "forward", thermal_energy)
+    rng = np.random.default_rng(seed)
+    drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
+    jarzynski, cumulant = _both(ahead, drawn)
+    effective = _effective(ahead)
+    kT, bias = thermal_energy, _bias(ahead)
+    if backward is None:
+        if effective < FEW_INDEPENDENT:
+            warnings.warn(
+                f"{effective:.1f} of {len(ahead)} pulls count in the average of exp(-W/kT), and it may be off by more "
+                "than its error: pull more slowly, or backward as well",
+                UserWarning,
+                stacklevel=2,
+            )
+        return Pulled(
+            _times(jarzynski, kT),
+            _times(cumulant, kT),
+            kT * bias,
+            effective,
+            kT * (float(ahead.mean()) - jarzynski.value),
+        )
+    back = _works(backward, "backward", thermal_energy)
+    drawn_back = back[rng.integers(len(back), size=(_SAMPLES, len(back)))]
+    jarzynski_back, cumulant_back = _both(back, drawn_back)
+    found = pymbar().bar(ahead, back)
+    overlap = _overlap(ahead, back, float(found["Delta_f"]))
+    if overlap < _OVERLAP:
+        warnings.warn(
+            f"forward and backward pulls have an overlap of {overlap:.1%}; below {_OVERLAP:.0%} errors are not to be "
+            "relied on: pull more slowly, or over a shorter way",
+            UserWarning,
+            stacklevel=2,
+        )
+    crossing = None
+    if np.ptp(ahead) and np.ptp(back):
+        sampled = _crossing(drawn, drawn_back)
+        crossing = Estimate(kT * float(_crossing(ahead[None], back[None])[0]), kT * float(np.nanstd(sampled)))
+    return Pulled(
+        _times(jarzynski, kT),
+        _times(cumulant, kT),
+        kT * bias,
+        effective,
+        kT * float(ahead.mean() - found["Delta_f"]),
+        _times(jarzynski_back, -kT),
+        _times(cumulant_back, -kT),
+        -kT * _bias(back),
+        _effective(back),
+        _times(Estimate(float(found["Delta_f"]), float(found["dDelta_f"])), kT),
+        crossing,
+        overlap,
+    )
+
+
+def work_along(x: ArrayLike, force: ArrayLike) -> FloatArray:
+    """Work done up to each place of a path, by the trapezoidal rule: the integral of the force on the target over it.
+
+    Parameters
+    ----------
+    x : array_like, shape (m,)
+        Where the target was.
+    force : array_like, shape (m,) or (n, m)
+        What moves the coordinate, in n pulls: the multiplier with the sign of dF/dx.
+
+    Returns
+    -------
+    ndarray, shape of `force`
+
+    Raises
+    ------
+    InputError
+        Shapes that do not go together; a NaN or infinity.
+    """
+    path, pushes = numbers(x, "x"), numbers(force, "force")
+    if path.ndim != 1 or len(path) < 2 or pushes.ndim not in (1, 2) or pushes.shape[-1] != len(path):
+        raise InputError(f"forces of shape {pushes.shape} do not go with a path of shape {path.shape}", item="force")
+    if not (np.isfinite(path).all() and np.isfinite(pushes).all()):
+        raise InputError("a place or a force of the path is not finite", item="force")
+    done = np.cumsum(0.5 * (pushes[..., 1:] + pushes[..., :-1]) * np.diff(path), axis=-1)
+    return np.concatenate([np.zeros((*pushes.shape[:-1], 1)), done], axis=-1)
+
+
+def work_profile(
+    works: ArrayLike, *, thermal_energy: float, log_weights: ArrayLike | None = None, seed: int = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Free energy along the path of forward pulls, against its start, with bootstrapped errors.
+
+    F(x) - F(0) = -kT ln(<exp(-W/kT) w>/<w at the start>), place by place.
+
+    Parameters
+    ----------
+    works : array_like, shape (n, m)
+        Work up to each of m places, of n pulls: see `work_along`.
+    thermal_energy : float
+    log_weights : array_like, shape (n, m), optional
+        ln Z^(-1/2) at each place: then F is -kT ln P of the coordinate. Without, it is that of the held system.
+    seed : int
+
+    Returns
+    -------
+    F, errors : ndarray, shape (m,)
+    """
+    done = numbers(works, "works")
+    if done.ndim != 2 or not done.shape[1]:
+        raise InputError(f"works must have shape (n, m), not {done.shape}", item="works")
+    reduced = np.stack([_works(column, "works", thermal_energy) for column in done.T], axis=1)
+    weights = np.zeros_like(reduced) if log_weights is None else numbers(log_weights, "log_weights")
+    if weights.shape != reduced.shape or not np.isfinite(weights).all():
+        raise InputError(f"log_weights must be finite and have shape {reduced.shape}", item="log_weights")
+
+    def along(chosen: IntArray | slice) -> FloatArray:
+        return np.asarray(logsumexp(weights[chosen, 0], axis=0) - logsumexp(weights[chosen] - reduced[chosen], axis=0))
+
+    rng, n = np.random.default_rng(seed), len(reduced)
+    sampled = np.array([along(rng.integers(n, size=n)) for _ in range(_SAMPLES)])
+    return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
+
+
+def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
+    """Works over kT."""
+    if not (thermal_energy > 0 and math.isfinite(thermal_energy)):
+        raise InputError(f"kT is {thermal_energy}; give a positive number", item="thermal_energy")
+    values = numbers(works, item)
+    if values.ndim != 1 or len(values) < FEWEST:
+        raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
+    if not np.isfinite(values).all():
+        raise InputError(f"work {int(np.argmin(np.isfinite(values)))} of {item} is not finite; leave it out", item=item)
+    return values / thermal_energy
+
+
+def _both(works: FloatArray, drawn: FloatArray) -> tuple[Estimate, Estimate]:
+    """Jarzynski's average and the second cumulant."""
+
+    def jarzynski(w: FloatArray) -> FloatArray:
+        return np.asarray(math.log(len(works)) - logsumexp(-w, axis=-1))
+
+    def cumulant(w: FloatArray) -> FloatArray:
+        return np.asarray(w.mean(axis=-1) - 0.5 * w.var(axis=-1, ddof=1))
+
+    first, second = (Estimate(float(f(works)), float(f(drawn).std(ddof=1))) for f in (jarzynski, cumulant))
+    return first, second
+
+
+def _effective(works: FloatArray) -> float:
+    return math.exp(2 * logsumexp(-works) - logsumexp(-2 * works))
+
+
+def _bias(works: FloatArray) -> float:
+    """Of Jarzynski's average over kT: var(w)/(2 n <w>^2), w = exp(-W/kT)."""
+    return 0.5 * (1 / _effective(works) - 1 / len(works))
+
+
+def _overlap(ahead: FloatArray, back: FloatArray, difference: float) -> float:
+    """What MBAR's overlap matrix has off its diagonal (Klimovich et al., J. Comput.-Aided Mol. Des. 29, 397 (2015))."""
+    odds = np.concatenate([ahead, -back]) - difference + math.log(len(ahead) / len(back))
+    return float((expit(odds) * expit(-odds)).sum() * (1 / len(ahead) + 1 / len(back)))
+
+
+def _crossing(ahead: FloatArray, back: FloatArray) -> FloatArray:
+    """Where the normal densities of W and of -W_backward are equal, between their means; row by row."""
+    one, other = ahead.mean(axis=1), -back.mean(axis=1)
+    middle = 0.5 * (one + other)
+    one, other = one - middle, other - middle
+    v, w = ahead.var(axis=1, ddof=1), back.var(axis=1, ddof=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # samples of one value, drawn again and again
+        a, b = 1 / v - 1 / w, one / v - other / w
+        c = one**2 / v - other**2 / w + np.log(v / w)
+        return middle + c / (b + np.copysign(np.sqrt(b**2 - a * c), b))
+
+
+def _times(estimate: Estimate, factor: float) -> Estimate:
+    return Estimate(factor * estimate.value, abs(factor) * estimate.error)

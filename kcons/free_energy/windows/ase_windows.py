@@ -1,0 +1,126 @@
+"""Windows sampled by ASE with any calculator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase import Atoms, units
+
+from kcons.ase import (
+    ConstrainedLangevin,
+    ConstrainedNoseHoover,
+    IsokineticDynamics,
+    draw_velocities,
+    from_ase_constraints,
+)
+from kcons.ase.topology import bonds_of
+from kcons.constraints import Constraint
+from kcons.constraints.target import FloatArray
+from kcons.errors import ConvergenceError
+from kcons.free_energy.ase_recorder import AseRecorder
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
+from kcons.motion import minimise
+
+#: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
+_FORCE, _STRIDE = 0.1, 0.1
+
+
+class AseWindows:
+    """Windows of ASE `Atoms`.
+
+    Parameters
+    ----------
+    atoms : ase.Atoms
+        The structure that all windows start from. Its ASE constraints are held beside the coordinates.
+    calculator : callable
+        Makes a calculator, in each process anew; a function of a module, so that it can be pickled.
+    coordinates : mapping of str to Constraint
+        Angstrom and radian; what they are held at is set by the windows.
+    held : sequence of Constraint
+        What is held besides, for example ``kcons.ase.constraints_of(atoms, "hbonds")``.
+
+    Raises
+    ------
+    KconsError
+        At `begin`: a coordinate that is undefined at the structure or depends on the other constraints.
+    """
+
+    kJ = units.mol / units.kJ
+
+    def __init__(
+        self,
+        atoms: Atoms,
+        calculator: Callable[[], Any],
+        coordinates: Mapping[str, Constraint],
+        held: Sequence[Constraint] = (),
+    ) -> None:
+        self.atoms = atoms.copy()
+        self.calculator = calculator
+        self.coordinates = dict(coordinates)
+        self.held = [*from_ase_constraints(self.atoms), *held]
+        self.atoms.set_constraint()
+        self.names = tuple(self.coordinates)
+        self.angles = angles_of(self.coordinates)
+        self.scales = scales_of(self.coordinates, 1.0)
+
+    def _rows(self) -> Held:
+        atoms = self.atoms
+        return Held(
+            self.coordinates,
+            self.held,
+            atoms.positions.copy(),
+            atoms.get_masses(),
+            atoms.cell.array if atoms.pbc.any() else None,
+            atoms.pbc,
+            lambda: bonds_of(atoms),
+        )
+
+    def begin(self) -> tuple[FloatArray, FloatArray]:
+        held = self._rows()
+        return held.found, held.periods
+
+    def sample(self, window: Window, settings: Settings, file: Path) -> None:
+        held = self._rows()
+        atoms = self.atoms.copy()
+        atoms.calc = self.calculator()
+        motion, x = held.placed(window.start)
+        if settings.relax:
+
+            def force(x: FloatArray, time: float) -> FloatArray:
+                atoms.positions = x
+                return np.asarray(atoms.get_forces(apply_constraint=False))
+
+            try:
+                x = minimise(motion, force, x, tolerance=_FORCE, longest=_STRIDE, steps=settings.relax).positions
+            except ConvergenceError as error:  # relaxed as far as wanted
+                if error.positions is None:
+                    raise
+                x = error.positions
+        atoms.positions = x
+        dt, friction = settings.timestep * units.fs, settings.friction / (1000 * units.fs)
+        common: dict[str, Any] = {"temperature_K": settings.temperature}
+        moved = held.towards(window, max(settings.pull, 1) * dt)
+        draw_velocities(atoms, settings.temperature, window.seed, constraints=[*held.others, *held.at(window.start)])
+        if settings.pull:
+            ConstrainedLangevin(
+                atoms, dt, friction=friction, rng=window.seed, constraints=[*held.others, *moved], **common
+            ).run(settings.pull)
+        rows = [*held.others, *held.at(window.target)]
+        # Velocities of the pull's end have its rate.
+        free = settings.thermostat != "langevin" and all(row.translation_invariant for row in rows)
+        draw_velocities(atoms, settings.temperature, window.seed + 1, constraints=rows, zero_momentum=free)
+        if settings.thermostat == "langevin":
+            common |= {"friction": friction, "rng": window.seed + 2}
+            dynamics: Any = ConstrainedLangevin(atoms, dt, constraints=rows, **common)
+        elif settings.thermostat == "nose-hoover":
+            dynamics = ConstrainedNoseHoover(atoms, dt, tdamp=1 / friction, constraints=rows, **common)
+        else:
+            dynamics = IsokineticDynamics(atoms, dt, constraints=rows, **common)
+        dynamics.run(settings.equilibration)
+        recorder = AseRecorder(dynamics, self.coordinates)
+        dynamics.attach(recorder, interval=settings.every)
+        dynamics.run(settings.production)
+        recorder.series.save(file)

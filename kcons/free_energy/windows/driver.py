@@ -1,0 +1,408 @@
+"""Windows run by any executor, kept one by one as they finish, and put together."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED as FIRST
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from multiprocessing import get_context
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, KconsError, OccupiedError
+from kcons.free_energy.averages import agreement
+from kcons.free_energy.mean_forces import MeanForce, mean_force
+from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
+from kcons.free_energy.profiles.profile import Profile, integrate
+from kcons.free_energy.series import Series
+from kcons.free_energy.windows.window import Sampler, Settings, Window
+from kcons.steppers.files import in_one_piece, text
+
+#: Boltzmann's constant in kJ/mol/K.
+BOLTZMANN = 0.00831446261815324
+#: How often a window is begun again whose process was killed.
+RETRIES = 3
+SIDES = ("up", "down")
+
+
+@dataclass(frozen=True)
+class WindowResult:
+    """The mean force where one or several coordinates were held, in kJ/mol, angstrom and radian.
+
+    Attributes
+    ----------
+    number : int
+    value, force, error : ndarray, shape (d,)
+        The coordinates, dF/dq and its standard error.
+    covariance : ndarray, shape (d, d)
+    sides : dict of str to MeanForce
+        From below and from above.
+    hysteresis : float
+        Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
+    raw : ndarray, shape (d,)
+        The plain mean of the multipliers, for comparison.
+    """
+
+    number: int
+    value: FloatArray
+    force: FloatArray
+    covariance: FloatArray
+    sides: dict[str, MeanForce]
+    hysteresis: float
+    raw: FloatArray
+
+    @property
+    def error(self) -> FloatArray:
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+@dataclass
+class FreeEnergy:
+    """What became of the windows.
+
+    Attributes
+    ----------
+    names : tuple of str
+    periods : ndarray, shape (d,)
+    windows : list of WindowResult
+        Those that are finished, in the order of their coordinates.
+    failed : dict of str to str
+        Windows that failed, and why.
+    """
+
+    names: tuple[str, ...]
+    periods: FloatArray
+    windows: list[WindowResult]
+    failed: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def profile(self) -> Profile:
+        """Free energy along the only coordinate, kJ/mol.
+
+        Raises
+        ------
+        InputError
+            There are several coordinates, or too few windows.
+        """
+        if len(self.names) != 1:
+            raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
+        x, f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("value", "force", "error"))
+        period = float(self.periods[0]) or None
+        spread = np.ptp(x) if len(x) else 0.0
+        whole = period is not None and spread + np.diff(np.sort(x)).max(initial=0.0) >= period * (1 - 1e-6)
+        return integrate(x, f, e, period=period if whole else None)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Free energy in all coordinates, kJ/mol.
+
+        Raises
+        ------
+        InputError
+            Too few windows.
+        """
+        x, f = (np.array([getattr(w, name) for w in self.windows]) for name in ("value", "force"))
+        covariances = np.array([w.covariance for w in self.windows])
+        return fit_surface(x, f, covariances, periods=[period or None for period in self.periods.tolist()])
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it as plain data."""
+        return {
+            "names": list(self.names),
+            "units": "kJ/mol, angstrom, radian",
+            "windows": [
+                {
+                    "number": w.number,
+                    "value": w.value.tolist(),
+                    "mean force": w.force.tolist(),
+                    "covariance": w.covariance.tolist(),
+                    "raw multiplier": w.raw.tolist(),
+                    "hysteresis": w.hysteresis,
+                    "samples": sum(side.n for side in w.sides.values()),
+                    "independent samples": sum(side.n_effective for side in w.sides.values()),
+                }
+                for w in self.windows
+            ],
+            "failed": self.failed,
+        }
+
+
+class Windows:
+    """Windows of one sampler in one folder.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        `AseWindows` or `OpenMMWindows`.
+    folder : path
+        Where finished windows are kept, one file each. A second run with the same sampler and settings goes on there.
+    settings : Settings, optional
+    both_sides : bool
+        Sample each window twice, pulled there from below and from above: what the two differ by is hysteresis.
+    approach : float or array_like, shape (d,)
+        From how far away it is pulled, in angstrom and radian.
+    seed : int
+
+    Raises
+    ------
+    KconsError
+        A coordinate that is undefined at the structure or depends on other constraints.
+    OccupiedError
+        The folder has windows of other settings.
+    """
+
+    def __init__(
+        self,
+        sampler: Sampler,
+        folder: str | PathLike[str],
+        settings: Settings | None = None,
+        *,
+        both_sides: bool = True,
+        approach: ArrayLike = 0.1,
+        seed: int = 1,
+    ) -> None:
+        self.sampler = sampler
+        self.settings = settings or Settings()
+        self.both_sides, self.seed = both_sides, seed
+        self.folder = Path(folder)
+        self.start, self.periods = sampler.begin()
+        self._targets: list[tuple[float, ...]] = []
+        self.approach: FloatArray = np.broadcast_to(np.asarray(approach, dtype=np.float64), (len(sampler.names),))
+        self._keep_settings()
+
+    def _keep_settings(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        mine = {"coordinates": list(self.sampler.names), "settings": asdict(self.settings), "seed": self.seed}
+        mine |= {"both sides": self.both_sides, "approach": self.approach.tolist(), "start": self.start.tolist()}
+        known = self.folder / "settings.json"
+        if known.exists():
+            theirs = json.loads(known.read_text(encoding="utf-8"))
+            differ = [key for key in mine if theirs.get(key) != json.loads(text(mine))[key]]
+            if differ:
+                raise OccupiedError(
+                    f"{self.folder} has windows of other {', '.join(differ)}; choose another folder",
+                    item=differ[0],
+                )
+            return
+        with in_one_piece(known) as opened:
+            opened.write(text(mine).encode())
+
+    @property
+    def angles(self) -> list[bool]:
+        """Which coordinates are angles."""
+        return [bool(angle) for angle in self.sampler.angles]
+
+    # -- running --------------------------------------------------------------------------------
+
+    def run(
+        self,
+        targets: ArrayLike | Iterable[Sequence[float]],
+        *,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
+    ) -> FreeEnergy:
+        """Sample windows at `targets`, but for those that are finished already.
+
+        Parameters
+        ----------
+        targets : array_like, shape (n,) or (n, d)
+            In angstrom and radian.
+        executor : Executor, optional
+            Anything with the interface of `concurrent.futures`: of Dask, ``Client(address).get_executor()``. By default
+            processes of this machine.
+        workers : int, optional
+            How many of these; by default one for each core.
+        progress : callable
+            ``progress(finished, all, seconds left)``.
+
+        Returns
+        -------
+        FreeEnergy
+            One failed window does not stop the others; `failed` says why.
+        """
+        places = np.array(targets, dtype=np.float64).reshape(-1, len(self.sampler.names))
+        if not len(places) or not np.all(np.isfinite(places)):
+            raise InputError("targets must be finite numbers, one row for each window", item="targets")
+        first = len(self._targets)
+        self._targets += [tuple(row) for row in places.tolist()]
+        jobs = [job for number in range(first, len(self._targets)) for job in self._jobs(number)]
+        missing = [job for job in jobs if not self.file(job).exists()]
+        failed = self._sample(missing, executor, workers, progress, len(jobs))
+        return self.result(failed)
+
+    def improve(
+        self,
+        error: float,
+        most: int,
+        *,
+        between: tuple[float, float] | None = None,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
+        at_once: int = 1,
+    ) -> FreeEnergy:
+        """Add windows where they help most until the profile's largest standard error is below `error` (kJ/mol).
+
+        Parameters
+        ----------
+        error : float
+        most : int
+            Never more than so many windows.
+        at_once : int
+            How many are added before the profile is looked at again: as many as there are workers.
+        """
+        result = self.result({})
+        while len(self._targets) < most and result.profile.error.max() > error:
+            count = min(at_once, most - len(self._targets))
+            result = self.run(
+                result.profile.next_windows(count, between=between),
+                executor=executor,
+                workers=workers,
+                progress=progress,
+            )
+            if result.failed:
+                break
+        return result
+
+    def _jobs(self, number: int) -> list[Window]:
+        """The runs of a window; the same ones whenever they are asked for."""
+        target = np.array(self._targets[number])
+        jobs = []
+        for k, side in enumerate(SIDES if self.both_sides else SIDES[:1]):
+            start = target + (-1 if side == "up" else 1) * self.approach
+            seed = int(np.random.SeedSequence([self.seed, number, k]).generate_state(1)[0])
+            begin, end = (tuple((q / self.sampler.scales).tolist()) for q in (start, target))
+            jobs.append(Window(number, side, begin, end, seed))
+        return jobs
+
+    def file(self, window: Window) -> Path:
+        """Where a finished window is kept."""
+        return self.folder / f"{window.name}.npz"
+
+    def _sample(
+        self,
+        jobs: Sequence[Window],
+        executor: Executor | None,
+        workers: int | None,
+        progress: Callable[[int, int, float], None] | None,
+        total: int,
+    ) -> dict[str, str]:
+        failed: dict[str, str] = {}
+        tries: dict[str, int] = dict.fromkeys((job.name for job in jobs), 0)
+        left, began, done = list(jobs), time.monotonic(), 0
+        while left:
+            pool = executor or _processes(workers or os.cpu_count() or 1, len(left))
+            again: list[Window] = []
+            try:
+                running: dict[Future[None], Window] = {}
+                for job in left:
+                    running[pool.submit(_sampled, self.sampler, job, self.settings, self.file(job))] = job
+                while running:
+                    for future in wait(running, return_when=FIRST).done:
+                        job = running.pop(future)
+                        problem = _problem(future)
+                        tries[job.name] += 1
+                        if problem == _KILLED and tries[job.name] <= RETRIES:
+                            again.append(job)
+                            continue
+                        done += 1
+                        note = self.folder / f"{job.name}.failed.txt"
+                        note.unlink(missing_ok=True)
+                        if problem is not None:
+                            failed[job.name] = problem
+                            note.write_text(problem, encoding="utf-8")
+                        if progress is not None:
+                            spent = time.monotonic() - began
+                            progress(total - len(jobs) + done, total, spent / done * (len(jobs) - done))
+            except BrokenExecutor:
+                if executor is not None:
+                    raise  # nothing can be sent to it any more
+                again = [job for job in left if not self.file(job).exists() and job.name not in failed]
+            finally:
+                if executor is None:
+                    pool.shutdown(wait=True, cancel_futures=True)
+            left = again
+        return failed
+
+    # -- what came of it ------------------------------------------------------------------------
+
+    def result(self, failed: Mapping[str, str]) -> FreeEnergy:
+        """Mean forces of the windows that are finished."""
+        kT = BOLTZMANN * self.settings.temperature / self.sampler.kJ
+        found = []
+        problems = dict(failed)
+        for number, target in enumerate(self._targets):
+            sides: dict[str, MeanForce] = {}
+            for job in self._jobs(number):
+                if not self.file(job).exists():
+                    continue
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
+                        sides[job.side] = mean_force(Series.load(self.file(job)), kT)
+                except KconsError as error:
+                    problems[job.name] = f"{type(error).__name__}: {error}"
+            if sides:
+                found.append(_together(number, np.array(target), sides, self.sampler.kJ, self.sampler.scales))
+        found.sort(key=lambda w: w.value.tolist())
+        return FreeEnergy(self.sampler.names, self.periods, found, problems)
+
+
+def _together(
+    number: int, target: FloatArray, sides: dict[str, MeanForce], kJ: float, scales: FloatArray
+) -> WindowResult:
+    """The mean of both sides, and how probable their difference is."""
+    per = kJ / scales
+    forces = np.array([side.force * per for side in sides.values()])
+    covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
+    chance = math.nan
+    if len(sides) == 2:
+        chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
+    raw = np.mean([side.raw * per for side in sides.values()], axis=0)
+    return WindowResult(
+        number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw
+    )
+
+
+#: What is said of a window whose process was killed, or whose worker was lost.
+_KILLED = "its process was killed each time"
+
+
+def _problem(future: Future[None]) -> str | None:
+    """Why a window failed; None if it did not."""
+    error = future.exception()
+    if error is None:
+        return None
+    if isinstance(error, BrokenExecutor) or type(error).__name__ in ("KilledWorker", "CancelledError"):
+        return _KILLED
+    return "".join(traceback.format_exception_only(error)).strip()
+
+
+def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -> None:
+    """In a worker: one window, unless another run has finished it meanwhile."""
+    if not file.exists():
+        sampler.sample(window, settings, file)
+
+
+def _processes(workers: int, jobs: int) -> ProcessPoolExecutor:
+    """Processes of this machine, one thread each: they start anew, since OpenMM and OpenMP do not survive a fork."""
+    return ProcessPoolExecutor(min(workers, jobs), mp_context=get_context("spawn"), initializer=_one_thread)
+
+
+def _one_thread() -> None:
+    for name in ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

@@ -1,0 +1,189 @@
+"""Windows sampled by OpenMM."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openmm
+from numpy.typing import ArrayLike
+from openmm import app, unit
+
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, Formula
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.target import FloatArray
+from kcons.errors import UnsupportedError
+from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
+from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
+from kcons.openmm.carried.callbacks import cell_of
+from kcons.openmm.carried.hold import constraints_about
+from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massless_atoms
+from kcons.openmm.collective.formula_rows import formula_rows
+from kcons.openmm.integrator.guard import velocities_of
+from kcons.openmm.quantities import masses_of, nanometers
+from kcons.openmm.topology import bonds_of
+
+#: What a relaxation leaves of the forces, kJ/mol/nm.
+_FORCE = 50.0
+
+
+class OpenMMWindows:
+    """Windows of an OpenMM System.
+
+    Parameters
+    ----------
+    topology : openmm.app.Topology
+    system : openmm.System
+        Without a barostat; its constraints are kept.
+    positions : Quantity or array_like, shape (n_particles, 3)
+        The structure that all windows start from, in nm if without unit.
+    coordinates : mapping of str to Constraint
+        by the windows.
+    platform : str, optional
+    properties : mapping of str to str
+        Of the platform.
+
+    Raises
+    ------
+    UnsupportedError
+        A coordinate of another kind, or of virtual sites.
+    KconsError
+        At `begin`: a coordinate that is undefined at the structure or depends on the constraints of the System.
+    """
+
+    kJ = 1.0
+
+    def __init__(
+        self,
+        topology: app.Topology,
+        system: openmm.System,
+        positions: unit.Quantity | ArrayLike,
+        coordinates: Mapping[str, Constraint],
+        *,
+        platform: str | None = None,
+        properties: Mapping[str, str] | None = None,
+    ) -> None:
+        n = system.getNumParticles()
+        self.positions = nanometers(positions, n)
+        self.coordinates = dict(coordinates)
+        self.names = tuple(self.coordinates)
+        self.angles = angles_of(self.coordinates)
+        self.scales = scales_of(self.coordinates, 10.0)
+        self.platform, self.properties = platform, dict(properties or {})
+        self._system = openmm.XmlSerializer.serialize(system)
+        self._bonds: IntArray = bonds_of(system, self.positions)
+        # A Topology cannot be pickled where its elements are; what a Simulation needs of it is the number of atoms.
+        self._n = topology.getNumAtoms()
+        for name, item in self.coordinates.items():
+            _force_of(name, item, system.usesPeriodicBoundaryConditions())
+
+    def _rows(self, system: openmm.System) -> Held:
+        masses = masses_of(system)
+        given = tuple(self.coordinates.values())
+        touched = np.unique(np.concatenate([item.atoms.ravel() for item in given]))
+        refuse_virtual_sites(system, touched, masses)
+        others = [*constraints_about(system, touched), *with_massless_atoms(given, masses)[len(given) :]]
+        wraps = system.usesPeriodicBoundaryConditions()
+        return Held(
+            self.coordinates,
+            others,
+            self.positions,
+            np.where(masses > 0, masses, 1.0),
+            cell_of(system.getDefaultPeriodicBoxVectors()) if wraps else None,
+            True,
+            lambda: self._bonds,
+        )
+
+    def begin(self) -> tuple[FloatArray, FloatArray]:
+        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
+        return held.found, held.periods
+
+    def sample(self, window: Window, settings: Settings, file: Path) -> None:
+        dt = settings.timestep / 1000
+        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
+        _, x = held.placed(window.start)
+        rates = [(b - a) / (max(settings.pull, 1) * dt) for a, b in zip(window.start, window.target, strict=True)]
+        langevin = Langevin(settings.temperature, settings.friction)
+        simulation = self._simulation(window.start, rates, langevin, dt, window)
+        simulation.context.setPositions(x)
+        integrator: Any = simulation.integrator
+        if settings.relax:
+            integrator.minimizeEnergy(simulation.context, _FORCE, settings.relax)
+        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, window.seed % 2**31)
+        simulation.step(settings.pull)
+        pulled = simulation.context.getState(positions=True)
+        ensemble: Any = langevin
+        if settings.thermostat == "nose-hoover":
+            ensemble = NoseHoover(settings.temperature, settings.friction)
+        elif settings.thermostat == "isokinetic":
+            ensemble = Isokinetic(settings.temperature)
+        simulation = self._simulation(window.target, [0.0] * len(rates), ensemble, dt, window)
+        simulation.context.setPositions(pulled.getPositions())
+        integrator = simulation.integrator
+        integrator.applyConstraints()
+        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, (window.seed + 1) % 2**31)
+        if settings.thermostat != "langevin":
+            _without_momentum(simulation.context, held)
+        simulation.step(settings.equilibration)
+        simulation.currentStep = 0
+        reporter = HeldCoordinatesReporter(io.StringIO(), settings.every, self.coordinates)
+        simulation.reporters.append(reporter)
+        simulation.step(settings.production)
+        reporter.series.save(file)
+
+    def _simulation(
+        self, targets: Sequence[float], rates: Sequence[float], ensemble: Any, dt: float, window: Window
+    ) -> app.Simulation:
+        system = openmm.XmlSerializer.deserialize(self._system)
+        wraps = system.usesPeriodicBoundaryConditions()
+        rows = [
+            Row(_force_of(name, item, wraps), float(target), float(rate), period=item.period, name=name)
+            for (name, item), target, rate in zip(self.coordinates.items(), targets, rates, strict=True)
+        ]
+        part = CollectiveRows(system, rows, positions=self.positions)
+        integrator = ProjectedIntegrator(dt, parts=[part], ensemble=ensemble)
+        integrator.setRandomNumberSeed(window.seed % 2**31 + 1)
+        chosen = [] if self.platform is None else [openmm.Platform.getPlatformByName(self.platform), self.properties]
+        topology = app.Topology()
+        residue = topology.addResidue("X", topology.addChain())
+        for _ in range(self._n):
+            topology.addAtom("X", None, residue)
+        return app.Simulation(topology, system, integrator, *chosen)
+
+
+def _without_momentum(context: openmm.Context, held: Held) -> None:
+    """Take total momentum out, which thermostats that scale velocities never forget, where no row knows a place."""
+    if all(row.translation_invariant for row in [*held.coordinates.values(), *held.others]):
+        masses = masses_of(context.getSystem())
+        v = velocities_of(context)
+        v[masses > 0] -= masses @ v / masses.sum()
+        context.setVelocities(v)
+
+
+def _force_of(name: str, item: Constraint, periodic: bool) -> openmm.Force:
+    """The coordinate as a Force of OpenMM."""
+    if item.n_rows != 1:
+        raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row")
+    atoms = item.atoms[0].tolist()
+    force: Any
+    if isinstance(item, Formula):
+        return formula_rows(item)[0].force
+    if isinstance(item, Distance):
+        force = openmm.CustomBondForce("r")
+        force.addBond(*atoms, [])
+    elif isinstance(item, Angle):
+        force = openmm.CustomAngleForce("theta")
+        force.addAngle(*atoms, [])
+    elif isinstance(item, Dihedral):
+        force = openmm.CustomTorsionForce("theta")
+        force.addTorsion(*atoms, [])
+    else:
+        raise UnsupportedError(
+            f"{name} is {item!r}; windows in OpenMM hold a Distance, an Angle, a Dihedral or a Formula"
+        )
+    force.setUsesPeriodicBoundaryConditions(periodic)
+    return force

@@ -1,0 +1,184 @@
+"""One window: where coordinates are held, from which side they come, and how it is sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints import Constraint, MovingTarget
+from kcons.constraints.arguments import ANGLE, LENGTH
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.motion.motion import Motion
+
+Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Coordinates held at `target`, pulled there from `start`; both in the units of the MD engine."""
+
+    number: int
+    side: str
+    start: tuple[float, ...]
+    target: tuple[float, ...]
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"window-{self.number:04d}-{self.side}"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every window is sampled.
+
+    Attributes
+    ----------
+    temperature : float
+        In K.
+    timestep : float
+        In fs.
+    thermostat : {'langevin', 'nose-hoover', 'isokinetic'}
+        For equilibration and production; pulls have Langevin's.
+    friction : float
+        In 1/ps, of Langevin dynamics; the other thermostats take its inverse as their time.
+    relax, pull, equilibration, production : int
+        Steps of relaxation where the window begins, and of each part of the run.
+    every : int
+        Steps from one sample to the next.
+    """
+
+    temperature: float = 300.0
+    timestep: float = 1.0
+    thermostat: Thermostat = "langevin"
+    friction: float = 5.0
+    relax: int = 50
+    pull: int = 1000
+    equilibration: int = 2000
+    production: int = 20000
+    every: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("temperature", "timestep", "friction"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"{name} is {getattr(self, name)}; give a positive number", item=name)
+        for name in ("relax", "pull", "equilibration", "production", "every"):
+            value = getattr(self, name)
+            if int(value) != value or value < (name in ("production", "every")):
+                raise InputError(f"{name} is {value}; give a number of steps", item=name)
+        if self.thermostat not in ("langevin", "nose-hoover", "isokinetic"):
+            raise InputError(
+                f"no thermostat {self.thermostat!r}; there are langevin, nose-hoover, isokinetic", item="thermostat"
+            )
+        if self.production // self.every < 32:
+            raise InputError(
+                f"production of {self.production} steps with a sample every {self.every} gives fewer than 32 samples; "
+                "an error needs more",
+                item="production",
+            )
+
+
+class Sampler(Protocol):
+    """What samples a window in an MD engine; it is sent to other processes, so it can be pickled.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the coordinates.
+    kJ : float
+        Its unit of energy in kJ/mol.
+    scales : ndarray, shape (d,)
+        The units of its coordinates in angstrom and radian.
+    angles : tuple of bool
+        Which coordinates are angles.
+    """
+
+    names: tuple[str, ...]
+    kJ: float
+    scales: FloatArray
+    angles: tuple[bool, ...]
+
+    def begin(self) -> tuple[FloatArray, FloatArray]:
+        """Coordinates at the initial structure, and their periods, shape (d,); raises where a window cannot be made."""
+
+    def sample(self, window: Window, settings: Settings, file: Path) -> None:
+        """Run the window, and write its `Series` to `file` once it is finished."""
+
+
+def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatArray:
+    """Units of coordinates in angstrom and radian; formulas stay in the units they are written in."""
+    return np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in coordinates.values()])
+
+
+def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool, ...]:
+    """Which coordinates are angles."""
+    return tuple(c.held is ANGLE for c in coordinates.values())
+
+
+@dataclass
+class Held:
+    """The rows of a window over the structure that all windows start from.
+
+    Parameters
+    ----------
+    coordinates : mapping of str to Constraint
+        One row each.
+    others : sequence of Constraint
+        What is held beside them, targets found at `positions` where they were left open.
+    positions, masses, cell
+        Of the initial structure.
+    bonds : callable
+        The bonds of the molecules.
+    """
+
+    coordinates: Mapping[str, Constraint]
+    others: list[Constraint]
+    positions: FloatArray
+    masses: FloatArray
+    cell: FloatArray | None
+    pbc: Any
+    bonds: Callable[[], IntArray]
+
+    def __post_init__(self) -> None:
+        for name, item in self.coordinates.items():
+            if not isinstance(item, Constraint) or item.n_rows != 1 or not item.holonomic:
+                raise UnsupportedError(f"{name} is {item!r}; a coordinate of windows is one row that holds positions")
+        self.coordinates = {name: item.with_target(None) for name, item in self.coordinates.items()}
+        # Refuses what is undefined here, or depends on the other constraints.
+        everything = self._set([*self.others, *self.coordinates.values()])
+        self.others = list(everything.constraints[: len(self.others)])
+        held = HeldCoordinates(everything, self.coordinates, self.positions)
+        self.found = everything.measure(self.positions)[held.rows]
+        self.periods = held.periods
+
+    def _set(self, rows: list[Constraint]) -> ConstraintSet:
+        return ConstraintSet(rows, self.positions, self.masses, cell=self.cell, pbc=self.pbc)
+
+    def at(self, values: ArrayLike) -> list[Constraint]:
+        """The coordinates held at `values`."""
+        return [
+            item.with_target([float(value)])
+            for item, value in zip(self.coordinates.values(), np.asarray(values), strict=True)
+        ]
+
+    def towards(self, window: Window, duration: float, time: float = 0.0) -> list[Constraint]:
+        """The coordinates moved from the start of a window to its target, at a constant rate."""
+        rows = []
+        for item, a, b in zip(self.coordinates.values(), window.start, window.target, strict=True):
+            rate = (b - a) / duration
+            rows.append(item.with_target(MovingTarget(lambda t, a=a, rate=rate: a + rate * (t - time))))  # type: ignore[misc]
+        return rows
+
+    def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
+        """The engine of a window, and the initial structure with groups turned and moved so that it is there."""
+        motion = Motion(self._set([*self.others, *self.at(values)]), self.positions)
+        return motion, motion.restore_positions(self.positions, bonds=self.bonds)

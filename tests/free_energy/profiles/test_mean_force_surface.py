@@ -1,0 +1,179 @@
+"""Surfaces from mean forces, against free energies in closed form."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import cache
+
+import numpy as np
+import pytest
+
+from kcons.errors import InputError
+from kcons.free_energy.profiles.mean_force_surface import fit_surface
+from kcons.free_energy.profiles.profile import integrate
+
+TURN = 2 * math.pi
+
+
+def wells(x):
+    """Two minima, one higher than the other; the valley between them is bent."""
+    a, b = np.asarray(x).T
+    return 5 * (a**2 - 1) ** 2 + 8 * (b - 0.4 * a**2) ** 2 + a
+
+
+def slopes(x):
+    a, b = np.asarray(x).T
+    bent = b - 0.4 * a**2
+    return np.stack([20 * a * (a**2 - 1) - 16 * bent * 0.8 * a / 1.0 + 1.0, 16 * bent], axis=1)
+
+
+def torsions(x):
+    a, b = np.asarray(x).T
+    return 5 * np.cos(a) + 4 * np.cos(2 * b) + 3 * np.cos(a - b)
+
+
+def torsion_slopes(x):
+    a, b = np.asarray(x).T
+    return np.stack([-5 * np.sin(a) - 3 * np.sin(a - b), -8 * np.sin(2 * b) + 3 * np.sin(a - b)], axis=1)
+
+
+SURFACES = {
+    "wells": (wells, slopes, [-1.4, -0.6], [1.4, 1.4], None),
+    "torsions": (torsions, torsion_slopes, [-math.pi, -math.pi], [math.pi, math.pi], (TURN, TURN)),
+}
+
+
+def noise(n, error, seed):
+    """Vectors with correlated components, and their covariance."""
+    mixing = error * np.array([[1.0, 0.0], [0.6, 0.8]])
+    drawn = np.random.default_rng(seed).standard_normal((n, 2)) @ mixing.T
+    return drawn, np.broadcast_to(mixing @ mixing.T, (n, 2, 2))
+
+
+@cache
+def fitted(name, n, error, seed):
+    _, gradient, low, high, periods = SURFACES[name]
+    x = np.random.default_rng(100 + seed).uniform(low, high, (n, 2))
+    drawn, covariances = noise(n, error, seed)
+    return fit_surface(x, gradient(x) + drawn, covariances, periods=periods)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_gradients_of_the_tests_are_gradients(name):
+    value, gradient, low, high, _ = SURFACES[name]
+    x, h = np.random.default_rng(0).uniform(low, high, (5, 2)), 1e-6
+    for j, step in enumerate(h * np.eye(2)):
+        assert gradient(x)[:, j] == pytest.approx((value(x + step) - value(x - step)) / (2 * h), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_scattered_windows_give_the_surface_within_its_errors(name):
+    value = SURFACES[name][0]
+    away, sizes = [], []
+    for seed in range(3):
+        surface = fitted(name, 60, 0.4, seed)
+        at = np.random.default_rng(7 + seed).uniform(surface.low, surface.high, (12, 2))
+        F, errors = surface.free_energy(at)
+        exact = value(at) - value(surface.zero[None])
+        away.append((F - exact) / errors)
+        sizes.append(np.abs(F - exact).max() / np.ptp(exact))
+    # All against one zero, and so not independent of each other: the mean square is 1 within some tenths.
+    assert 0.2 < np.mean(np.square(away)) < 2.0
+    assert (np.abs(away) < 2.5).mean() > 0.9
+    assert max(sizes) < 0.1
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_a_grid_without_noise_gives_the_surface(name):
+    value, gradient, low, high, periods = SURFACES[name]
+    places = [np.linspace(a, b, 11, endpoint=periods is None) for a, b in zip(low, high, strict=True)]
+    x = np.stack(np.meshgrid(*places), axis=-1).reshape(-1, 2)
+    surface = fit_surface(x, gradient(x), np.full(x.shape, 1e-4), periods=periods, zero=[0.1, 0.2])
+    at = np.random.default_rng(8).uniform(low, high, (200, 2))
+    exact = value(at) - value(np.array([[0.1, 0.2]]))
+    assert np.abs(surface.free_energy(at)[0] - exact).max() < 0.005 * np.ptp(exact)
+    assert surface.consistency.p_value > 1e-3
+    if periods:
+        turned, _ = surface.free_energy(at + np.array([TURN, -TURN]))
+        assert turned == pytest.approx(surface.free_energy(at)[0], abs=1e-6 * np.ptp(exact))
+
+
+def test_minima():
+    """Found where they are, and within their errors."""
+    from scipy.optimize import minimize
+
+    surface = fitted("wells", 60, 0.4, 0)
+    lowest, second = surface.minima()
+    exact = [minimize(lambda x: wells(x[None])[0], start, tol=1e-10) for start in ([-1.0, 0.4], [1.0, 0.4])]
+    for minimum, expected in zip((lowest, second), exact, strict=True):
+        assert np.abs(minimum.x - expected.x).max() < 0.1
+    difference = surface.difference(lowest.x, second.x)
+    assert abs(difference.off(exact[1].fun - exact[0].fun)) < 3
+    assert difference.value == pytest.approx(second.F - lowest.F, abs=1e-6)
+
+
+def test_minima_around_a_torus():
+    """As many as a fine grid of the closed form has, at the same places, each once."""
+    places = np.linspace(-math.pi, math.pi, 200, endpoint=False)
+    F = torsions(np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)).reshape(200, 200)
+    around = [np.roll(F, (a, b), axis=(0, 1)) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
+    exact = places[np.argwhere((np.array(around) > F).all(axis=0))]
+    found = np.array([minimum.x for minimum in fitted("torsions", 60, 0.4, 0).minima()])
+    assert len(found) == len(exact) == 2
+    away = (found[:, None] - exact[None] + math.pi) % TURN - math.pi
+    assert np.abs(away).max(axis=2).min(axis=0).max() < 0.1
+
+
+def test_vectors_that_are_no_gradient_are_warned_of():
+    x = np.random.default_rng(9).uniform([-1.4, -0.6], [1.4, 1.4], (60, 2))
+    swirl = 3.0 * np.stack([-x[:, 1], x[:, 0]], axis=1)
+    drawn, covariances = noise(60, 0.2, 1)
+    with pytest.warns(UserWarning, match="no gradient"):
+        fit_surface(x, slopes(x) + swirl + drawn, covariances)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fit_surface(x, slopes(x) + drawn, covariances).consistency.p_value > 1e-3
+
+
+def test_one_coordinate_is_a_profile():
+    x = np.linspace(-1.0, 1.0, 6)
+    f, e = 4 * x**3 - x, np.full(6, 0.05)
+    profile = integrate(x, f, e, zero=0.0)
+    surface = fit_surface(x[:, None], f[:, None], e[:, None], zero=[0.0])
+    F, errors = surface.free_energy(profile.x[:, None])
+    assert pytest.approx(F, abs=1e-9) == profile.F and profile.error == pytest.approx(errors, abs=1e-9)
+
+
+def test_three_coordinates():
+    x = np.random.default_rng(10).uniform(-1, 1, (40, 3))
+    matrix = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, -0.2], [0.0, -0.2, 3.0]])
+    surface = fit_surface(x, x @ matrix, np.full((40, 3), 0.02), zero=[0.0, 0.0, 0.0])
+    at = np.random.default_rng(11).uniform(-0.8, 0.8, (20, 3))
+    F, errors = surface.free_energy(at)
+    assert np.abs((F - 0.5 * np.einsum("ni,ij,nj->n", at, matrix, at)) / errors).max() < 4
+    assert np.abs(surface.minima()[0].x).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "item", "message"),
+    [
+        ({"x": np.zeros((3, 2))}, "x", r"d \+ 2 or more"),
+        ({"x": np.ones((9, 2))}, "x", "one value of coordinate 0"),
+        ({"f": np.zeros((9, 3))}, "f", r"shape \(9, 2\)"),
+        ({"f": np.full((9, 2), np.nan)}, "f", "window 0"),
+        ({"errors": np.ones(9)}, "errors", "shape"),
+        ({"errors": -np.ones((9, 2))}, "errors", "negative"),
+        ({"errors": np.tile([[1.0, 2.0], [2.0, 1.0]], (9, 1, 1))}, "errors", "window 0 is not symmetric and positive"),
+        ({"periods": (1.0,)}, "periods", "2 positive"),
+        ({"periods": (0.5, None)}, "x", "further apart than the period in coordinate 0"),
+        ({"zero": [0.0]}, "zero", "2 finite"),
+        ({"zero": [9.0, 0.0]}, "x", "beyond the windows"),
+    ],
+)
+def test_bad_input_is_refused(change, item, message):
+    x = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    good = {"x": x, "f": x, "errors": np.ones((9, 2))}
+    with pytest.raises(InputError, match=message) as caught:
+        fit_surface(**{**good, **change})
+    assert caught.value.item == item

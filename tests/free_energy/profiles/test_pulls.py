@@ -1,0 +1,168 @@
+"""Free energies from works whose distribution is known."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy.profiles.pulls import pull_free_energy, work_along, work_profile
+
+F, KT = 7.0, 2.5
+
+
+def normal(rng, n, spread, m=0):
+    """Works of variance spread^2 whose means are what Crooks asks for: F + spread^2/2kT, and the same backward."""
+    lost = spread**2 / (2 * KT)
+    return rng.normal(F + lost, spread, n), rng.normal(-F + lost, spread, m or n)
+
+
+NAMES = ("jarzynski", "cumulant", "jarzynski_backward", "cumulant_backward", "bar", "crossing")
+
+
+@cache
+def of_normal_works():
+    rng = np.random.default_rng(1)
+    return [pull_free_energy(*normal(rng, 200, KT), thermal_energy=KT) for _ in range(60)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_normal_works_give_the_free_energy_within_the_errors(name):
+    away = np.array([getattr(each, name).off(F) for each in of_normal_works()])
+    # The mean square of 60 has a standard deviation of 0.18; bootstraps of exponentials are a little too narrow.
+    assert 0.6 < (away**2).mean() < 1.6
+    assert abs(away.mean()) < 0.45
+
+
+def test_pulls_both_ways_are_better_than_one():
+    rng = np.random.default_rng(2)
+    found = [pull_free_energy(*normal(rng, 200, 2 * KT, 200), thermal_energy=KT) for _ in range(40)]
+    spread = {name: np.std([getattr(each, name).value for each in found]) for name in ("jarzynski", "bar")}
+    assert spread["bar"] < 0.7 * spread["jarzynski"]
+    assert found[0].best is found[0].bar
+    assert np.mean([each.dissipated for each in found]) == pytest.approx(2 * KT, rel=0.1)
+
+
+def test_bias_of_the_exponential_average():
+    """To first order in 1/n, in the mean over many sets of few pulls."""
+    rng = np.random.default_rng(3)
+    works = rng.normal(F + KT / 2, KT, (4000, 20))
+    seen = np.mean([-KT * np.log(np.mean(np.exp(-w / KT))) for w in works]) - F
+    exact = KT * (np.e - 1) / (2 * 20)  # var(w)/(2 n <w>^2) of a log-normal w
+    assert seen == pytest.approx(exact, rel=0.15)
+    said = np.mean([pull_free_energy(w, -w, thermal_energy=KT).bias for w in works[:150]])
+    assert said == pytest.approx(exact, rel=0.35)  # itself too low with few pulls: the tail is not in all sets
+    many = pull_free_energy(rng.normal(F + KT / 2, KT, 20000), thermal_energy=KT)
+    assert many.bias * 20000 == pytest.approx(exact * 20, rel=0.1)
+    assert many.n_effective == pytest.approx(20000 / np.e, rel=0.1)
+
+
+def test_directions_are_alike():
+    """Backward pulls taken for forward ones give the difference with the other sign."""
+    one, other = normal(np.random.default_rng(4), 300, KT, 250)
+    here, there = pull_free_energy(one, other, thermal_energy=KT), pull_free_energy(other, one, thermal_energy=KT)
+    for name in ("bar", "crossing"):
+        assert getattr(here, name).value == pytest.approx(-getattr(there, name).value, abs=1e-6)
+    assert here.jarzynski_backward.value == pytest.approx(-there.jarzynski.value)
+    assert here.cumulant_backward.value == pytest.approx(-there.cumulant.value)
+    assert here.bias_backward == pytest.approx(-there.bias)
+    assert here.n_effective_backward == there.n_effective
+
+
+def test_distributions_of_different_width_cross_between_their_means():
+    rng = np.random.default_rng(5)
+    found = pull_free_energy(rng.normal(3.0, 2.0, 20000), rng.normal(-1.0, 1.0, 20000), thermal_energy=1.0)
+    w = found.crossing.value
+    assert 1.0 < w < 3.0
+    densities = [np.exp(-((w - m) ** 2) / (2 * s**2)) / s for m, s in ((3.0, 2.0), (1.0, 1.0))]
+    assert densities[0] == pytest.approx(densities[1], rel=0.05)
+
+
+def dragged(rng, pulls, speed, steps=400, time=4.0):
+    """Overdamped pulls by a spring: x' = -(x - vt) + sqrt(2) dW, k = kT = friction = 1, stepped exactly.
+
+    Works are normal, with <W> = v^2 (T - 1 + e^-T) and variance 2 <W> (Mazonka and Jarzynski 1999, eq. 18).
+    """
+    dt = time / steps
+    decay = np.exp(-dt)
+    x, force = rng.standard_normal(pulls), np.empty((pulls, steps + 1))
+    path = speed * np.linspace(0.0, time, steps + 1)
+    for k, end in enumerate(path):
+        force[:, k] = end - x
+        # The mean of an exact step under a target that moves evenly.
+        x = (end + speed * dt - speed) + (x - end + speed) * decay + np.sqrt(1 - decay**2) * rng.standard_normal(pulls)
+    return path, force
+
+
+def test_a_spring_that_is_dragged():
+    """The free energy stays the same, whatever work is done: 0 at the end, and everywhere on the way."""
+    rng, speed, time = np.random.default_rng(6), 0.6, 4.0
+    path, force = dragged(rng, 4000, speed)
+    works = work_along(path, force)
+    mean = speed**2 * (time - 1 + np.exp(-time))
+    assert works[:, -1].mean() == pytest.approx(mean, abs=4 * np.sqrt(2 * mean / 4000))
+    assert works[:, -1].var() == pytest.approx(2 * mean, rel=0.1)
+    found = pull_free_energy(works[:, -1], thermal_energy=1.0)
+    assert abs(found.jarzynski.off(0.0)) < 3.5 and abs(found.cumulant.off(0.0)) < 3.5
+    profile, errors = work_profile(works[:, ::80], thermal_energy=1.0)
+    assert profile[0] == errors[0] == 0.0
+    assert np.abs(profile[1:] / errors[1:]).max() < 3.5
+    assert profile[-1] == pytest.approx(found.jarzynski.value, rel=1e-12)
+
+
+def test_slow_works_are_the_integral_of_the_mean_force():
+    """No work is lost: all estimates are the integral of the force, by the trapezoidal rule as in a plain sum."""
+    x = np.linspace(1.0, 2.0, 301)
+    works = work_along(x, np.tile(3 * x**2, (6, 1)))
+    assert works[:, -1] == pytest.approx(np.full(6, 7.0), abs=1e-4)
+    found = pull_free_energy(works[:, -1], -works[:, -1], thermal_energy=KT)
+    for name in ("jarzynski", "cumulant", "jarzynski_backward", "bar"):
+        assert getattr(found, name).value == pytest.approx(7.0, abs=1e-4), name
+    assert found.crossing is None and found.overlap == pytest.approx(1.0)
+    assert work_along(x, 3 * x**2)[-1] == works[0, -1]
+
+
+def test_weights_at_both_ends():
+    """Without work, the free energy is that of the weights: -kT ln(<w>/<w at the start>)."""
+    rng = np.random.default_rng(7)
+    logs = rng.standard_normal((400, 3))
+    found, _ = work_profile(np.zeros((400, 3)), thermal_energy=KT, log_weights=logs)
+    assert found == pytest.approx(-KT * np.log(np.exp(logs).mean(axis=0) / np.exp(logs[:, 0]).mean()), abs=1e-12)
+
+
+def test_pulls_that_do_not_overlap_are_warned_of():
+    one, other = normal(np.random.default_rng(8), 50, 12 * KT)
+    with pytest.warns(UserWarning, match=r"overlap of 0\.\d%"):
+        pull_free_energy(one, other, thermal_energy=KT)
+    with pytest.warns(UserWarning, match=r"of 50 pulls count"):
+        pull_free_energy(one, thermal_energy=KT)
+
+
+@pytest.mark.parametrize(
+    ("call", "item", "message"),
+    [
+        (lambda: pull_free_energy([1.0] * 4, thermal_energy=1.0), "forward", "5 pulls"),
+        (lambda: pull_free_energy([1.0] * 5, [1.0] * 4, thermal_energy=1.0), "backward", "5 pulls"),
+        (lambda: pull_free_energy([1.0] * 5 + [np.inf], thermal_energy=1.0), "forward", "work 5"),
+        (lambda: pull_free_energy([1.0] * 5, thermal_energy=-1.0), "thermal_energy", "positive"),
+        (lambda: work_along([0.0, 1.0], [0.0, 1.0, 2.0]), "force", "do not go"),
+        (lambda: work_along([0.0, 1.0], [0.0, np.nan]), "force", "finite"),
+        (lambda: work_profile(np.zeros(5), thermal_energy=1.0), "works", "shape"),
+        (lambda: work_profile(np.zeros((5, 2)), thermal_energy=1.0, log_weights=np.zeros(5)), "log_weights", "shape"),
+    ],
+)
+def test_bad_input_is_refused(call, item, message):
+    with pytest.raises(InputError, match=message) as caught:
+        call()
+    assert caught.value.item == item
+
+
+def test_one_direction_needs_no_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymbar", None)
+    works = np.random.default_rng(9).normal(F, 0.1, 50)
+    assert pull_free_energy(works, thermal_energy=KT).best.value == pytest.approx(F, abs=0.1)
+    with pytest.raises(UnsupportedError, match="free-energy"):
+        pull_free_energy(works, -works, thermal_energy=KT)

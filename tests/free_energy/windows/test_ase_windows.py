@@ -1,0 +1,69 @@
+"""Windows in ASE: placed by turning groups, pulled, sampled with each thermostat."""
+
+from __future__ import annotations
+
+import pickle
+from functools import partial
+
+import numpy as np
+import pytest
+from ase.build import molecule
+from ase.calculators.calculator import Calculator
+from ase.calculators.lj import LennardJones
+from ase.constraints import FixAtoms
+
+from kcons.constraints import Dihedral, Distance
+from kcons.errors import SingularGeometryError, UnsupportedError
+from kcons.free_energy import AseWindows, Series, Settings, Window
+
+CALCULATOR = partial(LennardJones, sigma=1.0, epsilon=0.02, rc=6.0)
+TURN = Dihedral([[2, 0, 1, 3]])
+#: Methanol as two rigid pieces that turn about the C-O bond.
+PIECES = Distance([[0, 1], [1, 3], [0, 3], [0, 2], [0, 4], [0, 5], [2, 4], [4, 5], [2, 5], [1, 2], [1, 4], [1, 5]])
+SHORT = Settings(pull=20, equilibration=20, production=320, every=10, relax=3)
+
+
+def sampler(**more):
+    return AseWindows(molecule("CH3OH"), CALCULATOR, {"turn": TURN}, **{"held": [PIECES], **more})
+
+
+@pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
+def test_a_window_far_from_the_structure(tmp_path, thermostat):
+    """From 180 to 60 degrees in one go; the same file whenever it is made."""
+    start, periods = sampler().begin()
+    assert start == pytest.approx([np.pi]) and periods == pytest.approx([2 * np.pi])
+    settings = Settings(**{**SHORT.__dict__, "thermostat": thermostat})
+    window = Window(0, "up", (1.0,), (np.pi / 3,), 5)
+    atoms = molecule("CH3OH")
+    atoms.set_constraint(FixAtoms([0]))  # so that the thermostats are not those of a free cluster
+    held = pickle.loads(pickle.dumps(AseWindows(atoms, CALCULATOR, {"turn": TURN}, [PIECES])))
+    for name in ("one", "two"):
+        held.sample(window, settings, tmp_path / name)
+    series = Series.load(tmp_path / "one")
+    assert len(series) == 32 and series.off.max() < 1e-12
+    np.testing.assert_allclose(series.value, np.pi / 3, atol=1e-12)
+    assert np.array_equal(series.multiplier, Series.load(tmp_path / "two").multiplier)
+    assert series.isokinetic_degrees_of_freedom == (3 if thermostat == "isokinetic" else 0)
+
+
+def test_a_calculator_that_fails_is_named(tmp_path):
+    windows = AseWindows(molecule("CH3OH"), Broken, {"turn": TURN}, [PIECES])
+    with pytest.raises(RuntimeError, match="no convergence"):
+        windows.sample(Window(0, "up", (1.0,), (1.1,), 5), SHORT, tmp_path / "one")
+    assert not (tmp_path / "one").exists()
+
+
+class Broken(Calculator):
+    implemented_properties = ["energy", "forces"]
+
+    def calculate(self, *_):
+        raise RuntimeError("no convergence")
+
+
+def test_coordinates_that_cannot_be_held():
+    with pytest.raises(SingularGeometryError, match="turn depends on the other"):
+        sampler(held=[PIECES, Distance([[2, 3]])]).begin()
+    with pytest.raises(UnsupportedError, match=r"bonds is .*one row"):
+        AseWindows(molecule("CH3OH"), CALCULATOR, {"bonds": PIECES}).begin()
+    with pytest.raises(SingularGeometryError, match=r"collinear|undefined"):
+        AseWindows(molecule("C2H2"), CALCULATOR, {"turn": Dihedral([[2, 0, 1, 3]])}).begin()

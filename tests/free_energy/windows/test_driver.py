@@ -1,0 +1,166 @@
+"""Windows by executors: kept as they finish, begun again where their process was killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from window_samplers import Fake, slope
+
+from kcons.errors import InputError, OccupiedError
+from kcons.free_energy import Settings, Windows
+
+SETTINGS = Settings(production=640, every=10)
+PLACES = np.linspace(-np.pi, np.pi, 9)[:-1]
+#: The same windows, by processes of their own.
+SCRIPT = """
+import sys
+import numpy as np
+from window_samplers import Fake
+from kcons.free_energy import Settings, Windows
+if __name__ == "__main__":
+    windows = Windows(Fake(sys.argv[1] + "/diary", wait=float(sys.argv[3])), sys.argv[1] + "/out",
+                      Settings(production=640, every=10))
+    windows.run(np.linspace(-np.pi, np.pi, 9)[:-1], workers=int(sys.argv[2]))
+"""
+
+
+def diary(folder):
+    return (folder / "diary").read_text().split()
+
+
+def run(folder, places=PLACES, executor=None, **fake):
+    windows = Windows(Fake(str(folder / "diary"), **fake), folder / "out", SETTINGS)
+    return windows, windows.run(places, executor=executor or ThreadPoolExecutor(2))
+
+
+def test_windows_and_their_profile(tmp_path):
+    told = []
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
+    with ThreadPoolExecutor(2) as executor:
+        result = windows.run(PLACES, executor=executor, progress=lambda *numbers: told.append(numbers))
+    assert result.failed == {} and len(result.windows) == 8
+    assert [done for done, _, _ in told] == list(range(1, 17)) and told[-1] == (16, 16, 0.0)
+    for window in result.windows:
+        assert set(window.sides) == {"up", "down"}
+        assert abs(window.force[0] - slope(window.value[0])) < 4 * window.error[0] < 2
+        assert window.error[0] == pytest.approx(2 / np.sqrt(128), rel=0.5)
+    assert min(w.hysteresis for w in result.windows) > 1e-3
+    at = np.linspace(-np.pi, np.pi, 5)
+    exact = 3 * np.cos(2 * at) + 2 * np.cos(at)
+    found = np.interp(at, result.profile.x, result.profile.F)
+    assert np.abs((found - found[0]) - (exact - exact[0])).max() < 1.5
+    known = json.loads(json.dumps(result.numbers()))
+    assert known["names"] == ["torsion"] and len(known["windows"]) == 8
+    assert known["windows"][0]["mean force"] == pytest.approx(result.windows[0].force.tolist())
+
+
+def test_finished_windows_are_not_sampled_again(tmp_path):
+    _, first = run(tmp_path)
+    assert sorted(diary(tmp_path)) == sorted(set(diary(tmp_path))) and len(diary(tmp_path)) == 16
+    _, second = run(tmp_path)
+    assert len(diary(tmp_path)) == 16
+    assert json.dumps(first.numbers()) == json.dumps(second.numbers())
+
+
+def test_one_failed_window_does_not_stop_the_others_and_is_tried_again(tmp_path):
+    _, result = run(tmp_path, fails=("window-0002-up", "window-0005-down", "window-0005-up"))
+    assert result.failed == dict.fromkeys(
+        ("window-0002-up", "window-0005-down", "window-0005-up"), "RuntimeError: the calculator did not converge"
+    )
+    assert len(result.windows) == 7 and "converge" in (tmp_path / "out/window-0002-up.failed.txt").read_text()
+    third = next(w for w in result.windows if w.number == 2)
+    assert list(third.sides) == ["down"] and np.isnan(third.hysteresis)
+    _, again = run(tmp_path)
+    assert again.failed == {} and len(again.windows) == 8 and len(diary(tmp_path)) == 19
+    assert not list((tmp_path / "out").glob("*.failed.txt"))
+
+
+def test_hysteresis_is_seen(tmp_path):
+    _, result = run(tmp_path, shift=1.5)
+    assert max(w.hysteresis for w in result.windows) < 1e-4
+
+
+def test_windows_are_added_where_they_help(tmp_path):
+    windows, first = run(tmp_path, np.linspace(-np.pi, np.pi, 6)[:-1])
+    with ThreadPoolExecutor(2) as executor:
+        better = windows.improve(0.5, 20, executor=executor, at_once=2)
+    assert first.profile.error.max() > 0.5 and len(first.windows) == 5
+    assert 5 < len(better.windows) < 20 and better.profile.error.max() <= 0.5
+
+
+def test_a_killed_worker_changes_nothing(tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir(), broken.mkdir()
+    _, expected = run(whole)
+    windows = Windows(Fake(str(broken / "diary"), kills=("window-0003-up",)), broken / "out", SETTINGS)
+    result = windows.run(PLACES, workers=2)
+    assert diary(broken).count("window-0003-up") >= 2
+    assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
+
+
+def killed_again_and_again(folder: Path, kills: int) -> None:
+    """Run in a process that is killed with all its children after random times, until it ends by itself."""
+    rng = np.random.default_rng(3)
+    finished: set[str] = set()
+    path = os.pathsep.join([str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])])
+    script = folder / "script.py"
+    script.write_text(SCRIPT)
+    for attempt in range(kills + 1):
+        process = subprocess.Popen(
+            [sys.executable, str(script), str(folder), "2", "0.3"],
+            env={**os.environ, "PYTHONPATH": path},
+            start_new_session=True,
+        )
+        if attempt < kills:
+            time.sleep(rng.uniform(0.5, 6.0))
+            os.killpg(process.pid, signal.SIGKILL)
+        assert process.wait(timeout=120) in (0, -signal.SIGKILL)
+        present = {file.name for file in (folder / "out").glob("window-*.npz")}
+        assert finished <= present
+        finished = present
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(30, marks=pytest.mark.validation)])
+def test_killed_runs_go_on(tmp_path, kills):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir(), broken.mkdir()
+    _, expected = run(whole)
+    killed_again_and_again(broken, kills)
+    _, result = run(broken)
+    assert json.dumps(result.numbers()) == json.dumps(expected.numbers())
+
+
+def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir(), broken.mkdir()
+    _, expected = run(whole)
+    path = [str(Path(__file__).parents[2] / "systems"), str(Path(__file__).parents[3])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
+        distributed.Client(cluster.scheduler_address) as client,
+    ):
+        fake = Fake(str(broken / "diary"), kills=("window-0003-up",), wait=0.05)
+        result = Windows(fake, broken / "out", SETTINGS).run(PLACES, executor=client.get_executor(pure=False))
+    assert diary(broken).count("window-0003-up") == 2
+    assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
+
+
+def test_bad_input(tmp_path):
+    with pytest.raises(OccupiedError, match=r"windows of other settings; choose another folder"):
+        run(tmp_path)
+        Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
+    for wrong in ([], [np.nan]):
+        with pytest.raises(InputError, match="targets must be finite"):
+            windows.run(wrong)

@@ -1,0 +1,72 @@
+"""Windows in OpenMM: two torsions of a peptide at once."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import openmm
+import pytest
+from openmm import app
+from openmm_systems import DATA
+
+from kcons.constraints import Angle, Dihedral, Distance, Formula, Plane
+from kcons.errors import SingularGeometryError, UnsupportedError
+from kcons.free_energy import OpenMMWindows, Series, Settings, Window
+
+PDB = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+PHI, PSI = Dihedral([[4, 6, 8, 14]]), Dihedral([[6, 8, 14, 16]])
+
+
+def system():
+    field = app.ForceField("amber14-all.xml", "implicit/gbn2.xml")
+    return field.createSystem(PDB.topology, constraints=app.HBonds, removeCMMotion=False)
+
+
+def sampler(coordinates, of=None):
+    return OpenMMWindows(PDB.topology, of or system(), PDB.positions, coordinates, platform="Reference")
+
+
+@pytest.mark.parametrize("thermostat", ["langevin", "nose-hoover", "isokinetic"])
+def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
+    windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))
+    assert windows.begin()[0] == pytest.approx([np.pi, np.pi], abs=1e-3)
+    settings = Settings(timestep=2.0, thermostat=thermostat, relax=5, pull=20, equilibration=20, production=320)
+    windows.sample(Window(0, "up", (-1.2, 1.9), (-1.1, 2.0), 7), settings, tmp_path / "window.npz")
+    series = Series.load(tmp_path / "window.npz")
+    assert len(series) == 32 and series.off.max() < 1e-10
+    np.testing.assert_allclose(series.value, np.tile([-1.1, 2.0], (32, 1)), atol=1e-10)
+    assert np.abs(series.multiplier).max() > 1
+    # 66 less 12 bonds, 2 torsions and the total momentum.
+    assert series.isokinetic_degrees_of_freedom == (49 if thermostat == "isokinetic" else 0)
+
+
+@pytest.mark.parametrize(
+    ("coordinate", "target"),
+    [
+        (Distance([[4, 14]]), 0.26),
+        (Angle([[6, 8, 14]]), 2.0),
+        (Formula("sqrt((x1-x2)**2 + (y1-y2)**2 + (z1-z2)**2)", [[4, 14]]), 0.26),
+    ],
+    ids=["distance", "angle", "formula"],
+)
+def test_other_coordinates(tmp_path, coordinate, target):
+    windows = sampler({"q": coordinate})
+    assert windows.scales.tolist() == ([10.0] if isinstance(coordinate, Distance) else [1.0])
+    settings = Settings(relax=5, pull=20, equilibration=10, production=32, every=1)
+    windows.sample(Window(0, "down", (target + 0.02,), (target,), 7), settings, tmp_path / "window.npz")
+    series = Series.load(tmp_path / "window.npz")
+    np.testing.assert_allclose(series.value, target, atol=1e-10)
+
+
+def test_coordinates_that_cannot_be_held():
+    with pytest.raises(UnsupportedError, match=r"p is <Plane.*Distance, an Angle, a Dihedral or a Formula"):
+        sampler({"p": Plane([0], (0, 0, 1))})
+    with pytest.raises(UnsupportedError, match=r"r is .*one row"):
+        sampler({"r": Distance([[0, 1], [1, 2]])})
+    tight = system()
+    x = PDB.positions
+    for i, j in ((4, 6), (6, 8), (4, 8), (8, 14), (6, 14), (4, 14)):
+        tight.addConstraint(i, j, openmm.unit.norm(x[i] - x[j]))
+    with pytest.raises(SingularGeometryError, match="q depends on the other"):
+        sampler({"q": Angle([[4, 6, 8]])}, tight).begin()

@@ -1,0 +1,57 @@
+"""Settings of windows, and how coordinates come to where a window begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons.constraints import Dihedral, Distance, Formula, KnifeEdge
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy import Settings, Window
+from kcons.free_energy.windows.window import Held, scales_of
+
+X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
+TURN = Dihedral([[0, 1, 2, 3]])
+BONDS = [[0, 1], [1, 2], [2, 3], [2, 4]]
+
+
+def held(coordinates=None, others=()):
+    return Held(coordinates or {"turn": TURN}, list(others), X, np.ones(5), None, True, lambda: np.array(BONDS))
+
+
+def test_settings_say_what_is_wrong():
+    for name, value in (("temperature", -1.0), ("timestep", 0.0), ("every", 0), ("relax", -1), ("pull", 0.5)):
+        with pytest.raises(InputError, match=f"{name} is"):
+            Settings(**{name: value})
+    with pytest.raises(InputError, match="no thermostat 'andersen'"):
+        Settings(thermostat="andersen")
+    with pytest.raises(InputError, match="fewer than 32 samples"):
+        Settings(production=300, every=10)
+
+
+def test_names_and_units():
+    assert Window(12, "up", (0.0,), (1.0,), 1).name == "window-0012-up"
+    both = {"r": Distance([[0, 1]]), "turn": TURN, "f": Formula("x1 - 1", [[0]])}
+    assert scales_of(both, 10.0).tolist() == [10.0, 1.0, 1.0]
+
+
+def test_groups_are_turned_and_keep_their_shape():
+    rows = held(others=[Distance([[0, 1]])])
+    start = float(rows.found[0])
+    motion, x = rows.placed([start + 2.0])
+    assert motion.constraint_set.measure(x)[-1] == pytest.approx(start + 2.0 - 2 * np.pi * (start + 2.0 > np.pi))
+    for i, j in [*BONDS, [3, 4], [1, 3], [1, 4]]:
+        assert np.linalg.norm(x[i] - x[j]) == pytest.approx(np.linalg.norm(X[i] - X[j]), rel=2e-3)
+
+
+def test_a_pull_ends_where_the_window_is():
+    rows = held()
+    (pulled,) = rows.towards(Window(0, "up", (0.3,), (0.5,), 1), duration=4.0)
+    assert [pulled.target_at(t)[0] for t in (0.0, 2.0, 4.0)] == pytest.approx([0.3, 0.4, 0.5])
+    assert rows.at([0.5])[0].target_at(0.0)[0] == 0.5
+
+
+@pytest.mark.parametrize("wrong", [Distance(BONDS[:2]), KnifeEdge(0, 1, (0, 0, 1)), "turn"])
+def test_a_coordinate_is_one_row_of_positions(wrong):
+    with pytest.raises(UnsupportedError, match=r"q is .*one row that holds positions"):
+        held({"q": wrong})

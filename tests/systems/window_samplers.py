@@ -1,0 +1,59 @@
+"""Samplers of windows that need no MD engine, for tests of what runs them; other processes import them from here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from kcons.free_energy import Sample, Series
+
+KT = 2.4943387854459713  # kJ/mol at 300 K
+
+
+def slope(q):
+    """dF/dq of F = 3 cos 2q + 2 cos q."""
+    return -6 * np.sin(2 * q) - 2 * np.sin(q)
+
+
+@dataclass
+class Fake:
+    """Multipliers of a torsion with noise; notes in `diary` that a window was begun.
+
+    `fails` lists windows that raise, `kills` those whose process is killed the first time.
+    """
+
+    diary: str
+    fails: tuple[str, ...] = ()
+    kills: tuple[str, ...] = ()
+    wait: float = 0.0
+    noise: float = 2.0
+    shift: float = 0.0
+    names: tuple[str, ...] = ("torsion",)
+    angles: tuple[bool, ...] = (True,)
+    kJ: float = 1.0
+    scales: np.ndarray = field(default_factory=lambda: np.ones(1))
+
+    def begin(self):
+        return np.zeros(1), np.full(1, 2 * np.pi)
+
+    def sample(self, window, settings, file):
+        with Path(self.diary).open("a") as diary:
+            diary.write(f"{window.name}\n")
+        if window.name in self.kills and Path(self.diary).read_text().count(window.name) == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if window.name in self.fails:
+            raise RuntimeError("the calculator did not converge")
+        time.sleep(self.wait)
+        rng = np.random.default_rng(window.seed)
+        series = Series(self.names, 2 * np.pi)
+        (q,) = window.target
+        apart = self.shift if window.side == "up" else -self.shift
+        for k in range(settings.production // settings.every):
+            force = slope(q) + apart + self.noise * rng.normal()
+            series.append(Sample(float(k), np.array([q]), np.array([force]), np.zeros(1), 0.0, np.zeros(1), 0.0))
+        series.save(file)
