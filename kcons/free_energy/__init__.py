@@ -24,6 +24,7 @@ _NAMES = {
     "windows.ase_windows": ("AseWindows",),
     "windows.openmm_windows": ("OpenMMWindows",),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
+    "windows.plan_file": ("PlanFile", "read_plan"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
