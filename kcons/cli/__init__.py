@@ -1,6 +1,7 @@
 """The command `kcons`.
 
 - `terminal`, `progress`: what is written to the terminal
-- `check`, `scan`, `studies`, `warmup`: `kcons check`, `scan`, `hardcases`, `stability`, `warmup`
+- `check`, `freeenergy`, `scan`, `warmup`: the commands of these names
+- `studies`: `kcons hardcases`, `kcons stability`
 - `main`: all others
 """

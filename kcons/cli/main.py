@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, scan, studies, warmup
+from kcons.cli import check, freeenergy, scan, studies, warmup
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
 from kcons.errors import InputError, KconsError
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; of `scan`, 3 where some
-    points failed; 2 for an error that the user can mend; 130 when interrupted.
+    The exit status: 0; of `check`, 1 for a violation and 3 where not all could be told; of `scan` and
+    `freeenergy`, 3 where some points or windows failed; 2 for an error that the user can mend; 130 when interrupted.
     """
     try:
         with patient_streams():
@@ -136,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     plan.set_defaults(run=_plan)
     check.add(commands)
+    freeenergy.add(commands)
     scan.add(commands)
     studies.add(commands)
     warmup.add(commands)

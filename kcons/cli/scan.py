@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,27 +190,9 @@ def _settings(given: str) -> dict[str, Any]:
 def _calculator(name: str, settings: dict[str, Any]) -> Any:
     if name.endswith(".xml"):
         return _of_system(Path(name), settings)
-    try:
-        if name in ("gfn1", "gfn2"):
-            if find_spec("tblite") is None:
-                raise UnsupportedError(f"{name} needs tblite: python -m pip install tblite")
-            from tblite.ase import TBLite
+    from kcons.ase.named_calculators import named_calculator
 
-            return TBLite(**{"method": f"GFN{name[-1]}-xTB", "verbosity": 0, **settings})
-        if ":" in name:
-            module, _, attribute = name.partition(":")
-            return getattr(import_module(module), attribute)(**settings)
-        from ase.calculators.calculator import get_calculator_class
-
-        return get_calculator_class(name)(**settings)
-    except UnsupportedError:
-        raise
-    except Exception as error:
-        raise InputError(
-            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, "
-            "those of ASE by name, MODULE:NAME, and FILE.xml for a System of OpenMM",
-            item="calculator",
-        ) from error
+    return named_calculator(name, settings)
 
 
 def _of_system(path: Path, settings: dict[str, Any]) -> Any:

@@ -21,7 +21,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.free_energy.ase_recorder import AseRecorder
-from kcons.free_energy.windows.window import Held, Settings, Window, scales_of
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
 from kcons.motion import minimise
 
 #: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
@@ -63,6 +63,7 @@ class AseWindows:
         self.held = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
         self.names = tuple(self.coordinates)
+        self.angles = angles_of(self.coordinates)
         self.scales = scales_of(self.coordinates, 1.0)
 
     def _rows(self) -> Held:

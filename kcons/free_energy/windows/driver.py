@@ -23,7 +23,9 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, OccupiedError
+from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force
+from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Sampler, Settings, Window
@@ -96,12 +98,25 @@ class FreeEnergy:
             There are several coordinates, or too few windows.
         """
         if len(self.names) != 1:
-            raise InputError(f"there are {len(self.names)} coordinates; use free_energy_surface", item="coordinates")
+            raise InputError(f"there are {len(self.names)} coordinates; see surface", item="coordinates")
         x, f, e = (np.array([getattr(w, name)[0] for w in self.windows]) for name in ("value", "force", "error"))
         period = float(self.periods[0]) or None
         spread = np.ptp(x) if len(x) else 0.0
         whole = period is not None and spread + np.diff(np.sort(x)).max(initial=0.0) >= period * (1 - 1e-6)
         return integrate(x, f, e, period=period if whole else None)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Free energy in all coordinates, kJ/mol.
+
+        Raises
+        ------
+        InputError
+            Too few windows.
+        """
+        x, f = (np.array([getattr(w, name) for w in self.windows]) for name in ("value", "force"))
+        covariances = np.array([w.covariance for w in self.windows])
+        return fit_surface(x, f, covariances, periods=[period or None for period in self.periods.tolist()])
 
     def numbers(self) -> dict[str, Any]:
         """All of it as plain data."""
@@ -184,6 +199,11 @@ class Windows:
             return
         with in_one_piece(known) as opened:
             opened.write(text(mine).encode())
+
+    @property
+    def angles(self) -> list[bool]:
+        """Which coordinates are angles."""
+        return [bool(angle) for angle in self.sampler.angles]
 
     # -- running --------------------------------------------------------------------------------
 
@@ -331,16 +351,15 @@ class Windows:
                 if not self.file(job).exists():
                     continue
                 try:
-                    sides[job.side] = mean_force(Series.load(self.file(job)), kT)
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
+                        sides[job.side] = mean_force(Series.load(self.file(job)), kT)
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
                 found.append(_together(number, np.array(target), sides, self.sampler.kJ, self.sampler.scales))
         found.sort(key=lambda w: w.value.tolist())
-        result = FreeEnergy(self.sampler.names, self.periods, found, problems)
-        with in_one_piece(self.folder / "free_energy.json") as opened:
-            opened.write(text(result.numbers()).encode())
-        return result
+        return FreeEnergy(self.sampler.names, self.periods, found, problems)
 
 
 def _together(
@@ -352,10 +371,7 @@ def _together(
     covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
     chance = math.nan
     if len(sides) == 2:
-        from scipy.stats import chi2
-
-        apart = forces[0] - forces[1]
-        chance = float(chi2.sf(apart @ np.linalg.pinv(covariances.sum(axis=0)) @ apart, len(apart)))
+        chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
     raw = np.mean([side.raw * per for side in sides.values()], axis=0)
     return WindowResult(
         number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw
@@ -390,4 +406,3 @@ def _processes(workers: int, jobs: int) -> ProcessPoolExecutor:
 def _one_thread() -> None:
     for name in ("OMP_NUM_THREADS", "OPENMM_CPU_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    warnings.filterwarnings("ignore", message=".*worth .* independent ones.*")

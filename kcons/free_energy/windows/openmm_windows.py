@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
-from kcons.free_energy.windows.window import Held, Settings, Window, scales_of
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.hold import constraints_about
@@ -71,6 +71,7 @@ class OpenMMWindows:
         self.positions = nanometers(positions, n)
         self.coordinates = dict(coordinates)
         self.names = tuple(self.coordinates)
+        self.angles = angles_of(self.coordinates)
         self.scales = scales_of(self.coordinates, 10.0)
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, MovingTarget
-from kcons.constraints.arguments import LENGTH
+from kcons.constraints.arguments import ANGLE, LENGTH
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -98,11 +98,14 @@ class Sampler(Protocol):
         Its unit of energy in kJ/mol.
     scales : ndarray, shape (d,)
         The units of its coordinates in angstrom and radian.
+    angles : tuple of bool
+        Which coordinates are angles.
     """
 
     names: tuple[str, ...]
     kJ: float
     scales: FloatArray
+    angles: tuple[bool, ...]
 
     def begin(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates at the initial structure, and their periods, shape (d,); raises where a window cannot be made."""
@@ -114,6 +117,11 @@ class Sampler(Protocol):
 def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatArray:
     """Units of coordinates in angstrom and radian; formulas stay in the units they are written in."""
     return np.array([angstrom if c.held is LENGTH and c.family != "Formula" else 1.0 for c in coordinates.values()])
+
+
+def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool, ...]:
+    """Which coordinates are angles."""
+    return tuple(c.held is ANGLE for c in coordinates.values())
 
 
 @dataclass

@@ -1,0 +1,51 @@
+"""Calculators of ASE by name, as commands and plan files give them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from kcons.errors import InputError, UnsupportedError
+
+
+def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> Any:
+    """A calculator from its name.
+
+    Parameters
+    ----------
+    name : str
+        gfn2 or gfn1 (by tblite), the name of a calculator of ASE, or MODULE:NAME of what makes one.
+    settings : mapping, optional
+        Arguments of what makes it.
+
+    Raises
+    ------
+    InputError
+        There is none of that name, or it does not take these settings.
+    UnsupportedError
+        tblite is not installed.
+    """
+    given = dict(settings or {})
+    try:
+        if name in ("gfn1", "gfn2"):
+            if find_spec("tblite") is None:
+                raise UnsupportedError(f"{name} needs tblite: python -m pip install tblite")
+            from tblite.ase import TBLite
+
+            return TBLite(**{"method": f"GFN{name[-1]}-xTB", "verbosity": 0, **given})
+        if ":" in name:
+            module, _, attribute = name.partition(":")
+            return getattr(import_module(module), attribute)(**given)
+        from ase.calculators.calculator import get_calculator_class
+
+        return get_calculator_class(name)(**given)
+    except UnsupportedError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"no calculator {name!r} with these settings ({type(error).__name__}: {error}); there are gfn2, gfn1, "
+            "those of ASE by name, and MODULE:NAME",
+            item="calculator",
+        ) from error

@@ -1,0 +1,64 @@
+"""The command `kcons freeenergy`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from kcons.cli.scan import INCOMPLETE
+from kcons.cli.terminal import console, say_written, show
+
+
+def add(commands: Any) -> None:
+    """Its options."""
+    made = commands.add_parser(
+        "freeenergy",
+        help="free energy along held coordinates, from a plan",
+        description="Samples windows with coordinates held, and integrates their mean force. The plan is a TOML file; "
+        "see the page on free energies. Goes on where it stopped: finished windows are kept one by one. Exit status 0; "
+        "2 for wrong use; 3 if some windows failed.",
+    )
+    made.add_argument("plan", type=Path, help="TOML file with structure, forces, coordinates and sampling")
+    made.add_argument("--out", type=Path, help="folder of the windows and results (default ./PLAN without its ending)")
+    made.add_argument("--workers", type=int, help="processes of this machine (default: of the plan, or one a core)")
+    made.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786, in place of processes")
+    made.add_argument("--list", action="store_true", help="say what would be run, and leave")
+    made.set_defaults(run=_free_energy)
+
+
+def _free_energy(chosen: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from kcons.cli.progress import Bars
+    from kcons.free_energy import Windows, read_plan
+    from kcons.free_energy.windows import windows_report
+
+    plan = read_plan(chosen.plan)
+    if chosen.scheduler is not None:
+        plan = replace(plan, scheduler=chosen.scheduler)
+    sides = 2 if plan.options.get("both_sides", True) else 1
+    if chosen.list:
+        steps = plan.settings.pull + plan.settings.equilibration + plan.settings.production
+        print(f"{len(plan.targets)} windows of {', '.join(plan.sampler.names)}, {sides} runs of {steps:,} steps each")
+        return 0
+    folder: Path = chosen.out or Path(chosen.plan.stem)
+    windows = Windows(plan.sampler, folder, plan.settings, **plan.options)
+    with Bars() as watcher, plan.executor() as executor:
+
+        def progress(done: int, total: int, seconds: float) -> None:
+            each = seconds / (total - done) if done < total else 0.0
+            watcher.overall("windows", done * each, total * each)
+
+        how: dict[str, Any] = {
+            "executor": executor,
+            "workers": chosen.workers or plan.processes,
+            "progress": progress,
+        }
+        found = windows.run(plan.targets, **how)
+        if plan.improve and not found.failed:
+            found = windows.improve(**plan.improve, **how)
+    degrees = windows.angles
+    show(windows_report.table(found, degrees), windows_report.summary(found), console())
+    say_written(windows_report.write(found, folder, degrees))
+    return INCOMPLETE if found.failed else 0

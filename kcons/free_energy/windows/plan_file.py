@@ -1,0 +1,234 @@
+"""Windows as a file describes them, in TOML."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, fields
+from functools import partial
+from itertools import product
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kcons.constraints import Angle, Constraint, Dihedral, Distance, FixedAtoms
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.free_energy.windows.window import Sampler, Settings
+
+#: Tables of a plan and their keys.
+TABLES = {
+    "structure": ("file", "count_from"),
+    "forces": ("calculator", "settings", "system", "platform", "properties"),
+    "coordinate": ("name", "distance", "angle", "dihedral", "from", "to", "windows", "values"),
+    "held": ("constrain", "fixed", "distances"),
+    "sampling": (*(f.name for f in fields(Settings)), "both_sides", "approach", "seed"),
+    "improve": ("error", "most", "at_once"),
+    "workers": ("processes", "scheduler"),
+}
+FAMILIES: dict[str, type[Constraint]] = {"distance": Distance, "angle": Angle, "dihedral": Dihedral}
+
+
+@dataclass(frozen=True)
+class PlanFile:
+    """A plan that was read.
+
+    Attributes
+    ----------
+    sampler : Sampler
+    settings : Settings
+    targets : ndarray, shape (n, d)
+        In angstrom and radian.
+    options : dict
+        Of `Windows`: both_sides, approach, seed.
+    improve : dict or None
+        Of `Windows.improve`.
+    processes : int or None
+    scheduler : str or None
+        Address of a scheduler of Dask.
+    """
+
+    sampler: Sampler
+    settings: Settings
+    targets: FloatArray
+    options: dict[str, Any]
+    improve: dict[str, Any] | None
+    processes: int | None
+    scheduler: str | None
+
+    def executor(self) -> AbstractContextManager[Executor | None]:
+        """Where the windows run; None for processes of this machine."""
+        return nullcontext() if self.scheduler is None else _Cluster(self.scheduler)
+
+
+class _Cluster(AbstractContextManager["Executor | None"]):
+    """The executor of a Dask cluster."""
+
+    def __init__(self, address: str) -> None:
+        try:
+            from distributed import Client
+        except ModuleNotFoundError:
+            raise UnsupportedError(
+                "a scheduler is one of Dask, which is not installed: python -m pip install 'dask[distributed]'"
+            ) from None
+        try:
+            self._client = Client(address, timeout="10s")
+        except (OSError, ValueError) as error:
+            raise InputError(f"no scheduler of Dask answers at {address}: {error}", item="scheduler") from error
+
+    def __enter__(self) -> Executor:
+        found: Executor = self._client.get_executor(pure=False)
+        return found
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()
+
+
+def read_plan(file: str | PathLike[str]) -> PlanFile:
+    """Read a plan; its paths count from where it lies.
+
+    Raises
+    ------
+    InputError
+        No TOML, unknown or missing keys, files that are not there, coordinates without values.
+    """
+    path = Path(file)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"there is no file {path}", item="plan") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML: {error}", item="plan") from error
+    _refuse_unknown(data)
+    coordinates, values = {}, []
+    for entry in data.get("coordinate", []):
+        name, item, places = _coordinate(entry, data.get("structure", {}).get("count_from", 0))
+        if name in coordinates:
+            raise InputError(f"two coordinates have the name {name}; give each its own", item="coordinate")
+        coordinates[name] = item
+        values.append(places)
+    if not coordinates:
+        raise InputError("the plan has no [[coordinate]]", item="coordinate")
+    settings = dict(data.get("sampling", {}))
+    options = {key: settings.pop(key) for key in ("both_sides", "approach", "seed") if key in settings}
+    workers = data.get("workers", {})
+    return PlanFile(
+        _sampler(data, path.parent, coordinates),
+        Settings(**settings),
+        np.array(list(product(*values))),
+        options,
+        data.get("improve"),
+        workers.get("processes"),
+        workers.get("scheduler"),
+    )
+
+
+def _refuse_unknown(data: Mapping[str, Any]) -> None:
+    for table, content in data.items():
+        _refuse(table, TABLES, "the plan")
+        if (table == "coordinate") != isinstance(content, list):
+            brackets = "[[coordinate]], once for each" if table == "coordinate" else f"[{table}], once"
+            raise InputError(f"write {brackets}", item=table)
+        for entry in content if isinstance(content, list) else [content]:
+            if not isinstance(entry, dict):
+                raise InputError(f"{table} is {entry!r}; write [{table}] and its keys below", item=table)
+            for key in entry:
+                _refuse(key, TABLES[table], f"[{table}]")
+
+
+def _refuse(key: str, known: Any, where: str) -> None:
+    if key not in known:
+        near = difflib.get_close_matches(key, known, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"{where} has an unknown key {key!r}{hint} There are {', '.join(known)}", item=key)
+
+
+def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, FloatArray]:
+    families = [family for family in FAMILIES if family in entry]
+    name = entry.get("name") or "-".join([*families, *map(str, entry.get(families[0] if families else "", []))])
+    if len(families) != 1:
+        raise InputError(
+            f"coordinate {name} is {' and '.join(families) or 'nothing'}; give the atoms of a {', '.join(FAMILIES)}",
+            item="coordinate",
+        )
+    (family,) = families
+    item = FAMILIES[family]([[int(atom) - first for atom in entry[family]]])
+    if "values" in entry:
+        places = np.array(entry["values"], dtype=np.float64)
+    elif {"from", "to", "windows"} <= set(entry):
+        turn = family == "dihedral" and abs(entry["to"] - entry["from"]) >= 360 - 1e-9
+        places = np.linspace(entry["from"], entry["to"], int(entry["windows"]), endpoint=not turn)
+    else:
+        raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
+    if places.ndim != 1 or not len(places):
+        raise InputError(f"coordinate {name} has no values", item="coordinate")
+    return name, item, places if family == "distance" else np.radians(places)
+
+
+def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Constraint]) -> Sampler:
+    structure, forces, held = data.get("structure", {}), data.get("forces", {}), data.get("held", {})
+    if "file" not in structure:
+        raise InputError("the plan has no structure; write [structure] with file = ...", item="structure")
+    place = folder / structure["file"]
+    if not place.is_file():
+        raise InputError(f"there is no file {place}", item="structure")
+    if ("calculator" in forces) == ("system" in forces):
+        raise InputError(
+            "give calculator or system in [forces]: a calculator of ASE, or the XML file of a System of OpenMM",
+            item="forces",
+        )
+    if "system" in forces:
+        if held:
+            raise InputError("in OpenMM the System says what is held; leave out [held]", item="held")
+        return _of_openmm(place, folder / forces["system"], forces, coordinates)
+    import ase.io
+
+    from kcons.ase import constraints_of
+    from kcons.ase.named_calculators import named_calculator
+    from kcons.free_energy.windows.ase_windows import AseWindows
+
+    try:
+        atoms: Any = ase.io.read(place)
+    except Exception as error:
+        raise InputError(f"ASE cannot read {place}: {type(error).__name__}: {error}", item="structure") from error
+    first = structure.get("count_from", 0)
+    rows: list[Constraint] = []
+    if "fixed" in held:
+        rows.append(FixedAtoms([int(a) - first for a in held["fixed"]]))
+    if "distances" in held:
+        rows.append(Distance(np.array(held["distances"], dtype=np.int64) - first))
+    if "constrain" in held:
+        rows += constraints_of(atoms, held["constrain"])
+    make = partial(named_calculator, forces["calculator"], forces.get("settings", {}))
+    make()  # complain before windows are begun
+    return AseWindows(atoms, make, coordinates, rows)
+
+
+def _of_openmm(
+    structure: Path, system: Path, forces: Mapping[str, Any], coordinates: Mapping[str, Constraint]
+) -> Sampler:
+    import openmm
+    from openmm import app
+
+    from kcons.free_energy.windows.openmm_windows import OpenMMWindows
+
+    if not system.is_file():
+        raise InputError(f"there is no file {system}", item="system")
+    try:
+        pdb = app.PDBxFile(str(structure)) if structure.suffix == ".cif" else app.PDBFile(str(structure))
+        made = openmm.XmlSerializer.deserialize(system.read_text(encoding="utf-8"))
+    except Exception as error:
+        raise InputError(f"OpenMM cannot read {structure} or {system}: {error}", item="system") from error
+    return OpenMMWindows(
+        pdb.topology,
+        made,
+        pdb.positions,
+        coordinates,
+        platform=forces.get("platform"),
+        properties=forces.get("properties"),
+    )

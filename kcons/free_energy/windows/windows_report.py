@@ -1,0 +1,120 @@
+"""What is shown of windows: a table, columns of text, a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kcons.free_energy.averages import FEW_INDEPENDENT
+from kcons.free_energy.windows.driver import FreeEnergy, WindowResult
+from kcons.steppers.files import in_one_piece, text
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+#: Differences of the two sides that are less probable than this are marked.
+UNLIKELY = 0.01
+#: Least windows that a profile is drawn through.
+FEWEST = 4
+
+
+def table(found: FreeEnergy, degrees: Sequence[bool]) -> Table:
+    """The windows, one in a line.
+
+    Parameters
+    ----------
+    degrees : sequence of bool
+        Which coordinates are angles.
+    """
+    from rich.table import Table
+
+    made = Table(title="mean force (kJ/mol by angstrom or radian)")
+    for name, angle in zip(found.names, degrees, strict=True):
+        made.add_column(f"{name} ({'degrees' if angle else 'angstrom'})", justify="right")
+    for name in found.names:
+        made.add_column(f"dF/d {name}" if len(found.names) > 1 else "dF/dq", justify="right")
+    made.add_column("raw multiplier", justify="right")
+    made.add_column("independent samples", justify="right")
+    made.add_column("hysteresis p", justify="right")
+    for window in found.windows:
+        shown = [np.degrees(q) if angle else q for q, angle in zip(window.value, degrees, strict=True)]
+        mark = "!" if window.hysteresis < UNLIKELY else ""
+        made.add_row(
+            *(f"{q:.4g}" for q in shown),
+            *(f"{f:.2f} ± {e:.2f}" for f, e in zip(window.force, window.error, strict=True)),
+            ", ".join(f"{raw:.2f}" for raw in window.raw),
+            f"{_independent(window):.0f}",
+            "" if np.isnan(window.hysteresis) else f"{window.hysteresis:.2g}{mark}",
+        )
+    return made
+
+
+def _independent(window: WindowResult) -> float:
+    return sum(side.n_effective for side in window.sides.values())
+
+
+def summary(found: FreeEnergy) -> str:
+    """A sentence or two."""
+    lines = [f"{len(found.windows)} windows"]
+    doubtful = [w.number for w in found.windows if w.hysteresis < UNLIKELY]
+    if doubtful:
+        lines.append(
+            f"runs from below and from above differ by more than chance in window {', '.join(map(str, doubtful))} "
+            "(marked !): something slow is not equilibrated there; sample longer, or look for the other coordinate"
+        )
+    poor = [w.number for w in found.windows if _independent(w) < FEW_INDEPENDENT]
+    if poor:
+        lines.append(
+            f"fewer than {FEW_INDEPENDENT} independent samples in window {', '.join(map(str, poor))}: errors there are "
+            "not to be relied on; sample longer"
+        )
+    if len(found.names) == 1 and len(found.windows) >= FEWEST:
+        profile = found.profile
+        low, high = int(np.argmin(profile.F)), int(np.argmax(profile.F))
+        gap = profile.difference(float(profile.x[low]), float(profile.x[high]))
+        lines.append(f"from the lowest to the highest point {gap.value:.2f} ± {gap.error:.2f} kJ/mol")
+    lines += [f"{name} failed: {why}" for name, why in found.failed.items()]
+    return "\n".join(lines)
+
+
+def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool]) -> list[Path]:
+    """free_energy.json, and for one coordinate profile.csv and profile.png; returns their paths."""
+    written = [folder / "free_energy.json"]
+    with in_one_piece(written[0]) as opened:
+        opened.write(text(found.numbers()).encode())
+    if len(found.names) == 1 and len(found.windows) >= FEWEST:
+        profile = found.profile
+        written.append(folder / "profile.csv")
+        with in_one_piece(written[-1]) as opened:
+            unit = "radian" if degrees[0] else "angstrom"
+            opened.write(f"{found.names[0]} ({unit}),F (kJ/mol),error (kJ/mol)\n".encode())
+            np.savetxt(opened, np.column_stack([profile.x, profile.F, profile.error]), fmt="%.8g", delimiter=",")
+        written.append(folder / "profile.png")
+        _draw(found, written[-1], degrees[0])
+    return written
+
+
+def _draw(found: FreeEnergy, file: Path, degrees: bool) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below = figure.subplots(2, 1, sharex=True)
+    profile, turn = found.profile, 180 / np.pi if degrees else 1.0
+    above.plot(turn * profile.x, profile.F, color="tab:blue")
+    above.fill_between(
+        turn * profile.x, profile.F - 2 * profile.error, profile.F + 2 * profile.error, color="tab:blue", alpha=0.25
+    )
+    above.set_ylabel("F (kJ/mol), band 2 standard errors")
+    x = turn * np.array([w.value[0] for w in found.windows])
+    below.errorbar(
+        x, [w.force[0] for w in found.windows], [2 * w.error[0] for w in found.windows], fmt="o", ms=4, capsize=2
+    )
+    below.axhline(0, color="0.6", lw=0.8)
+    below.set_ylabel("dF/dq (kJ/mol by " + ("radian)" if degrees else "angstrom)"))
+    below.set_xlabel(f"{found.names[0]} ({'degrees' if degrees else 'angstrom'})")
+    figure.savefig(file, dpi=150)

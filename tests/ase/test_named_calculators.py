@@ -1,0 +1,26 @@
+"""Calculators by name."""
+
+from __future__ import annotations
+
+import pytest
+from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
+
+from kcons.ase.named_calculators import named_calculator
+from kcons.errors import InputError
+
+
+def test_names_and_settings():
+    assert isinstance(named_calculator("emt"), EMT)
+    made = named_calculator("ase.calculators.lj:LennardJones", {"sigma": 2.0})
+    assert isinstance(made, LennardJones) and made.parameters.sigma == 2.0
+    pytest.importorskip("tblite")
+    assert named_calculator("gfn1", {"charge": 1}).parameters.method == "GFN1-xTB"
+
+
+@pytest.mark.parametrize(("name", "settings"), [("no", {}), ("no.module:thing", {}), ("lj", {"nothing of mine": 1})])
+def test_what_there_is_not_is_said(name, settings):
+    if name == "lj":
+        name, settings = "math:sqrt", {"x": 1}
+    with pytest.raises(InputError, match=rf"no calculator '{name}' with these settings.*gfn2, gfn1"):
+        named_calculator(name, settings)

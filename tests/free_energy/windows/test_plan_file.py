@@ -1,0 +1,149 @@
+"""Plans in TOML: what they make, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from ase.build import molecule
+from ase.io import write
+from openmm import app
+from openmm_systems import DATA
+
+from kcons.errors import InputError, KconsError, UnsupportedError
+from kcons.free_energy import AseWindows, OpenMMWindows, read_plan
+
+#: Files of coordinates have no bonds.
+pytestmark = pytest.mark.filterwarnings("ignore:.*bonds.*guessed")
+PLAN = """
+[structure]
+file = "methanol.xyz"
+
+[forces]
+calculator = "lj"
+settings = {sigma = 1.0, epsilon = 0.02, rc = 6.0}
+
+[[coordinate]]
+name = "turn"
+dihedral = [2, 0, 1, 3]
+from = -180
+to = 180
+windows = 12
+
+[held]
+constrain = "hbonds"
+
+[sampling]
+temperature = 310
+timestep = 0.5
+thermostat = "nose-hoover"
+both_sides = false
+seed = 4
+
+[improve]
+error = 0.5
+most = 20
+
+[workers]
+processes = 3
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path / "methanol.xyz", molecule("CH3OH"))
+    return tmp_path
+
+
+def read(folder, text=PLAN):
+    (folder / "plan.toml").write_text(text)
+    return read_plan(folder / "plan.toml")
+
+
+def test_a_plan_for_ase(folder):
+    plan = read(folder)
+    assert isinstance(plan.sampler, AseWindows) and plan.sampler.names == ("turn",)
+    assert plan.settings.temperature == 310 and plan.settings.thermostat == "nose-hoover"
+    assert plan.settings.production == 20000
+    np.testing.assert_allclose(plan.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
+    assert plan.options == {"both_sides": False, "seed": 4} and plan.improve == {"error": 0.5, "most": 20}
+    assert plan.processes == 3
+    with plan.executor() as executor:
+        assert executor is None
+    assert plan.sampler.begin()[0] == pytest.approx([np.pi])
+    assert plan.sampler.held[0].n_rows == 4
+
+
+def test_atoms_from_one_and_two_coordinates(folder):
+    text = PLAN.replace('file = "methanol.xyz"', 'file = "methanol.xyz"\ncount_from = 1').replace(
+        "dihedral = [2, 0, 1, 3]", "dihedral = [3, 1, 2, 4]"
+    )
+    text += "\n[[coordinate]]\ndistance = [1, 2]\nvalues = [1.4, 1.5]\n"
+    plan = read(folder, text)
+    assert plan.sampler.coordinates["turn"].atoms.tolist() == [[2, 0, 1, 3]]
+    assert plan.sampler.names == ("turn", "distance-1-2") and plan.targets.shape == (24, 2)
+    assert plan.targets[1] == pytest.approx([-np.pi, 1.5])
+
+
+def test_a_plan_for_openmm(folder):
+    pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+    field = app.ForceField("amber14-all.xml", "implicit/gbn2.xml")
+    system = field.createSystem(pdb.topology, constraints=app.HBonds)
+    (folder / "system.xml").write_text(openmm.XmlSerializer.serialize(system))
+    (folder / "alanine.pdb").write_text((DATA / "alanine-dipeptide-implicit.pdb").read_text())
+    plan = read(
+        folder,
+        """
+        [structure]
+        file = "alanine.pdb"
+        [forces]
+        system = "system.xml"
+        platform = "Reference"
+        [[coordinate]]
+        name = "r"
+        distance = [4, 14]
+        from = 2.8
+        to = 3.4
+        windows = 4
+        """,
+    )
+    assert isinstance(plan.sampler, OpenMMWindows) and plan.sampler.scales.tolist() == [10.0]
+    np.testing.assert_allclose(plan.targets[:, 0], [2.8, 3.0, 3.2, 3.4])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("[sampling]", "[samplings]", r"unknown key 'samplings'; did you mean 'sampling'\?"),
+        ("timestep = 0.5", "time_step = 0.5", r"\[sampling\] has an unknown key 'time_step'; did you mean 'timestep'"),
+        ("temperature = 310", "temperature = -310", "temperature is -310"),
+        ('calculator = "lj"', 'calculator = "no such"', "no calculator 'no such'"),
+        ('file = "methanol.xyz"', 'file = "nothing.xyz"', "there is no file .*nothing.xyz"),
+        ('file = "methanol.xyz"', "", "the plan has no structure"),
+        ('calculator = "lj"', "", r"give calculator or system"),
+        ("windows = 12", "", "give values, or from, to and windows"),
+        ("dihedral = [2, 0, 1, 3]", "", "coordinate turn is nothing"),
+        ("dihedral = [2, 0, 1, 3]", "dihedral = [2, 0, 1, 3]\nangle = [2, 0, 1]", "turn is angle and dihedral"),
+        ("[[coordinate]]", "[coordinate]", r"write \[\[coordinate\]\]"),
+        ("temperature = 310", "temperature 310", "is no TOML"),
+        ('constrain = "hbonds"', 'constrain = "everything"', "everything"),
+        (
+            "[workers]",
+            '[[coordinate]]\nname = "turn"\nangle = [2, 0, 1]\nvalues = [100.0]\n[workers]',
+            "two coordinates",
+        ),
+    ],
+)
+def test_wrong_plans(folder, old, new, match):
+    assert old in PLAN
+    with pytest.raises(KconsError, match=match):
+        read(folder, PLAN.replace(old, new))
+
+
+def test_an_unknown_scheduler(folder):
+    with pytest.raises(InputError, match="no file"):
+        read_plan(folder / "nothing.toml")
+    plan = read(folder, PLAN.replace("processes = 3", 'scheduler = "tcp://127.0.0.1:9"'))
+    pytest.importorskip("distributed")
+    with pytest.raises((InputError, UnsupportedError), match=r"no scheduler of Dask answers at tcp://127\.0\.0\.1:9"):
+        plan.executor()

@@ -1,0 +1,43 @@
+"""Tables and files of windows."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from window_samplers import Fake
+
+from kcons.cli.terminal import rendered
+from kcons.free_energy import Settings, Windows
+from kcons.free_energy.windows import windows_report
+
+
+@pytest.fixture
+def found(tmp_path):
+    windows = Windows(
+        Fake(str(tmp_path / "diary"), fails=("window-0001-up",), shift=0.4),
+        tmp_path / "out",
+        Settings(production=640, every=10),
+    )
+    return windows.run(np.linspace(-np.pi, np.pi, 9)[:-1], executor=ThreadPoolExecutor(1))
+
+
+def test_table_and_sentences(found):
+    text = rendered(windows_report.table(found, [True]))
+    assert "torsion (degrees)" in text and "-180" in text and "±" in text
+    said = windows_report.summary(found)
+    assert said.startswith("8 windows") and "window-0001-up failed: RuntimeError" in said
+    assert "from the lowest to the highest point" in said
+    low = min(w.hysteresis for w in found.windows if w.number != 1)
+    assert ("(marked !)" in said) == (low < 0.01) == ("!" in text)
+
+
+def test_files(found, tmp_path):
+    paths = windows_report.write(found, tmp_path, [True])
+    assert [path.name for path in paths] == ["free_energy.json", "profile.csv", "profile.png"]
+    lines = paths[1].read_text().splitlines()
+    assert lines[0] == "torsion (radian),F (kJ/mol),error (kJ/mol)"
+    numbers = np.loadtxt(paths[1], delimiter=",", skiprows=1)
+    np.testing.assert_allclose(numbers[:, 1], found.profile.F, rtol=1e-6, atol=1e-9)
+    assert paths[2].read_bytes().startswith(b"\x89PNG")
