@@ -319,7 +319,13 @@ def bott_duffin(
     # P_perp u may be given any unit: one of mass keeps both parts of the matrix of one size.
     diagonal = np.diagonal(M)[np.diagonal(M) > 0]
     unit = float(np.exp(np.mean(np.log(diagonal)))) if len(diagonal) else 1.0
-    u = np.linalg.solve(M @ P_par - unit * P_perp, _real_vector(f, n, "f") - M @ a_perp)
+    try:
+        u = np.linalg.solve(M @ P_par - unit * P_perp, _real_vector(f, n, "f") - M @ a_perp)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the mass matrix is singular along what the constraints leave free; give a mass to what moves there",
+            item="masses",
+        ) from None
     shape = np.shape(f)
     return BottDuffinSolution((P_par @ u + a_perp).reshape(shape), unit * (P_perp @ u).reshape(shape))
 

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.linalg import lapack
 
-from kcons.constraints.arguments import FloatArray
+from kcons.constraints.arguments import FloatArray, IntArray, lent
 from kcons.errors import (
     ConstraintError,
     ContradictionError,
@@ -35,7 +35,7 @@ from kcons.errors import (
 from kcons.models.multibody_functions import MultibodyFunctions, largest, shown
 from kcons.models.projected_steps import projecting, solver_of, span_of, times_of
 
-#: Singular values of G with rows of unit length below this part of the largest count as zero.
+#: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
 #: N^T M N is taken for singular where elimination leaves no more than this part of a diagonal element.
 MASSLESS = 1e-13
@@ -70,34 +70,35 @@ class MultibodySolution(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """M and G at one place, and their factors: G = size U diag(s) V, N spans its null space, N^T M N = W^T W."""
+    """M and G at one place, and their factors.
+
+    `rows` are independent and span all: G[rows] = size[rows] R^T Q^T; N spans their null space, N^T M N = W^T W.
+    """
 
     t: float
     q: FloatArray
     M: FloatArray
     G: FloatArray
     size: FloatArray
-    U: FloatArray
-    s: FloatArray
-    V: FloatArray
+    rows: IntArray
+    Q: FloatArray
+    R: FloatArray
     N: FloatArray
     W: FloatArray
 
     def solve(self, f: FloatArray, b: FloatArray) -> FloatArray:
         """a with G a = b and N^T (M a - f) = 0."""
-        a0 = self.V.T @ ((self.U.T @ (b / self.size)) / self.s)
-        if not self.N.shape[1]:
-            return np.asarray(a0)
-        y, _ = lapack.dpotrs(self.W, self.N.T @ (f - self.M @ a0))
-        return np.asarray(a0 + self.N @ y)
+        a: FloatArray = np.zeros(len(f))
+        if len(self.rows):
+            a = self.Q @ lapack.dtrtrs(self.R, (b / self.size)[self.rows], trans=1)[0]
+        if self.N.shape[1]:
+            a = a + self.N @ lapack.dpotrs(self.W, self.N.T @ (f - self.M @ a))[0]
+        return a
 
     def multipliers(self, z: FloatArray) -> FloatArray:
         """lambda with G^T lambda = z; of least norm where rows depend."""
-        found = self.U @ ((self.V @ z) / self.s) / self.size
-        if len(self.s) < len(self.G):
-            independent = np.linalg.qr(self.U * self.size[:, None])[0]  # spans the range of G
-            found = independent @ (independent.T @ found)
-        return np.asarray(found)
+        basis, triangle = np.linalg.qr(self.G @ self.Q)  # of the range of G
+        return np.asarray(basis @ np.linalg.solve(triangle.T, self.Q.T @ z))
 
 
 class Multibody(MultibodyFunctions):
@@ -151,7 +152,7 @@ class Multibody(MultibodyFunctions):
     def degrees_of_freedom(self, q: ArrayLike, t: float = 0.0) -> int:
         """n - rank G at `q`."""
         q, _ = self._state(q, q, t)
-        return len(q) - len(self._place(q, t, None).s)
+        return len(q) - len(self._place(q, t, None).rows)
 
     def residuals(self, q: ArrayLike, v: ArrayLike, t: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """g and its time derivative G v + dg/dt, shape (m,) each, in the units that g has."""
@@ -231,23 +232,24 @@ class Multibody(MultibodyFunctions):
         wanted = None if t_eval is None else times_of(t_eval, t0, t1)
         solver = solver_of(method)
         q, v = self._state(q, v, t0)
-        n, rank = len(q), len(self._start(q, v, t0).s)
+        n, rank = len(q), len(self._start(q, v, t0).rows)
         latest: dict[str, Any] = {}
 
         def project(t: float, y: FloatArray) -> FloatArray:
-            latest["place"] = place = self._placed(y[:n], t, rank)
+            latest["place"] = place = self._placed(lent(y[:n]), t, rank)
             latest["error"] = None
             return np.concatenate([place.q, self._tangent(place, y[n:])])
 
         def slope(t: float, y: FloatArray) -> FloatArray:
             place = latest["place"]
+            q, v = lent(y[:n]), lent(y[n:])
             if not np.isfinite(y).all():
                 return np.full(2 * n, np.nan)
             try:
-                if place.t != t or not np.array_equal(place.q, y[:n]):
-                    place = self._place(y[:n], t, rank)
-                f = self._called("force", (n,), place.q, y[n:], t)
-                return np.concatenate([y[n:], place.solve(f, self._b(place.q, y[n:], t))])
+                if place.t != t or not np.array_equal(place.q, q):
+                    place = self._place(q, t, rank)
+                f = self._called("force", (n,), q, v, t)
+                return np.concatenate([v, place.solve(f, self._b(q, v, t))])
             except (NonFiniteError, SingularGeometryError) as error:
                 # A trial step may go too far, and is then made shorter; what is left is told if the run ends here.
                 latest["error"] = error
@@ -258,7 +260,7 @@ class Multibody(MultibodyFunctions):
             return project(t, y)
 
         start = project(t0, np.concatenate([q, v]))
-        self._motion(latest["place"], start[n:])  # what is wrong at the start is told at once
+        self._motion(latest["place"], lent(start[n:]))  # what is wrong at the start is told at once
         latest["steps"] = 0
         stepper = projecting(solver, counted)
         ode = solve_ivp(slope, (t0, t1), start, stepper, wanted, rtol=rtol, atol=atol, **options)
@@ -270,7 +272,8 @@ class Multibody(MultibodyFunctions):
         states, motions = [], []
         for t, y in zip(ode.t, ode.y.T, strict=True):
             states.append(y if wanted is None else project(t, y))
-            motions.append(self._motion(self._place(states[-1][:n], t, rank), states[-1][n:]))
+            q, v = np.split(lent(states[-1]), 2)
+            motions.append(self._motion(self._place(q, t, rank), v))
         q, v = np.split(np.array(states).reshape(-1, 2 * n), 2, axis=1)
         a, multipliers = (np.array(part) for part in zip(*motions, strict=True)) if motions else (q, q[:, :0])
         return MultibodySolution(ode.t, q, v, a, multipliers, ode.nfev, latest["steps"])
@@ -280,16 +283,17 @@ class Multibody(MultibodyFunctions):
         n = len(q)
         M, G = self._M(q), self._G(q, t)
         size = _row_lengths(G)
-        U, s, V, _ = lapack.dgesdd(G / size[:, None]) if len(G) else (np.zeros((0, 0)), np.zeros(0), np.eye(n), 0)
-        if rank is None or (rank and not s[rank - 1] > DEPENDENT * s[0]):
-            found = int(np.sum(s > DEPENDENT * s[0])) if len(s) else 0
+        Q, R, rows = _factors(G / size[:, None])
+        left = np.abs(R.diagonal())
+        if rank is None or (rank and not left[rank - 1] > DEPENDENT * left[0]):
+            found = int(np.sum(left > DEPENDENT * left[:1]))
             if rank is not None:
                 raise SingularGeometryError(
                     f"at t = {t:.8g} only {found} constraints are independent, and {rank} at the start: a singular "
                     f"place of the mechanism, q = {shown(q)}. End the run before, or hold it by other constraints"
                 )
             rank = found
-        V, N = V[:rank], V[rank:].T
+        N = Q[:, rank:]
         S = N.T @ M @ N
         W, info = lapack.dpotrf(S) if rank < n else (S, 0)
         if info or (W.diagonal() ** 2 <= MASSLESS * S.diagonal()).any():
@@ -297,7 +301,7 @@ class Multibody(MultibodyFunctions):
                 f"at t = {t:.8g}, q = {shown(q)} the mass matrix is not positive along what the {rank} independent "
                 "constraints leave free: give the coordinates that move there a mass, or hold them"
             )
-        return _Place(t, q, M, G, size, U[:, :rank], s[:rank], V, N, W)
+        return _Place(t, q, M, G, size, rows[:rank], Q[:, :rank], R[:rank, :rank], N, W)
 
     def _start(self, q: FloatArray, v: FloatArray, t: float) -> _Place:
         """The place of a start; refused where that is off the constraints."""
@@ -328,13 +332,14 @@ class Multibody(MultibodyFunctions):
                 break
             step = place.solve(np.zeros(len(q)), -g)
             for part in PARTS if off > accepted else PARTS[:1]:
-                there = self._g(place.q + part * step, t)
+                moved = lent(place.q + part * step)
+                there = self._g(moved, t)
                 left = largest(there / place.size)
                 if left < (1.0 - 0.5 * part) * off:
                     break
             else:
                 break
-            place, g, off = self._place(place.q + part * step, t, rank), there, left
+            place, g, off = self._place(moved, t, rank), there, left
         if not off <= accepted:
             row = int(np.argmax(np.abs(g / place.size)))
             raise ConvergenceError(
@@ -361,6 +366,18 @@ class Multibody(MultibodyFunctions):
                 rows=[row],
             )
         return v
+
+
+def _factors(A: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Q, shape (n, n), and R of A^T with its columns exchanged, and their order: QR in two calls of LAPACK."""
+    m, n = A.shape
+    if m == 0:
+        return np.eye(n), np.zeros((0, 0)), np.zeros(0, dtype=np.int64)
+    R, order, tau, _, _ = lapack.dgeqp3(A.T)
+    k = min(m, n)
+    Q = np.zeros((n, n), order="F")
+    Q[:, :k] = R[:, :k]
+    return lapack.dorgqr(Q, tau)[0], R[:k], order - 1
 
 
 def _row_lengths(G: FloatArray) -> FloatArray:

@@ -55,9 +55,11 @@ class MultibodyFunctions:
             check_symmetric(self.mass)
 
     def _called(self, name: str, shape: tuple[int, ...] | None, *arguments: Any) -> FloatArray:
-        """What a function of the user returned, of that shape, by default (m,), and finite."""
-        found = getattr(self, name)(*[lent(a) if isinstance(a, np.ndarray) else a for a in arguments])
-        array = np.array(numbers(found, name))
+        """What a function of the user returned, of that shape, by default (m,), and finite; a copy.
+
+        Arguments are lent, or nobody else's.
+        """
+        array = np.array(numbers(getattr(self, name)(*arguments), name))
         if shape is None:
             array = np.atleast_1d(array)
             shape = (array.size,) if self.m is None else (self.m,)
@@ -121,7 +123,7 @@ class MultibodyFunctions:
                 )
             if not np.isfinite(array).all():
                 raise InputError(f"{item}[{int(np.argmin(np.isfinite(array)))}] is not finite", item=item)
-            found.append(array)
+            found.append(lent(array))
         self._check_functions(found[0], t)
         return found[0], found[1]
 

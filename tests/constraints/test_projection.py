@@ -504,6 +504,8 @@ def test_a_singular_mass_matrix_that_is_positive_where_something_moves() -> None
     np.testing.assert_allclose(solution.constraint_force, [1.0, -1.0], rtol=1e-14)
     with pytest.raises(InputError, match=r"not positive definite.*bott_duffin"):
         projection.acceleration([[1.0, -1.0]], np.diag([2.0, 0.0]), [3.0, 1.0], [0.5])
+    with pytest.raises(InputError, match="singular along what the constraints leave free"):
+        projection.bott_duffin([[1.0, 0.0]], np.diag([2.0, 0.0]), [3.0, 1.0], [0.5])
 
 
 @pytest.mark.parametrize("mass", [[[1.0, 0.5], [0.4, 1.0]], [[1.0, np.nan], [np.nan, 1.0]]])

@@ -11,6 +11,7 @@ import pytest
 
 from kcons import ConstraintSet, Motion, System, run
 from kcons.constraints import Distance, Formula
+from kcons.models import Multibody
 from kcons.steppers import BlanesMoan6, Extrapolation
 
 LENGTH, SPRING, EPSILON, MASS, HEIGHT, FREQUENCY = 1.0, 0.5, 1e-2, 10.0, 0.1, 10.0
@@ -57,3 +58,23 @@ def test_car_axis_by_extrapolation(car):
     system, start = car
     *_, end = Extrapolation(1e-9).states(system, start, 3.0)
     np.testing.assert_allclose(end.positions[:, :2], POSITIONS, rtol=0, atol=1e-7)
+
+
+def test_car_axis_in_published_coordinates():
+    """(x_l, y_l, x_r, y_r), both constraints as functions, of which the first depends on time; no derivatives."""
+
+    def held(q, t):
+        y = HEIGHT * np.sin(FREQUENCY * t)
+        across, up = q[0] - q[2], q[1] - q[3]
+        return np.array([q[0] * np.sqrt(LENGTH**2 - y**2) + q[1] * y, across**2 + up**2 - LENGTH**2])
+
+    def force(q, v, t):
+        return springs(np.append(q.reshape(2, 2), [[0.0], [0.0]], axis=1), t)[:, :2].ravel()
+
+    body = Multibody(np.full(4, WEIGHT), force, held, time_dependent=True, time_step=0.002)
+    start = [0.0, 0.5, 1.0, 0.5], [-0.5, 0.0, -0.5, 0.0]
+    found = body.solve(*start, (0.0, 3.0), [3.0], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found.q[0], np.ravel(POSITIONS), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.v[0], np.ravel(VELOCITIES), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.multipliers[0], MULTIPLIERS, rtol=0, atol=1e-7)
+    assert np.abs(held(found.q[0], 3.0)).max() < 1e-15
