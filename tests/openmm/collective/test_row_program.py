@@ -199,13 +199,13 @@ def held_peptide(ensemble, dt, carried=False):
 )
 def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
     """Where the bath does nothing: the trajectory of rows held by `hold`, whose code is another one."""
-    ends = []
+    ends, starts = [], []
     v = np.random.default_rng(5).normal(size=(22, 3))
     for carried in (False, True):
         context, integrator, _ = held_peptide(ensemble, 0.001, carried)
-        if ends:
-            context.setPositions(start)
-        start = state_of(context)[0]
+        if starts:
+            context.setPositions(starts[0])
+        starts.append(state_of(context)[0])
         context.setVelocities(v - v.mean(axis=0))
         integrator.applyVelocityConstraints()
         integrator.step(40)
