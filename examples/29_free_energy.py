@@ -1,0 +1,245 @@
+"""Free energies from held coordinates, against what is known.
+
+    python examples/29_free_energy.py                   some seconds: a chain under three thermostats
+    python examples/29_free_energy.py --full            the same with errors of 1 %, into docs/results/free_energy.json
+    python examples/29_free_energy.py --alanine FOLDER  phi of alanine dipeptide: windows against umbrellas and MBAR
+
+The chain has four atoms, bonds held, harmonic angles and a torsion that is held; a trap on its first atom leaves the
+torsion's distribution alone, and keeps thermostats without noise ergodic. Its mean force is a quadrature.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from kcons import ConstraintSet, Motion, System, run
+from kcons.constraints import Dihedral, Distance
+from kcons.free_energy import HeldCoordinates, Recorder, Settings, mean_force
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+
+RESULT = Path(__file__).parents[1] / "docs" / "results" / "free_energy.json"
+MASSES = np.array([12.0, 14.0, 16.0, 12.0])
+LENGTHS = (1.5, 1.4, 1.5)
+KT, BEND, BENT, PULL = 2.494, 40.0, 1.95, 6.0  # kJ/mol, and angstrom, u: the unit of time is 0.1 ps
+PHI = 1.1
+
+
+# -- the chain ------------------------------------------------------------------------------------------
+
+
+def chain(first: float, second: float, phi: float) -> np.ndarray:
+    a, b, c = LENGTHS
+    x = np.zeros((4, 3))
+    x[0] = a * np.array([np.cos(first), np.sin(first), 0])
+    x[2] = [b, 0, 0]
+    x[3] = x[2] + c * np.array([-np.cos(second), np.sin(second) * np.cos(phi), np.sin(second) * np.sin(phi)])
+    return x
+
+
+def internal_energy(x: np.ndarray) -> float:
+    """Angles, and a spring between the ends, which pulls on the torsion."""
+    angles = [
+        np.arccos(np.dot(u, w) / np.linalg.norm(u) / np.linalg.norm(w))
+        for u, w in ((x[0] - x[1], x[2] - x[1]), (x[1] - x[2], x[3] - x[2]))
+    ]
+    return float(BEND / 2 * np.sum((np.array(angles) - BENT) ** 2) + PULL / 2 * np.sum((x[0] - x[3]) ** 2))
+
+
+def force(x: np.ndarray, time: float) -> np.ndarray:
+    f = np.zeros((4, 3))
+    end = PULL * (x[3] - x[0])
+    f[0] += end
+    f[3] -= end
+    for i, j, k in ((0, 1, 2), (1, 2, 3)):
+        u, w = x[i] - x[j], x[k] - x[j]
+        p, q = np.sqrt(u @ u), np.sqrt(w @ w)
+        u, w = u / p, w / q
+        cosine = u @ w
+        slope = BEND * (np.arccos(cosine) - BENT) / np.sqrt(1 - cosine * cosine)
+        to_i, to_k = slope * (w - cosine * u) / p, slope * (u - cosine * w) / q
+        f[i] += to_i
+        f[k] += to_k
+        f[j] -= to_i + to_k
+    f[0] -= np.array([20.0, 30.0, 45.0]) * x[0] * (1 + x[0] * x[0])
+    return f
+
+
+def exact(n: int = 80) -> float:
+    """dF/dphi by quadrature over both angles: the bonds' measure is sqrt(det H) sin sin."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    angles = BENT + 1.15 * nodes
+
+    def integral(phi: float) -> float:
+        total = 0.0
+        for first, w in zip(angles, weights, strict=True):
+            for second, u in zip(angles, weights, strict=True):
+                x = chain(first, second, phi)
+                rows = ConstraintSet(Distance([[0, 1], [1, 2], [2, 3]]), x, MASSES).jacobian(x).toarray()
+                h = np.linalg.det(rows / np.repeat(MASSES, 3) @ rows.T)
+                total += w * u * np.sqrt(h) * np.sin(first) * np.sin(second) * np.exp(-internal_energy(x) / KT)
+        return total
+
+    step = 1e-3
+    return float(-KT * (np.log(integral(PHI + step)) - np.log(integral(PHI - step))) / (2 * step))
+
+
+def sampled(stepper: object, steps: int, every: int, g: int = 0) -> dict[str, float]:
+    turn = Dihedral([[0, 1, 2, 3]])
+    x = chain(BENT, BENT, PHI)
+    motion = Motion(ConstraintSet([Distance([[0, 1], [1, 2], [2, 3]]), turn], x, MASSES), x)
+    system = System(motion, force)
+    state = system.initial_state(x, thermal_velocities(system, x, KT, np.random.default_rng(1)))
+    state = run(system, state, 0.02, steps // 10, stepper=stepper)
+    recorder = Recorder(system, HeldCoordinates(motion, {"phi": turn}, x))
+    recorder.series.isokinetic_degrees_of_freedom = g
+    run(system, state, 0.02, steps, stepper=stepper, observers=[recorder], every=every)
+    found = mean_force(recorder.series, KT)
+    return {"mean force": found.force[0], "error": found.error[0], "raw multiplier": found.raw[0]}
+
+
+def closed_forms(full: bool) -> dict[str, object]:
+    steps = 400_000 if full else 2_000
+    steppers = {
+        "Langevin": (Langevin(KT, 1.0, seed=2), 0),
+        "Nose-Hoover": (NoseHooverChain(KT, 2.0), 0),
+        "isokinetic": (Isokinetic(KT), 8),
+    }
+    truth = exact(60 if full else 16)
+    rows = {name: sampled(stepper, steps, 20 if full else 40, g) for name, (stepper, g) in steppers.items()}
+    for name, row in rows.items():
+        away = (row["mean force"] - truth) / row["error"]
+        print(
+            f"{name:12s} dF/dphi {row['mean force']:8.3f} +- {row['error']:.3f}, quadrature {truth:.3f} "
+            f"({away:+.1f} standard errors); raw multiplier {row['raw multiplier']:.3f}"
+        )
+    return {"quadrature": truth, "steps": steps, "degrees of freedom": 8, "thermostats": rows}
+
+
+# -- alanine dipeptide ----------------------------------------------------------------------------------
+
+
+def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[str, object]:
+    """phi in vacuum: windows of held phi, and umbrellas with as many steps put together by MBAR."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    from openmm import app
+    from pymbar import FES
+
+    from kcons.free_energy import OpenMMWindows, Windows
+
+    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    system = _system(pdb)
+    sampler = OpenMMWindows(
+        pdb.topology, system, pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
+    )
+    settings = Settings(timestep=2.0, temperature=TEMPERATURE, production=production, every=20)
+    held = Windows(sampler, folder / "windows", settings)
+    places = np.linspace(-np.pi, np.pi, windows, endpoint=False)
+    began = time.perf_counter()
+    result = held.run(places, workers=workers, progress=lambda *n: print("windows", *n, flush=True))
+    spent = time.perf_counter() - began
+    profile = result.profile
+    total = 2 * windows * (settings.pull + settings.equilibration + production)
+    each = total // windows
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        series = list(pool.map(umbrella, places, range(windows), [each] * windows, [str(folder)] * windows))
+    kT = 0.00831446261815324 * TEMPERATURE
+    phi = np.concatenate(series)
+    away = (phi[None] - places[:, None] + np.pi) % (2 * np.pi) - np.pi
+    fes = FES(STIFFNESS / 2 * away**2 / kT, [len(s) for s in series])
+    bins = np.linspace(-np.pi, np.pi, 73)
+    fes.generate_fes(
+        np.zeros(len(phi)), phi, fes_type="histogram", histogram_parameters={"bin_edges": [bins]}, n_bootstraps=0
+    )
+    centres = (bins[1:] + bins[:-1]) / 2
+    known = fes.get_fes(centres, reference_point="from-lowest", uncertainty_method="analytical")
+    at = int(np.argmin(known["f_i"]))
+    ours = np.interp(centres, profile.x, profile.F)
+    ours -= ours[at]
+    difference = ours - kT * known["f_i"]
+    low = kT * known["f_i"] < 30
+    difference -= difference[low].mean()
+    errors = np.interp(centres, profile.x, profile.error)
+    found = {
+        "windows": windows,
+        "steps of each method": total,
+        "seconds of the windows": spent,
+        "largest difference below 30 kJ/mol": float(np.abs(difference[low]).max()),
+        "root mean square difference": float(np.sqrt(np.mean(difference[low] ** 2))),
+        "largest error of the windows": float(errors[low].max()),
+        "largest error of MBAR": float(kT * known["df_i"][low].max()),
+        "doubtful windows": [w.number for w in result.windows if w.hysteresis < 0.01],
+        "phi": centres.tolist(),
+        "held": ours.tolist(),
+        "error": errors.tolist(),
+        "MBAR": (kT * known["f_i"]).tolist(),
+        "MBAR error": (kT * known["df_i"]).tolist(),
+    }
+    print({k: v for k, v in found.items() if not isinstance(v, list)})
+    return found
+
+
+TEMPERATURE, STIFFNESS = 300.0, 150.0  # K, kJ/mol/rad^2
+
+
+def _system(pdb: object) -> object:
+    from openmm import app
+
+    field = app.ForceField("amber14-all.xml")
+    return field.createSystem(pdb.topology, constraints=app.HBonds, removeCMMotion=False)
+
+
+def umbrella(place: float, number: int, steps: int, folder: str) -> np.ndarray:
+    """phi every 20 steps of a run with a harmonic umbrella, OpenMM's own integrator."""
+    import openmm
+    from openmm import app, unit
+
+    file = Path(folder) / f"umbrella-{number}.npy"
+    if file.exists():
+        return np.load(file)
+    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    system = _system(pdb)
+    bias = openmm.CustomTorsionForce(f"{STIFFNESS / 2}*min(d, 2*pi-d)^2; d=abs(theta-place); pi=3.141592653589793")
+    bias.addGlobalParameter("place", float(place))
+    bias.addTorsion(4, 6, 8, 14, [])
+    system.addForce(bias)
+    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 5.0, 0.002)
+    integrator.setRandomNumberSeed(number + 1)
+    simulation = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(pdb.positions)
+    simulation.minimizeEnergy()
+    simulation.context.setVelocitiesToTemperature(TEMPERATURE, number + 1)
+    simulation.step(steps // 10)
+    found = []
+    for _ in range((steps - steps // 10) // 20):
+        simulation.step(20)
+        x = simulation.context.getState(positions=True).getPositions(asNumpy=True).value_in_unit(unit.nanometer)
+        found.append(Dihedral([[0, 1, 2, 3]]).measure(np.asarray(x)[None, [4, 6, 8, 14]], 0.0)[0])
+    np.save(file, np.array(found))
+    return np.array(found)
+
+
+def main(arguments: list[str]) -> None:
+    if "--alanine" in arguments:
+        folder = Path(arguments[arguments.index("--alanine") + 1])
+        folder.mkdir(parents=True, exist_ok=True)
+        found = {"alanine dipeptide": alanine(folder, 24, 20_000, 2)}
+    else:
+        found = {"chain": closed_forms("--full" in arguments)}
+        if "--full" not in arguments:
+            return
+    known = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+    known |= {**found, "machine": platform.processor() or platform.machine(), "python": platform.python_version()}
+    RESULT.write_text(json.dumps(known, indent=1) + "\n")
+    print(f"wrote {RESULT}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
