@@ -219,10 +219,10 @@ def uniform(name, n, error, method="spline"):
     return math.sqrt(np.mean(np.square(found)))
 
 
-def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
+@pytest.mark.parametrize(("name", "to", "error"), [("Lennard-Jones", 10, 0.009), ("Morse", 11, 0.09)])
+def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side(name, to, error):
     """Each window is sampled equally long. Splines are the better method for equal distances here."""
-    error = 0.009
-    assert adapted("Lennard-Jones", 7, 11, error)[11] < uniform("Lennard-Jones", 22, error)
+    assert adapted(name, 7, to, error)[to] < uniform(name, 2 * to, error)
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():
