@@ -20,7 +20,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from kcons.constraints.arguments import FloatArray
 from kcons.thermostats import Estimate
@@ -274,10 +274,17 @@ def learn(
 
     # Steps of differences that are well above the rounding of the likelihood.
     options = {"ftol": 1e-6, "maxiter": 100, "eps": 1e-4}
-    starts = [np.concatenate([[0.0], np.full(sum(counts), -math.log(part))]) for part in _STARTS]
-    bounds = [(-7.0, 7.0)] * (1 + sum(counts))
-    found = [minimize(unlikely, start, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
-    best = np.asarray(min(found, key=lambda result: float(result.fun)).x)
+
+    def search(function: Callable[[FloatArray], float], start: FloatArray) -> OptimizeResult:
+        return minimize(function, start, method="L-BFGS-B", bounds=[(-7.0, 7.0)] * len(start), options=options)
+
+    # The same length everywhere along a coordinate first, from two starts; then lengths that differ.
+    spread = np.repeat(np.eye(1 + len(axes)), [1, *counts], axis=0)
+    starts = [np.array([0.0, *(-math.log(part) for _ in axes)]) for part in _STARTS]
+    found = min(
+        (search(lambda q: unlikely(spread @ q), start) for start in starts), key=lambda result: float(result.fun)
+    )
+    best = spread @ found.x if len(spread) == len(axes) + 1 else np.asarray(search(unlikely, spread @ found.x).x)
     sizes, directions = np.linalg.eigh(_curvature(unlikely, best))
     away = directions * np.sqrt(len(best) / np.maximum(sizes, _FLATTEST))
     chosen = np.clip(np.concatenate([best + away.T, best - away.T]), -7.0, 7.0)

@@ -76,10 +76,10 @@ def test_errors_of_splines_are_as_large_as_they_say(name, n, error):
     ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
 )
 def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
-    """Few windows: what lies between them counts as well. 40 differences; their mean square has a standard deviation
-    of 0.22 if they are independent."""
+    """Few windows: what lies between them counts as well. 30 differences; their mean square has a standard deviation
+    of 0.26 if they are independent."""
     case = CASES[name]
-    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(8)])
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(6)])
     assert 0.4 < (away**2).mean() < 1.6
     assert (np.abs(away) < 1.96).mean() >= 0.85
 
