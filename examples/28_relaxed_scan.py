@@ -37,7 +37,7 @@ from kcons.constraints import Dihedral
 from kcons.free_energy import Scan, scan
 
 #: The largest force left on an atom, eV/angstrom.
-FMAX = 0.01
+FMAX = 0.005
 KJ = units.mol / units.kJ
 POINTS = 24
 #: Molecules of ASE's G2 set, and the torsion of each.

@@ -79,6 +79,9 @@ class Internals:
         turns = turns[self._sines(x, turns[:, 1:]) >= STRAIGHT]
         self._straight = table[sine < STRAIGHT]
         self._families: list[Constraint] = [Distance(pairs), Angle(bent), Dihedral(turns)]
+        # From now on each term keeps its images: in a small cell, others may come as near.
+        tables = [*(item.atoms for item in self._families), self._straight]
+        self._images = [lined_up(x[atoms], lattice) - x[atoms] for atoms in tables]
         self._frames = self._sideways(x)
         energy = units.Hartree
         stretch = STRETCH * close[*pairs.T] * energy / units.Bohr**2
@@ -100,17 +103,19 @@ class Internals:
             result[..., here] = data[..., there]
         return result
 
-    def _gathered(self, atoms: IntArray, x: FloatArray) -> FloatArray:
-        return lined_up(x[atoms], self.lattice)
+    def _gathered(self, x: FloatArray) -> list[FloatArray]:
+        """The atoms of each distance, angle, dihedral and straight angle, in the images next to each other."""
+        tables = [*(item.atoms for item in self._families), self._straight]
+        return [x[atoms] + images for atoms, images in zip(tables, self._images, strict=True)]
 
     def _sines(self, x: FloatArray, triples: IntArray) -> FloatArray:
-        r = self._gathered(triples, x)
+        r = lined_up(x[triples], self.lattice)
         u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
         return norm(cross(u, w)) / (norm(u) * norm(w))
 
     def _sideways(self, x: FloatArray) -> FloatArray:
         """Two directions across each straight angle, shape (2, n, 3)."""
-        r = self._gathered(self._straight, x)
+        r = self._gathered(x)[-1]
         axis = (r[:, 2] - r[:, 0]) / norm(r[:, 2] - r[:, 0])[:, None]
         first = cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])
         first /= norm(first)[:, None]
@@ -118,8 +123,8 @@ class Internals:
 
     def values(self, x: FloatArray) -> FloatArray:
         """Angstrom and radian, shape (n,)."""
-        found = [item.measure(self._gathered(item.atoms, x), 0.0) for item in self._families]
-        r = self._gathered(self._straight, x)
+        *gathered, r = self._gathered(x)
+        found = [item.measure(part, 0.0) for item, part in zip(self._families, gathered, strict=True)]
         u, w = r[:, 0] - r[:, 1], r[:, 2] - r[:, 1]
         bow = u / norm(u)[:, None] + w / norm(w)[:, None]
         return np.concatenate([*found, *np.einsum("sni,ni->sn", self._frames, bow)])
@@ -135,19 +140,19 @@ class Internals:
     def jacobian(self, x: FloatArray) -> FloatArray:
         """dq/dx, shape (n, 3 n_atoms)."""
         table = np.zeros((len(self.constants), self.n_atoms, 3))
+        *gathered, r = self._gathered(x)
         first = 0
-        for item in self._families:
+        for item, part in zip(self._families, gathered, strict=True):
             rows = np.arange(first, first + item.n_rows)
-            table[rows[:, None], item.atoms] = item.gradient(self._gathered(item.atoms, x), 0.0)
+            table[rows[:, None], item.atoms] = item.gradient(part, 0.0)
             first += item.n_rows
-        r = self._gathered(self._straight, x)
         for side in self._frames:
             rows = np.arange(first, first + len(side))
             for end in (0, 2):
                 arm = r[:, end] - r[:, 1]
-                part = side / norm(arm)[:, None] - arm * (np.einsum("ni,ni->n", side, arm) / norm(arm) ** 3)[:, None]
-                table[rows, self._straight[:, end]] += part
-                table[rows, self._straight[:, 1]] -= part
+                slope = side / norm(arm)[:, None] - arm * (np.einsum("ni,ni->n", side, arm) / norm(arm) ** 3)[:, None]
+                table[rows, self._straight[:, end]] += slope
+                table[rows, self._straight[:, 1]] -= slope
             first += len(side)
         return table.reshape(len(table), 3 * self.n_atoms)
 

@@ -46,6 +46,16 @@ def test_a_cell_changes_nothing():
     np.testing.assert_allclose(cut, whole, atol=1e-9)
 
 
+def test_terms_keep_their_images():
+    """Two atoms half a cell apart: the other image is as near, and nearer after a small move."""
+    x = np.array([[0.0, 0, 0], [1.25, 0, 0]])
+    internals = Internals([6, 6], x, lattice_of(np.diag([2.5, 9.0, 9.0]), True))
+    for d in (-1e-3, 1e-3):
+        change = internals.change(internals.values(x + np.array([[0, 0, 0], [d, 0, 0]])), internals.values(x))
+        assert abs(change) == pytest.approx([1e-3])
+        assert np.sign(change) == np.sign(d) * np.sign(internals.jacobian(x)[0, 3])
+
+
 def test_data_go_from_terms_to_terms():
     x = molecule("H2O2").positions
     numbers = [8, 8, 1, 1]
