@@ -736,4 +736,35 @@ MUTANTS = [
         "self.context.setPositions(x)",
         "tests/comparison/methods/test_engines.py::test_units_of_openmm",
     ),
+    # -- relaxed scans --
+    (
+        "free_energy/relaxed_scan.py",
+        "attempt.energy < best[point].energy:",
+        "attempt.energy > best[point].energy:",
+        "tests/free_energy/test_relaxed_scan.py::test_both_ways_find_the_lower_of_two_minima",
+    ),
+    (
+        "free_energy/relaxed_scan.py",
+        "if with_it.rank != rank + n + 1:",
+        "if False:",
+        "tests/free_energy/test_relaxed_scan.py::test_bad_coordinates",
+    ),
+    (
+        "free_energy/relaxation.py",
+        "missing = change - size - self._learned @ move",
+        "missing = change - size + self._learned @ move",
+        "tests/free_energy/test_relaxation.py::test_what_was_learned_goes_along",
+    ),
+    (
+        "free_energy/model_hessian.py",
+        "return [x[atoms] + images for",
+        "return [lined_up(x[atoms], self.lattice) + 0 * images for",
+        "tests/free_energy/test_model_hessian.py::test_terms_keep_their_images",
+    ),
+    (
+        "free_energy/attempts.py",
+        'same = (tuple(head["point"]), head["source"]) == (point, source)',
+        "same = True",
+        "tests/free_energy/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
+    ),
 ]
