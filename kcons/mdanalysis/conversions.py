@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from openmm import unit
 
 __all__ = [
-    "FromHost",
+    "FromMDEngine",
     "ToOpenMM",
     "ase_to_openmm",
     "from_ase",
@@ -47,7 +47,7 @@ __all__ = [
 NM = 0.1
 
 
-class FromHost(NamedTuple):
+class FromMDEngine(NamedTuple):
     """A Universe, and what was held where it came from, in angstrom and radian."""
 
     universe: Any
@@ -106,7 +106,7 @@ def _held_atoms(snapshot: Snapshot, rows: Sequence[Constraint]) -> ase.Atoms:
     return atoms
 
 
-def from_ase(atoms: ase.Atoms) -> FromHost:
+def from_ase(atoms: ase.Atoms) -> FromMDEngine:
     """A Universe of one frame, and the constraints of the atoms.
 
     Raises
@@ -118,7 +118,7 @@ def from_ase(atoms: ase.Atoms) -> FromHost:
     """
     from kcons.ase.topology import snapshot_of as snapshot_of_atoms
 
-    return FromHost(universe_of(snapshot_of_atoms(atoms)), _constraints_on(atoms))
+    return FromMDEngine(universe_of(snapshot_of_atoms(atoms)), _constraints_on(atoms))
 
 
 def _constraints_on(atoms: ase.Atoms) -> list[Constraint]:
@@ -168,7 +168,7 @@ def from_openmm(
     *,
     velocities: unit.Quantity | None = None,
     part: Any = None,
-) -> FromHost:
+) -> FromMDEngine:
     """A Universe of one frame, and what the System holds.
 
     Parameters
@@ -183,7 +183,7 @@ def from_openmm(
     from kcons.openmm.topology import snapshot_of as snapshot_of_topology
 
     snapshot = snapshot_of_topology(topology, positions, system=system, velocities=velocities)
-    return FromHost(universe_of(snapshot), all_rescaled(_constraints_in(system, part), 1 / NM))
+    return FromMDEngine(universe_of(snapshot), all_rescaled(_constraints_in(system, part), 1 / NM))
 
 
 def _constraints_in(system: openmm.System | None, part: Any) -> list[Constraint]:

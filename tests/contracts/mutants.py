@@ -736,6 +736,30 @@ MUTANTS = [
         "self.context.setPositions(x)",
         "tests/comparison/methods/test_engines.py::test_units_of_openmm",
     ),
+    (
+        "openmm/collective/row_program.py",
+        "if not self._single or _halved(p.integrator, scheme):",
+        "if not self._single:",
+        "tests/openmm/collective/test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "result[j] += mixed[s]",
+        "result[j] += mixed[j]",
+        "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "return seen if others is None else seen + metric.reactions @ others",
+        "return seen if others is None else seen - metric.reactions @ others",
+        "tests/free_energy/test_held_coordinates.py::test_multipliers_are_those_of_the_engine",
+    ),
+    (
+        "free_energy/mean_forces.py",
+        "series.kinetic / (g - 1) if g",
+        "series.kinetic / g if g > 99",
+        "tests/free_energy/test_mean_forces.py::test_one_end_to_end_length_beside_two_bonds",
+    ),
     # -- relaxed scans --
     (
         "free_energy/relaxed_scan.py",

@@ -93,32 +93,12 @@ def test_names_of_modules_are_their_own():
 
 
 TESTS = ROOT / "tests"
-#: Modules without a test file of their own, and where they are tested. What gets one is taken out.
-TESTED_ELSEWHERE = {
-    **dict.fromkeys(
-        (
-            f"comparison/hard_cases/{theme}.py"
-            for theme in ("bodies", "chains", "growth_models", "inputs", "invariance", "long_runs", "motions")
-        ),
-        "comparison/hard_cases/test_cases_of_kcons.py",
-    ),
-    **dict.fromkeys(
-        (f"comparison/hard_cases/{theme}.py" for theme in ("rings", "starts", "steps", "thermostats")),
-        "comparison/hard_cases/test_cases_of_kcons.py",
-    ),
-    "comparison/methods/peers/mici_leapfrog.py": "comparison/methods/peers/test_peer_methods.py",
-    "comparison/methods/peers/shake.py": "comparison/methods/peers/test_peer_methods.py",
-    "comparison/work_precision/whole_page.py": "comparison/work_precision/test_whole.py",
-    "openmm/integrator/interface.py": "openmm/integrator/test_projected.py",
-}
 
 
 def test_each_module_has_its_test_file():
     """Of its name, in the same place below tests/."""
     modules = {path.relative_to(PACKAGE).as_posix() for path in FILES if not path.stem.startswith("__")}
-    without = {name for name in modules if not (TESTS / name).with_name(f"test_{name.rpartition('/')[2]}").is_file()}
-    assert without == set(TESTED_ELSEWHERE)
-    assert [place for place in TESTED_ELSEWHERE.values() if not (TESTS / place).is_file()] == []
+    assert [name for name in modules if not (TESTS / name).with_name(f"test_{name.rpartition('/')[2]}").is_file()] == []
 
 
 #: At most: lines of a module, of a function and of a class; parameters but for self, outside of the compiled solvers.

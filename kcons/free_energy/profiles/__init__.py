@@ -4,4 +4,5 @@
 - `profile`: in one coordinate, and where to sample next
 - `mean_force_surface`: in several coordinates
 - `pulls`: from the work of moving targets
+- `plots`: figures of all of them
 """

@@ -7,6 +7,7 @@ much more likely the vectors are if their components need not belong to one free
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ _ROTATIONS = np.geomspace(0.01, 3.0, 12)
 _CHANCE = 1e-3
 #: Distance, in parts of the range, below which two minima are one.
 _SAME = 1e-3
+#: Places whose errors are computed at once, with the covariances among them.
+_TOGETHER = 200
 
 
 class Consistency(NamedTuple):
@@ -85,10 +88,13 @@ class Surface:
         InputError
             A place outside of the range of the windows.
         """
-        places = self._places(x)
-        values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))
-        variance = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
-        return values[:-1] - values[-1], np.sqrt(np.maximum(variance, 0.0))
+        found = []
+        for places in np.array_split(self._places(x), max(1, math.ceil(len(numbers(x, "x")) / _TOGETHER))):
+            values, covariance = self._process.posterior((np.vstack([places, self.zero]), [-1]))
+            variance = np.diag(covariance)[:-1] - 2 * covariance[:-1, -1] + covariance[-1, -1]
+            found.append((values[:-1] - values[-1], np.sqrt(np.maximum(variance, 0.0))))
+        F, errors = (np.concatenate(part) for part in zip(*found, strict=True))
+        return F, errors
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> Estimate:
         """F(b) - F(a) with its standard error."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kcons.comparison.hard_cases import CannotExpressError, Case, judge, outcome
+from kcons.comparison.hard_cases import CannotExpressError, Case, all_cases, judge, outcome
 from kcons.errors import InputError
 
 
@@ -65,3 +65,9 @@ def test_warnings_are_not_silence():
 def test_what_cannot_be_said():
     assert judge(RAISE, CannotExpressError("no surfaces")).text == "no surfaces"
     assert judge(RAISE, ImportError("No module named 'openmm'")).verdict == "cannot express"
+
+
+def test_all_cases_of_the_list_are_there():
+    names = list(all_cases())
+    assert [name for name in names if name.startswith("H")] == [f"H{k:02d}" for k in range(1, 43)]
+    assert sum(name.startswith("X") for name in names) >= 30

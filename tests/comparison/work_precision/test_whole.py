@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-from html.parser import HTMLParser
 from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 from matplotlib.figure import Figure
+from tiny_whole_comparison import METHODS, TINY, Page, measured_once, plan_tiny
 
 from kcons.cli import main
 from kcons.comparison import test_systems
 from kcons.comparison.methods.methods import STEPPERS, USUAL_STEPPERS
-from kcons.comparison.study import machine, tables
+from kcons.comparison.study import machine
 from kcons.comparison.study.study import Watcher
-from kcons.comparison.work_precision import parts_of_the_whole, timing_rounds, whole, whole_page
+from kcons.comparison.work_precision import timing_rounds, whole, whole_page
 from kcons.comparison.work_precision.measurement import Comparison
 from kcons.comparison.work_precision.parts_of_the_whole import Item
 from kcons.errors import InputError
-
-TINY = (
-    Item("chain-3", "Chain of 3 bonds", "chain", 3, budget=5, seconds=1, quick_seconds=1),
-    Item("gone", "A later test system", "no such scene", seconds=1),
-    Item("sphere", "Spheres", "sphere", 1, budget=5, seconds=1, quick_seconds=0),
-    Item("later", "A part of the future", module="kcons.no_such_module", seconds=1),
-)
-METHODS = ["rattle", "blanes-moan4", "dop853", "verlet"]
 
 
 class Listener(Watcher):
@@ -43,22 +33,12 @@ class Listener(Watcher):
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    for module in (parts_of_the_whole, whole):
-        monkeypatch.setattr(module, "PLAN", TINY)
-    monkeypatch.setattr(whole, "methods_of", lambda item, system, quick: (METHODS, {}))
-    monkeypatch.setattr(machine, "code_digest", lambda: "digest")
+    plan_tiny(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("all")
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (parts_of_the_whole, whole):
-            patch.setattr(module, "PLAN", TINY)
-        patch.setattr(whole, "methods_of", lambda item, system, quick: (METHODS, {}))
-        patch.setattr(machine, "code_digest", lambda: "digest")
-        whole.run(TINY, folder)
-    return folder
+    return measured_once(tmp_path_factory)
 
 
 @pytest.fixture
@@ -120,84 +100,6 @@ def test_numbers_come_back_as_they_were(finished):
 def test_what_cannot_be_run_is_said(finished):
     assert whole.read(finished, "gone")["not run"] == "this version of kcons has no test system 'no such scene'"
     assert "kcons.no_such_module" in whole.read(finished, "later")["not run"]
-
-
-class Page(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.addresses, self.text, self.tags, self.headings = [], "", [], []
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        self.addresses += [value for name, value in attributes if name in ("href", "src", "action", "data", "srcset")]
-
-    def handle_data(self, data):
-        self.text += data
-
-
-def test_page_is_one_file_with_everything(finished):
-    page = Page()
-    source = (finished / "index.html").read_text(encoding="utf-8")
-    page.feed(source)
-    assert page.addresses and all(address.startswith(("#", "data:")) for address in page.addresses)
-    assert not {"script", "iframe", "object", "embed", "form"} & set(page.tags)
-    assert "url(" not in source and "@import" not in source
-    assert page.tags.count("img") == 2
-    for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A later test system", "not run: this version"):
-        assert text in page.text
-    environment = whole.read(finished, "sphere")["environment"]
-    assert environment["cpu"] in page.text
-    assert (environment["commit"] or "not from a repository") in page.text
-    assert f"numpy {environment['versions']['numpy']}" in page.text
-
-
-def test_winners_name_md_engine_and_gain(finished):
-    table = whole_page.winners(whole.parts(finished))
-    cells = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
-    (sphere,) = [row for row in cells if row["test system"] == "Spheres"]
-    assert sphere["decided by"] == "force evaluations" and sphere["over"] == "SciPy DOP853 on eq. 105"
-    # Where times decide, how well they repeat is said.
-    margins = {
-        part.heading: part.data["comparison"]["timing"]["margin"]
-        for part in whole.parts(finished)
-        if part.key in ("chain-3", "sphere")
-    }
-    for row in cells:
-        by_time = row["decided by"] == "wall time"
-        assert row["times repeat to"] == (f"{100 * margins[row['test system']]:.0f} %" if by_time else "")
-    assert {row["decided by"] for row in cells} == {"wall time", "force evaluations"}
-    text = tables.markdown(table.of((0, 1, 4)))
-    assert text.splitlines()[0] == "| test system | MD engine | gain |"
-    assert text.splitlines()[1] == "| --- | --- | ---: |"
-    assert len(text.splitlines()) == 2 + len(table.rows)
-
-
-def test_close_calls_are_named(finished):
-    """Lines that only the margin saves are listed, and what beats kcons in both is counted."""
-    (chain,) = [part for part in whole.parts(finished) if part.key == "chain-3"]
-
-    def told(error, factor, margin):
-        data = copy.deepcopy(chain.data)
-        measured = data["comparison"]["measurements"]
-        best = min((m for m in measured if m["method"] == "rattle"), key=lambda m: m["error"])
-        peer = {**best, "method": "dop853", "title": "SciPy DOP853"}
-        peer |= {"error": error * best["error"], "seconds_per_time": factor * best["seconds_per_time"]}
-        data["comparison"]["measurements"] = [best, peer]
-        data["comparison"]["timing"] = {"force_seconds": 1e-3, "margin": margin}
-        return whole_page.results([dataclasses.replace(chain, data=data)])
-
-    text = told(1.0, 0.8, 0.3)
-    assert "In 1 of 1 lines of this table no other method is both cheaper and more accurate" in text
-    assert "no other method is cheaper than kcons in 1 of them" in text
-    assert (
-        "at the same error somewhere in 1 lines: ties at best, not wins. These are:\n\n- Chain of 3 bonds: SciPy"
-        in text
-    )
-    assert "up to 20 % cheaper (wall time, arrays)" in text
-    text = told(1.0, 0.8, 0.1)
-    assert "no other method is cheaper than kcons in 0 of them" in text
-    assert "somewhere in 0 lines: ties at best, not wins.\n" in text
-    assert "In 0 of 1 lines of this table no other" in told(0.9, 0.8, 0.3)
 
 
 @pytest.mark.usefixtures("empty_pictures")
@@ -292,23 +194,6 @@ def test_mistakes(arguments, text, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main.main(arguments) == 2
     assert text in capsys.readouterr().err
-
-
-def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(whole_page, "PICTURES", ("sphere",))
-    page = tmp_path / "page.md"
-    page.write_text(f"head\n{whole_page.BEGIN}\nold\n{whole_page.END}\ntail\n")
-    parts_of_the_whole = whole.parts(finished)
-    assert whole_page.fill(page, parts_of_the_whole) == [page, tmp_path / "figures" / "report-sphere.png"]
-    first = page.read_text(encoding="utf-8")
-    assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
-    assert "| test system | MD engine | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
-    assert "full run" in first
-    whole_page.fill(page, parts_of_the_whole)
-    assert page.read_text(encoding="utf-8") == first
-    page.write_text("no marks")
-    with pytest.raises(InputError, match="no place for results"):
-        whole_page.fill(page, parts_of_the_whole)
 
 
 def test_there_is_nothing_to_redraw(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from peer_packages import measured, need
+from peer_packages import check_order_two, measured, need
 
 from kcons.comparison import test_systems
 from kcons.comparison.methods import methods
@@ -55,3 +55,16 @@ def test_an_error_of_the_forces_passes_through_lammps(monkeypatch):
     system.potential.forget()
     with pytest.raises(ZeroDivisionError, match="no forces today"):
         methods.METHODS["lammps-rattle-1e-8"].start(system, system.time_steps[0])
+
+
+@pytest.mark.parametrize("name", ["lammps-shake-1e-12", "lammps-rattle-1e-12"])
+def test_order_two(name):
+    check_order_two(name, "dumbbells")
+
+
+def test_refusals():
+    chain, water = test_systems.build("chain", 6), test_systems.build("water", 8, forces="ase")
+    need("lammps")
+    assert "centre" in methods.METHODS["lammps-shake-1e-8"].refuses(chain)
+    assert methods.METHODS["lammps-rattle-1e-8"].refuses(water) is None
+    assert "fixed" in methods.METHODS["lammps-rattle-1e-8"].refuses(test_systems.build("slab"))
