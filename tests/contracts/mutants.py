@@ -151,6 +151,12 @@ MUTANTS = [
     ),
     # -- solvers: functions --
     (
+        "solvers/called_solvers.py",
+        "add(words, v, inv_dt)",
+        "add(words, v, 1.0)",
+        "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
+    ),
+    (
         "solvers/sparse/row_functions.py",
         "f, g = h / (rho * q), up / q",
         "f, g = h / rho, up / q",
