@@ -151,6 +151,12 @@ MUTANTS = [
     ),
     # -- solvers: functions --
     (
+        "solvers/called_solvers.py",
+        "add(words, v, inv_dt)",
+        "add(words, v, 1.0)",
+        "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
+    ),
+    (
         "solvers/sparse/row_functions.py",
         "f, g = h / (rho * q), up / q",
         "f, g = h / rho, up / q",
@@ -759,5 +765,36 @@ MUTANTS = [
         "series.kinetic / (g - 1) if g",
         "series.kinetic / g if g > 99",
         "tests/free_energy/test_mean_forces.py::test_one_end_to_end_length_beside_two_bonds",
+    ),
+    # -- relaxed scans --
+    (
+        "free_energy/relaxed_scan.py",
+        "attempt.energy < best[point].energy:",
+        "attempt.energy > best[point].energy:",
+        "tests/free_energy/test_relaxed_scan.py::test_both_ways_find_the_lower_of_two_minima",
+    ),
+    (
+        "free_energy/relaxed_scan.py",
+        "if with_it.rank != rank + n + 1:",
+        "if False:",
+        "tests/free_energy/test_relaxed_scan.py::test_bad_coordinates",
+    ),
+    (
+        "free_energy/relaxation.py",
+        "missing = change - size - self._learned @ move",
+        "missing = change - size + self._learned @ move",
+        "tests/free_energy/test_relaxation.py::test_what_was_learned_goes_along",
+    ),
+    (
+        "free_energy/model_hessian.py",
+        "return [x[atoms] + images for",
+        "return [lined_up(x[atoms], self.lattice) + 0 * images for",
+        "tests/free_energy/test_model_hessian.py::test_terms_keep_their_images",
+    ),
+    (
+        "free_energy/attempts.py",
+        'same = (tuple(head["point"]), head["source"]) == (point, source)',
+        "same = True",
+        "tests/free_energy/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
 ]
