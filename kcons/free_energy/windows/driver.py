@@ -379,7 +379,7 @@ def _together(
 
 
 #: What is said of a window whose process was killed, or whose worker was lost.
-_KILLED = "its process was killed each time"
+_KILLED = "its process was killed each time (a script that starts processes does so below if __name__ == '__main__':)"
 
 
 def _problem(future: Future[None]) -> str | None:
