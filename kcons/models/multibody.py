@@ -33,7 +33,7 @@ from kcons.errors import (
     SingularGeometryError,
 )
 from kcons.models.multibody_functions import MultibodyFunctions, largest, shown
-from kcons.models.projected_steps import projecting, solver_of, span_of, times_of
+from kcons.models.projected_steps import check_sizes, projecting, solver_of, span_of, times_of
 
 #: Rows of G, of unit length, depend on others where no more than this part of them is left beside these.
 DEPENDENT = 1e-10
@@ -232,6 +232,7 @@ class Multibody(MultibodyFunctions):
         wanted = None if t_eval is None else times_of(t_eval, t0, t1)
         solver = solver_of(method)
         q, v = self._state(q, v, t0)
+        check_sizes(options | {"rtol": rtol, "atol": atol}, 2 * len(q))
         n, rank = len(q), len(self._start(q, v, t0).rows)
         latest: dict[str, Any] = {}
 
@@ -270,13 +271,15 @@ class Multibody(MultibodyFunctions):
                 "that jump: end the run there; or a larger tolerance"
             )
         states, motions = [], []
-        for t, y in zip(ode.t, ode.y.T, strict=True):
+        for t, y in zip(ode.t, np.transpose(ode.y), strict=True):
             states.append(y if wanted is None else project(t, y))
             q, v = np.split(lent(states[-1]), 2)
             motions.append(self._motion(self._place(q, t, rank), v))
         q, v = np.split(np.array(states).reshape(-1, 2 * n), 2, axis=1)
-        a, multipliers = (np.array(part) for part in zip(*motions, strict=True)) if motions else (q, q[:, :0])
-        return MultibodySolution(ode.t, q, v, a, multipliers, ode.nfev, latest["steps"])
+        a, multipliers = (
+            (np.array(part) for part in zip(*motions, strict=True)) if motions else (q, np.zeros((0, self.m or 0)))
+        )
+        return MultibodySolution(np.asarray(ode.t), q, v, a, multipliers, ode.nfev, latest["steps"])
 
     def _place(self, q: FloatArray, t: float, rank: int | None) -> _Place:
         """Factors at `q`, with so many independent rows, by default as many as there are."""

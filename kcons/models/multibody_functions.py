@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from copy import copy
 from typing import Any
@@ -41,6 +42,12 @@ class MultibodyFunctions:
                 raise InputError(f"{name} must be a function, not {given!r:.60}", item=name)
             if given is not None and constraints is None and name != "force":
                 raise InputError(f"there is a {name} without constraints; give the function g as well", item=name)
+        last = ("t",) if time_dependent else ()
+        _check_arguments("mass", mass, ("q",))
+        _check_arguments("force", force, ("q", "v", "t"))
+        _check_arguments("constraints", constraints, ("q", *last))
+        _check_arguments("jacobian", jacobian, ("q", *last))
+        _check_arguments("curvature", curvature, ("q", "v", *last))
         for name, size in (("length", length), ("time_step", time_step)):
             if not (np.isfinite(size) and size > 0):
                 raise InputError(f"{name} must be positive, not {size}", item=name)
@@ -153,6 +160,21 @@ class MultibodyFunctions:
                     "(length=...)",
                     item=name,
                 )
+
+
+def _check_arguments(name: str, function: Any, arguments: tuple[str, ...]) -> None:
+    """Refuse a function that cannot be called with these."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # no function, or one that does not say what it takes
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        hint = "; say time_dependent=True for constraints that take t" if name not in ("mass", "force") else ""
+        raise InputError(
+            f"{name} takes {signature}, but is called with ({', '.join(arguments)}){hint}", item=name
+        ) from None
 
 
 def check_symmetric(M: FloatArray) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,8 @@ from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError, UnsupportedError
 
 METHODS: dict[str, type[OdeSolver]] = {"RK23": RK23, "RK45": RK45, "DOP853": DOP853, "Radau": Radau, "BDF": BDF}
+#: What SciPy takes where less is asked for.
+LEAST_RTOL = 100 * float(np.finfo(float).eps)
 
 
 def projecting(
@@ -88,6 +91,27 @@ def span_of(t_span: Sequence[float]) -> tuple[float, float]:
     if not (np.isfinite(t0) and np.isfinite(t1)):
         raise InputError("t_span is not finite", item="t_span")
     return t0, t1
+
+
+def check_sizes(options: Mapping[str, Any], n: int) -> None:
+    """Refuse tolerances and sizes of steps with which SciPy goes on for ever, or otherwise than was asked for.
+
+    Raises
+    ------
+    InputError
+        rtol below rounding; atol that is negative or not for `n` numbers; steps that are not positive; NaN.
+    """
+    for name, least in (("rtol", LEAST_RTOL), ("atol", 0.0), ("max_step", 0.0), ("first_step", 0.0)):
+        if options.get(name) is None:
+            continue
+        given = numbers(options[name], name)
+        shapes = [(), (n,)] if name.endswith("tol") else [()]
+        if given.shape not in shapes or not np.all(given >= least) or ("step" in name and not given > 0):
+            raise InputError(
+                f"{name} is {options[name]!r:.60}; give a number of {least:g} or more"
+                + (", not 0" if "step" in name else f", or {n} of them"),
+                item=name,
+            )
 
 
 def times_of(t_eval: ArrayLike, t0: float, t1: float) -> FloatArray:

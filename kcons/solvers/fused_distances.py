@@ -3,11 +3,13 @@
 A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
 compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
 time (`solvers.rigid_triangles`), long chains (`chains.chains`), and whatever else is held by sparse elimination
-(`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes.
+(`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes. Rows that
+are no distances have solvers that are called by address (`solvers.called_solvers`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba as nb
@@ -16,11 +18,13 @@ from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
+from kcons.solvers import called_solvers
+from kcons.solvers.called_solvers import CalledSolver, words_of
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.sweeps import project
 from kcons.solvers.distance_clusters import resolved
-from kcons.solvers.kernels.aligned_memory import LINE, aligned
-from kcons.solvers.kernels.array_views import piece
+from kcons.solvers.kernels.aligned_memory import in_one_array
+from kcons.solvers.kernels.array_views import halves, integers, lattice_piece, octets, piece
 from kcons.solvers.kernels.eight_wide import WIDTH
 from kcons.solvers.kernels.groups_of_eight import NO_LATTICE, OPEN, lattice_kind, restore_points
 from kcons.solvers.rigid_triangles import RigidTriangles, project_triangles
@@ -29,17 +33,16 @@ from kcons.solvers.sparse.distances import SparseDistances
 
 #: Rounds from where the last one ended, until the lengths are what the positions resolve.
 _MAX_ROUNDS = 4
-#: Numbers in a cache line.
-_ALIGNMENT = LINE // 8
 
 #: Pieces: lengths, pairs, what `SparseDistances.tables` gives, tables of triangles, fixed atoms, the cell, and what
 #: `Chains.tables` gives.
 _LENGTHS, _PAIRS, _ATOMS, _MOVES = 0, 1, 3, 16
 _CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, _CHAINS = range(20, 30)
 _CHAIN_PIECES = 12
-MORE = _CHAINS + _CHAIN_PIECES
+_CALLED = _CHAINS + _CHAIN_PIECES
+MORE = _CALLED + 1
 
-Packed = tuple[FloatArray, int | None, int | None, int | None]
+Packed = tuple[FloatArray, int | None, int | None, int | None, int | None]
 
 
 def packed(
@@ -53,6 +56,7 @@ def packed(
     *more: NDArray[Any],
     numbers: IntArray | None = None,
     late: NDArray[np.bool_] | None = None,
+    called: Sequence[CalledSolver] = (),
 ) -> Packed:
     """What `packed_positions` and `packed_tangents` need to know.
 
@@ -74,12 +78,14 @@ def packed(
         What the atoms that `chains` knows are called here; None where they are called the same.
     late : ndarray of bool, shape (n_rows,), optional
         Which of `pairs` depend on others, see `kcons.solvers.sparse.elimination.make_pattern`.
+    called : sequence of CalledSolver
+        Of all other rows, to be kept as long as the tables are used; neither with triangles nor with chains.
 
     Returns
     -------
     tables : ndarray of float64
         Begins with where each piece starts and ends, as integers.
-    triangles, others, chains : int or None
+    triangles, others, chains, called : int or None
         Whether there are rows of each kind: 1, or None.
     """
     pieces: list[NDArray[Any]]
@@ -96,21 +102,10 @@ def packed(
         pieces += triangles.tables()
     pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()]
     pieces += [np.zeros(0)] * _CHAIN_PIECES if chains is None else chains.tables(numbers)
-    pieces += more
-    cuts = np.zeros((len(pieces), 2), dtype=np.int64)
-    end = 2 * len(pieces)
-    for k, part in enumerate(pieces):
-        # Each in cache lines of its own, counted in its own numbers.
-        first = -(-end // _ALIGNMENT) * LINE // part.itemsize
-        cuts[k] = first, first + part.size
-        end = -(-(first + part.size) * part.itemsize // 8)
-    room = aligned(end)
-    room.view(np.int64)[: cuts.size] = cuts.ravel()
-    for part, (first, last) in zip(pieces, cuts, strict=True):
-        # All is 0; memory for rooms to work in is not asked for before they are used.
-        if part.strides != (0,) or part[:1].any():
-            room.view(part.dtype)[first:last] = part
-    return room, None if triangles is None else 1, 1 if len(pairs) else None, None if chains is None else 1
+    pieces += [words_of(called), *more]
+    there = triangles is not None, len(pairs) > 0, chains is not None, len(called) > 0
+    first, second, third, last = (1 if each else None for each in there)
+    return in_one_array(pieces), first, second, third, last
 
 
 def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
@@ -125,12 +120,12 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
+def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Parameters
     ----------
-    tables, triangles, others, chains
+    tables, triangles, others, chains, called
         From `packed`.
 
     Returns
@@ -138,13 +133,13 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
     int
         Iterations; -1 where there is no solution, with `x` and `v` as they were but for fixed atoms.
     """
-    t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
-    lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
+    t, h, u = tables, integers(tables), halves(tables)
+    lattice, kind = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]]
     pinned, places = piece(u, h, _PINNED), piece(t, h, _PLACES)
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
-    b, first = tables.view(np.uint8), True
+    b, first = octets(tables), True
     # Nothing is written before all is solved, except that triangles and chains undo what they wrote.
     most = 0
     for turn in range(_MAX_ROUNDS + 1):
@@ -157,6 +152,13 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
             )  # fmt: skip
             if failed:
                 return most if turn else -1
+            most = max(most, iterations)
+        if called is not None and turn == 0:
+            iterations = called_solvers.solve_positions(
+                piece(h, h, _CALLED), x, x_ref, v, inv_dt, t[:0], lattice, kind != OPEN
+            )
+            if iterations < 0:
+                return -1
             most = max(most, iterations)
         if triangles is not None and turn == 0:
             landed, _, iterations, _ = project_triangles(
@@ -198,10 +200,10 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains):  #
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
-    t, h, u = tables, tables.view(np.int64), tables.view(np.uint32)
-    lattice, kind = piece(t, h, _LATTICE).reshape(2, 3, 3), h[h[2 * _KIND]]
+    t, h, u = tables, integers(tables), halves(tables)
+    lattice, kind = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]]
     pinned = piece(u, h, _PINNED)
     for k in range(pinned.size):
         for axis in range(3):
@@ -214,6 +216,10 @@ def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no
         )  # fmt: skip
         if failed:
             return False
+    if called is not None and not called_solvers.solve_tangents(
+        piece(h, h, _CALLED), v, x, t[:0], lattice, kind != OPEN
+    ):
+        return False
     if triangles is not None:
         converged, _, _, _ = project_triangles(
             v, x, t[:0].reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
@@ -222,7 +228,7 @@ def packed_tangents(x, v, tables, triangles, others, chains):  # type: ignore[no
         if not converged:
             return False
     if chains is not None:
-        b, none = tables.view(np.uint8), t[:0]
+        b, none = octets(tables), t[:0]
         converged, _, _, _ = project(
             v, x, none.reshape(0, 3), 0.0, True, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
             piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5),

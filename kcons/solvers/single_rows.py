@@ -7,6 +7,7 @@ What one particle on a surface takes, and a hundred thousand. Values and gradien
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -14,8 +15,10 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.kernels.nearest_image import NO_LATTICE
+from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.cluster_solver import Request
+from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
+from kcons.solvers.kernels.array_views import halves, integers, piece
 from kcons.solvers.kernels.two_and_four_wide import entry, lane, load_point, number, put, quad, rolled
 from kcons.solvers.sparse.elimination import FAST
 from kcons.solvers.sparse.mixed_rows import SPEED_TOLERANCE
@@ -29,9 +32,11 @@ BLOCK = 32
 #: What is known of one of them: the error that is rounding, the last one, the multiplier that had it, and how
 #: often the step from there was halved, -1 once it has arrived.
 WORDS, ROUNDING, PREVIOUS, LAST, HALVINGS = 4, 0, 1, 2, 3
+#: Of the pieces of `SingleRows.tables`, those that are named.
+_PUSHES, _SOLUTION = 7, 8
 
 
-class SingleRows:
+class SingleRows(CalledSolver):
     """Solver for clusters of one row, which is a function.
 
     Parameters
@@ -54,51 +59,30 @@ class SingleRows:
         # Row by row: its first slot, its first parameter, its kind.
         links = np.zeros((len(rows) + 1, 3), np.uint32)
         links[:, 0], links[:-1, 1], links[:-1, 2] = incidence.indptr, self._given.starts, self._given.kinds
-        self._tables = links.ravel(), atoms, self._given.numbers, inverse_masses[atoms]
-        self._work = np.zeros(3 * widest * BLOCK), np.zeros(WORDS * BLOCK)
-        self._scale = constraint_set.scale[rows]
-        self._targets = np.ascontiguousarray(constraint_set.target(0.0)[rows])
-        self._pushes, self._solution = np.zeros(3 * len(atoms)), np.zeros(len(rows))
+        self._links = links.ravel()
+        self.tables = in_one_array(
+            (
+                *(self._links, atoms, inverse_masses[atoms], room(3 * widest * BLOCK), room(WORDS * BLOCK)),
+                *(constraint_set.scale[rows], np.ascontiguousarray(constraint_set.target(0.0)[rows])),
+                *(room(3 * len(atoms)), room(len(rows))),
+            )
+        )
+        self._pushes, self._solution = part_of(self.tables, _PUSHES), part_of(self.tables, _SOLUTION)
         self._made_of = constraint_set, rows, inverse_masses
 
     def __reduce__(self) -> tuple[type[SingleRows], tuple[object, ...]]:
         return SingleRows, self._made_of  # addresses are of no use elsewhere
 
-    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
-        """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request
-        self._given.numbers[:2] = time, reference_time
-        found = _positions(
-            x, reference, self._targets if wanted is None else wanted[self.rows],
-            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, *self._work, self._scale,
-            self._pushes, self._solution, x if velocities is None else velocities,
-            0.0 if velocities is None else inv_dt,
-        )  # fmt: skip
-        self._given.refuse()
-        if found[0] and multipliers is not None:
-            multipliers[:] = self._solution
-        return Outcome(*found)
-
-    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
-        """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, wanted, lattice, time, *_ = request
-        self._given.numbers[:2] = time
-        found = _tangents(
-            x, y, self._targets if wanted is None else wanted[self.rows], wanted is not None,
-            NO_LATTICE if lattice is None else lattice, lattice is not None, *self._tables, self._pushes,
-            self._solution,
-        )  # fmt: skip
-        self._given.refuse()
-        if found[0] and multipliers is not None:
-            np.negative(self._solution, out=multipliers)
-        return Outcome(*found)
+    @property
+    def kernels(self) -> tuple[Any, Any, Any]:
+        return _positions, _tangents, _apply
 
     def rank(self, x: FloatArray, lattice: FloatArray | None, time: float) -> int:
         """Independent rows at `x`: those that some atom can answer."""
         outcome = self.tangents(Request(np.zeros_like(x), x, None, lattice, time))
         if not outcome.converged:
             return len(self.rows)
-        return int(np.count_nonzero(np.add.reduceat(np.abs(self._pushes), 3 * self._tables[0][:-3:3].astype(np.int64))))
+        return int(np.count_nonzero(np.add.reduceat(np.abs(self._pushes), 3 * self._links[:-3:3].astype(np.int64))))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
@@ -122,20 +106,30 @@ def _gather(x, slot, end, atoms, relative, lattice, periodic, room, at):  # type
         at += 3
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _apply(x, factor, slot, end, atoms, pushes):  # type: ignore[no-untyped-def]
-    for p in range(slot, end):
-        rolled()
-        g = 3 * entry(atoms, p)
-        for i in range(3):
-            put(x, g + i, number(x, g + i) + factor * number(pushes, 3 * p + i))
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    links, atoms, pushes, solution = piece(u, h, 0), piece(u, h, 1), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
+    for k in range(len(solution)):
+        change = factor * number(solution, k)
+        for p in range(entry(links, 3 * k), entry(links, 3 * k + 3)):
+            rolled()
+            g = 3 * entry(atoms, p)
+            for i in range(3):
+                put(x, g + i, number(x, g + i) + change * number(pushes, 3 * p + i))
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    x, x_ref, wanted, lattice, periodic, links, atoms, numbers, masses, base, state, scale, pushes, solution,
-    velocities, inv_dt,
-):  # fmt: skip
+    careful, alone, x, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, numbers
+):
+    """As `kcons.solvers.called_solvers` says; all is careful here."""
+    t, h, u = tables, integers(tables), halves(tables)
+    links, atoms, masses, base = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2), piece(t, h, 3)
+    state, scale, pushes, solution = piece(t, h, 4), piece(t, h, 5), piece(t, h, _PUSHES), piece(t, h, _SOLUTION)
+    if not wanted.size:
+        wanted = piece(t, h, 6)
     worst, worst_row, most = 0.0, -1, 0
     for begin in range(0, len(solution), BLOCK):
         stop = min(begin + BLOCK, len(solution))
@@ -210,18 +204,19 @@ def _positions(  # type: ignore[no-untyped-def]
                     put(solution, k, lam + off / slope)
             iteration += 1
         most = max(most, iteration - 1)
-    for k in range(len(solution)):
-        slot, end, lam = entry(links, 3 * k), entry(links, 3 * k + 3), number(solution, k)
-        _apply(x, lam, slot, end, atoms, pushes)
+    if alone:
+        _apply(x, 1.0, tables)
         if inv_dt != 0.0:
-            _apply(velocities, inv_dt * lam, slot, end, atoms, pushes)
+            _apply(velocities, inv_dt, tables)
     return True, worst, most, worst_row
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(  # type: ignore[no-untyped-def]
-    x, y, wanted, driven, lattice, periodic, links, atoms, numbers, masses, pushes, solution
-):
+def _tangents(alone, x, y, wanted, lattice, periodic, tables, numbers):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    links, atoms, masses = piece(u, h, 0), piece(u, h, 1), piece(t, h, 2)
+    pushes, solution, driven = piece(t, h, _PUSHES), piece(t, h, _SOLUTION), wanted.size > 0
     worst, worst_row, most = 0.0, -1, 0
     for k in range(len(solution)):
         slot, end, parameters = entry(links, 3 * k), entry(links, 3 * k + 3), entry(links, 3 * k + 1)
@@ -261,6 +256,6 @@ def _tangents(  # type: ignore[no-untyped-def]
         if abs(off) >= worst:
             worst, worst_row = abs(off), k
         most = max(most, iteration)
-    for k in range(len(solution)):
-        _apply(y, number(solution, k), entry(links, 3 * k), entry(links, 3 * k + 3), atoms, pushes)
+    if alone:
+        _apply(y, 1.0, tables)
     return True, worst, most, worst_row

@@ -151,6 +151,12 @@ MUTANTS = [
     ),
     # -- solvers: functions --
     (
+        "solvers/called_solvers.py",
+        "add(words, v, inv_dt)",
+        "add(words, v, 1.0)",
+        "tests/solvers/test_called_solvers.py::test_the_same_as_from_python",
+    ),
+    (
         "solvers/sparse/row_functions.py",
         "f, g = h / (rho * q), up / q",
         "f, g = h / rho, up / q",
@@ -735,5 +741,60 @@ MUTANTS = [
         "self.context.setPositions(x * self._length)",
         "self.context.setPositions(x)",
         "tests/comparison/methods/test_engines.py::test_units_of_openmm",
+    ),
+    (
+        "openmm/collective/row_program.py",
+        "if not self._single or _halved(p.integrator, scheme):",
+        "if not self._single:",
+        "tests/openmm/collective/test_row_program.py::test_the_second_half_of_a_drift_begins_in_the_middle",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "result[j] += mixed[s]",
+        "result[j] += mixed[j]",
+        "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
+    ),
+    (
+        "free_energy/held_coordinates.py",
+        "return seen if others is None else seen + metric.reactions @ others",
+        "return seen if others is None else seen - metric.reactions @ others",
+        "tests/free_energy/test_held_coordinates.py::test_multipliers_are_those_of_the_engine",
+    ),
+    (
+        "free_energy/mean_forces.py",
+        "series.kinetic / (g - 1) if g",
+        "series.kinetic / g if g > 99",
+        "tests/free_energy/test_mean_forces.py::test_one_end_to_end_length_beside_two_bonds",
+    ),
+    # -- relaxed scans --
+    (
+        "free_energy/relaxed_scan.py",
+        "attempt.energy < best[point].energy:",
+        "attempt.energy > best[point].energy:",
+        "tests/free_energy/test_relaxed_scan.py::test_both_ways_find_the_lower_of_two_minima",
+    ),
+    (
+        "free_energy/relaxed_scan.py",
+        "if with_it.rank != rank + n + 1:",
+        "if False:",
+        "tests/free_energy/test_relaxed_scan.py::test_bad_coordinates",
+    ),
+    (
+        "free_energy/relaxation.py",
+        "missing = change - size - self._learned @ move",
+        "missing = change - size + self._learned @ move",
+        "tests/free_energy/test_relaxation.py::test_what_was_learned_goes_along",
+    ),
+    (
+        "free_energy/model_hessian.py",
+        "return [x[atoms] + images for",
+        "return [lined_up(x[atoms], self.lattice) + 0 * images for",
+        "tests/free_energy/test_model_hessian.py::test_terms_keep_their_images",
+    ),
+    (
+        "free_energy/attempts.py",
+        'same = (tuple(head["point"]), head["source"]) == (point, source)',
+        "same = True",
+        "tests/free_energy/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
 ]

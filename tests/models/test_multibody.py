@@ -158,6 +158,14 @@ def test_between_steps_as_well_and_backwards():
     assert max(np.abs(body.residuals(q, v)).max() for q, v in zip(back.q, back.v, strict=True)) < 1e-14
 
 
+def test_no_time_and_no_times():
+    body = pendulum()
+    still = body.solve(*hung(SWING), (1, 1))
+    np.testing.assert_array_equal(still.q[-1], hung(SWING)[0])
+    nothing = body.solve(*hung(SWING), (0, 0.1), [])
+    assert nothing.q.shape == (0, 3) and nothing.multipliers.shape == (0, 2) and nothing.steps > 0
+
+
 def bead(**options):
     """On a line that turns at rate 2: r = cosh(2 t); the wall pushes with 2 m w r'."""
     return Multibody(
@@ -471,6 +479,9 @@ def test_steps_that_become_too_small():
         ({"t_span": (0, np.nan)}, "t_span"),
         ({"t_eval": [2.0]}, "t_eval"),
         ({"method": "Euler"}, "method"),
+        ({"rtol": np.nan}, "rtol"),
+        ({"atol": [1e-9, 1e-9, 1e-9]}, "atol"),
+        ({"max_step": -1.0}, "max_step"),
     ],
 )
 def test_bad_arguments_are_named(change, item):

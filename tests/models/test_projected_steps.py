@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kcons.errors import InputError, UnsupportedError
-from kcons.models.projected_steps import METHODS, projecting, solver_of, span_of, times_of
+from kcons.models.projected_steps import METHODS, check_sizes, projecting, solver_of, span_of, times_of
 
 
 def turn(t, y):
@@ -49,3 +49,32 @@ def test_bad_arguments_are_named():
         with pytest.raises(InputError, match="t_eval"):
             times_of(times, 0.0, 1.0)
     np.testing.assert_array_equal(times_of([0.7, 0.2], 1.0, 0.0), [0.7, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rtol", np.nan),
+        ("rtol", -1.0),
+        ("rtol", 0.0),
+        ("rtol", 1e-16),
+        ("rtol", [1e-9, 1e-9, 1e-9]),
+        ("atol", -1e-9),
+        ("atol", [1e-9, np.nan]),
+        ("atol", [1e-9]),
+        ("max_step", 0.0),
+        ("max_step", np.nan),
+        ("first_step", -0.1),
+        ("first_step", "short"),
+    ],
+)
+def test_tolerances_and_steps_that_cannot_be_are_named(name, value):
+    """With a tolerance of NaN, SciPy tries the first step for ever."""
+    with pytest.raises(InputError, match=name) as caught:
+        check_sizes({name: value}, 2)
+    assert caught.value.item == name
+
+
+def test_tolerances_and_steps_that_can_be_are_taken():
+    check_sizes({"rtol": [1e-9, 1e-3], "atol": 0.0, "max_step": np.inf, "first_step": None, "jac": len}, 2)
+    check_sizes({}, 2)

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 from kcons.errors import InputError, NonFiniteError
 from kcons.models.growth.constrained import ACCEPTED, ConstrainedGrowth
 from kcons.models.growth.model import FloatArray, Populations, starting_logarithms
-from kcons.models.projected_steps import projecting, solver_of, span_of, times_of
+from kcons.models.projected_steps import check_sizes, projecting, solver_of, span_of, times_of
 
 Event = Callable[[float, FloatArray], float]
 
@@ -170,6 +170,7 @@ def solve(
     bound = system.bind(p0)
     log_start = bound.project(t0, log_start) if project else log_start
     options = {"rtol": 1e-9, "atol": 1e-11} | options
+    check_sizes(options, system.n)
     tolerance = max(options["atol"] + options["rtol"], 1e-13)
     holder: dict[str, Any] = {}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import openmm
 
 from kcons.openmm.collective.clock import Clock
@@ -9,6 +11,7 @@ from kcons.openmm.collective.forecast import Forecast, Measured
 from kcons.openmm.collective.small_algebra import Block
 from kcons.openmm.integrator.part import Part
 from kcons.openmm.integrator.program import Program
+from kcons.steppers.operations import Exchange
 
 
 class GroupRows(Part):
@@ -104,7 +107,7 @@ class GroupRows(Part):
             self._base = p.vector(f"base{c}", "positions as other parts leave them")
         if self.meets_system:
             p.vector(f"v_kept{c}", "velocities while v is used to project rows")
-            if not self._single:
+            if not self._single or _halved(p.integrator, scheme):
                 self._start = p.vector(f"start{c}", "positions at the start of the drift")
 
     def _gradients(self, p: Program, *, sizes: bool, slopes: bool, products: bool = True) -> None:
@@ -311,6 +314,12 @@ class GroupRows(Part):
             if self._rates[k] != 0.0:
                 done = f"{work}+select(first_stage+failed, 0, {self._rate(k)}*{impulse})"
                 p.let(work, done, "force times speed of the target")
+
+
+def _halved(integrator: Any, scheme: Any) -> bool:
+    """Whether a bath acts between two halves of the drift: the second one does not begin where the step does."""
+    ensemble = getattr(integrator, "ensemble", None)
+    return ensemble is not None and any(isinstance(each, Exchange) for each in ensemble.operations(scheme))
 
 
 def _last_share(integrator: openmm.CustomIntegrator) -> float:

@@ -13,11 +13,15 @@ from numba import types
 from numba.extending import intrinsic, overload
 
 
-def _view(context: Any, builder: Any, kind: Any, data: Any, size: Any) -> Any:
+def view(context: Any, builder: Any, kind: Any, data: Any, *shape: Any) -> Any:
+    """A contiguous array of `shape`, each of it a value, at the address `data`."""
     result = context.make_array(kind)(context, builder)
-    step = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    size = context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
+    steps = [size]
+    for length in shape[:0:-1]:
+        steps.insert(0, builder.mul(steps[0], length))
     pointer = builder.bitcast(data, result.data.type)
-    context.populate_array(result, data=pointer, shape=[size], strides=[step], itemsize=step, meminfo=None)
+    context.populate_array(result, data=pointer, shape=shape, strides=steps, itemsize=size, meminfo=None)
     return result._getvalue()
 
 
@@ -32,13 +36,30 @@ def _piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
         at = builder.mul(args[2], ir.Constant(args[2].type, 2))
         start = builder.load(builder.gep(cuts.data, [at]))
         end = builder.load(builder.gep(cuts.data, [builder.add(at, ir.Constant(at.type, 1))]))
-        return _view(context, builder, kind, builder.gep(numbers.data, [start]), builder.sub(end, start))
+        return view(context, builder, kind, builder.gep(numbers.data, [start]), builder.sub(end, start))
 
     return kind(room, header, types.int64), codegen
 
 
 #: ``room[header[2 k] : header[2 k + 1]]`` of flat contiguous arrays, `header` of int64.
 piece: Any = _piece
+
+
+@intrinsic
+def lattice_piece(typingctx, room, header, k):  # type: ignore[no-untyped-def]
+    """The same as a lattice, shape (2, 3, 3)."""
+    kind = types.Array(room.dtype, 3, "C")
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        numbers, cuts = (
+            context.make_array(t)(context, builder, a) for t, a in zip(sig.args[:2], args[:2], strict=True)
+        )
+        at = builder.mul(args[2], ir.Constant(args[2].type, 2))
+        start = builder.load(builder.gep(cuts.data, [at]))
+        shape = [context.get_constant(types.intp, length) for length in (2, 3, 3)]
+        return view(context, builder, kind, builder.gep(numbers.data, [start]), *shape)
+
+    return kind(room, header, types.int64), codegen
 
 
 def _flat(dtype: Any) -> Any:
@@ -48,14 +69,20 @@ def _flat(dtype: Any) -> Any:
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
             source = context.make_array(sig.args[0])(context, builder, args[0])
-            return _view(context, builder, sig.return_type, source.data, source.nitems)
+            size = source.nitems
+            if dtype is not None:
+                ratio = array.dtype.bitwidth // dtype.bitwidth
+                size = builder.mul(size, ir.Constant(size.type, ratio))
+            return view(context, builder, sig.return_type, source.data, size)
 
         return kind(array), codegen
 
     return function
 
 
-_numbers, _integers = _flat(None), _flat(types.int64)
+_numbers = _flat(None)
+# Memory of doubles as integers of eight, four and one bytes: what NumPy's `view` gives, which takes long to compile.
+integers, halves, octets = _flat(types.int64), _flat(types.uint32), _flat(types.uint8)
 
 
 def flat(array: Any) -> Any:
@@ -78,5 +105,5 @@ def _overload_flat(array):  # type: ignore[no-untyped-def]
 @overload(bits, inline="always")
 def _overload_bits(array):  # type: ignore[no-untyped-def]
     if array.layout == "C":
-        return lambda array: _integers(array)
+        return lambda array: integers(array)
     return lambda array: array.ravel().view(types.int64)

@@ -6,6 +6,8 @@ compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.sol
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,10 @@ from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.cluster_solver import Outcome, Request
-from kcons.solvers.kernels.aligned_memory import aligned
-from kcons.solvers.kernels.nearest_image import NO_LATTICE
+from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.cluster_solver import Request
+from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
+from kcons.solvers.kernels.array_views import halves, integers, piece
 from kcons.solvers.kernels.two_and_four_wide import (
     add_to_point,
     dot,
@@ -47,9 +50,11 @@ from kcons.solvers.sparse.substitution import update
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
 SPEED_TOLERANCE = 1e-15
 _EPS = float(np.finfo(float).eps)
+#: Of the pieces of `SparseRows.tables`, those that are named.
+_PIVOTS, _MOVES, _SOLUTION = 16, 20, 21
 
 
-class SparseRows:
+class SparseRows(CalledSolver):
     """Solver for clusters of compiled rows of any kind.
 
     Parameters
@@ -64,6 +69,7 @@ class SparseRows:
     """
 
     name = "mixed"
+    ways = False, True
 
     def __init__(
         self,
@@ -84,77 +90,39 @@ class SparseRows:
         widths = np.diff(start)[order]
         slots = np.concatenate([[0], np.cumsum(widths)]).astype(np.int64)
         flat = np.concatenate([atoms[start[k] : start[k + 1]] for k in order]) if len(order) else atoms
-        self._atoms, atom_start, slot_atoms = plain_if_small(_number_atoms, len(flat))(
+        atom_numbers, atom_start, slot_atoms = plain_if_small(_number_atoms, len(flat))(
             flat, slots, pattern.clusters, len(inverse_masses)
         )
-        w = inverse_masses[self._atoms]
+        w = inverse_masses[atom_numbers]
         triple, sides, masses = make_triples(pattern.start, pattern.columns, slots, slot_atoms, w)
         # Row by row: its first entry, its first target, its first slot, its first parameter.
         links = np.zeros((len(rows) + 1, 4), np.uint32)
         links[:, 0], links[:, 1], links[:, 2] = pattern.start, pattern.target_start, slots
-        self._links = links.ravel()
         self._made_of = constraint_set, rows, inverse_masses, late
         self._given = GivenRows(constraint_set, self.rows, int(widths.max(initial=0)))
         links[:-1, 3] = self._given.starts
-        self._tables = (
-            pattern.clusters, self._atoms, atom_start, slot_atoms, self._given.kinds, self._given.numbers, self._links,
-            pattern.columns, pattern.targets, triple, sides, masses,
-        )  # fmt: skip
-        self._scale = constraint_set.scale[self.rows]
-        self._targets = np.ascontiguousarray(constraint_set.target(0.0)[self.rows])
-        n = len(rows)
-        self._lines = aligned(8 * int(slots[-1]))
-        self._lines[6::8] = w[slot_atoms]
-        # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
-        self._state, self._entries = aligned(2 * n), aligned(4 * len(pattern.columns))
-        self._pivots, self._values, self._inverse_rounding = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._base, self._moves = aligned(4 * len(self._atoms)), aligned(4 * len(self._atoms))
-        self._solution = np.zeros(n)
-        self._kept_moves = np.zeros(len(self._moves))
-        self._kept_solution = np.zeros(n)
-        self._speeds = aligned(4 * len(self._atoms))
+        n, numbers = len(rows), 4 * len(atom_numbers)
+        lines = np.zeros(8 * int(slots[-1]))
+        lines[6::8] = w[slot_atoms]
+        self.tables = in_one_array(
+            (
+                *(pattern.clusters, atom_numbers, atom_start, slot_atoms, self._given.kinds, links.ravel()),
+                *(pattern.columns, pattern.targets, triple, sides, masses, constraint_set.scale[self.rows]),
+                *(np.ascontiguousarray(constraint_set.target(0.0)[self.rows]), lines),
+                # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
+                *(room(2 * n), room(4 * len(pattern.columns))),
+                *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
+                *(room(numbers), room(n), room(numbers)),
+            )
+        )
+        self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
 
     def __reduce__(self) -> tuple[type[SparseRows], tuple[object, ...]]:
         return SparseRows, self._made_of  # addresses are of no use elsewhere
 
-    def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
-        """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request
-        self._given.numbers[:2] = time, reference_time
-        targets = self._targets if wanted is None else wanted[self.rows]
-        for careful in (False, True):
-            failed, residual, iterations, worst = _positions(
-                careful, x, reference, targets, NO_LATTICE if lattice is None else lattice, lattice is not None,
-                *self._tables, self._scale, self._lines, self._state, self._entries, self._pivots, self._values,
-                self._inverse_rounding, self._base, self._moves, self._solution, self._kept_moves, self._kept_solution,
-            )  # fmt: skip
-            self._given.refuse()
-            if not failed:
-                break
-        if not failed:
-            _apply(x, 1.0, self._atoms, self._moves)
-            if velocities is not None:
-                _apply(velocities, inv_dt, self._atoms, self._moves)
-            if multipliers is not None:
-                multipliers[:] = self._solution
-        return Outcome(not failed, residual, iterations, worst)
-
-    def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
-        """M-orthogonal projection of y onto A y = rates, in place."""
-        y, x, wanted, lattice, time, *_ = request
-        self._given.numbers[:2] = time
-        rates = self._targets if wanted is None else wanted[self.rows]
-        failed, residual, iterations, worst = _tangents(
-            x, y, rates, wanted is not None, NO_LATTICE if lattice is None else lattice, lattice is not None,
-            *self._tables, self._lines, self._state, self._entries, self._pivots, self._values,
-            self._base, self._moves, self._speeds, self._solution,
-        )  # fmt: skip
-        self._given.refuse()
-        if not failed:
-            _apply(y, 1.0, self._atoms, self._moves)
-            if multipliers is not None:
-                np.negative(self._solution, out=multipliers)
-        return Outcome(not failed, residual, iterations, worst)
+    @property
+    def kernels(self) -> tuple[Any, Any, Any]:
+        return _positions, _tangents, _apply
 
     def rank(self, x: FloatArray, lattice: FloatArray | None, time: float = 0.0) -> int:
         """Independent rows at `x`: those whose pivot does not vanish."""
@@ -272,7 +240,7 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
             store_quad(moves, a, load_quad(moves, a) + f * second_vector(lines, 8 * slot))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
     scale, lines, values, inverse_rounding, base, moves, solution,
@@ -303,7 +271,7 @@ def _begin(  # type: ignore[no-untyped-def]
         put(inverse_rounding, k, 1.0 / max(1e-14 * number(scale, k), 2 * _EPS * reach))
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state):  # type: ignore[no-untyped-def]
     """Right-hand sides; largest and total error, the row with the largest, and the largest in units of its rounding."""
     error, total, excess = 0.0, 0.0, 0.0
@@ -323,7 +291,7 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
     return error, total, excess, bad
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, inline="always")
 def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         if not (abs(state[2 * k + 1]) < np.inf):
@@ -331,12 +299,29 @@ def _first_not_finite(first, last, state):  # type: ignore[no-untyped-def]
     return first
 
 
+@nb.njit(cache=True, fastmath=FAST)
+def _apply(x, factor, tables):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    header = integers(tables)
+    atoms, moves = piece(halves(tables), header, 1), piece(tables, header, _MOVES)
+    for a in range(len(atoms)):
+        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _positions(  # type: ignore[no-untyped-def]
-    careful, x_new, x_ref, wanted, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters,
-    links, columns, targets, triple, sides, masses, scale, lines, state, entries, pivots, values, inverse_rounding,
-    base, moves, solution, kept_moves, kept_solution,
-):  # fmt: skip
+    careful, alone, x_new, x_ref, velocities, inv_dt, wanted, lattice, periodic, tables, parameters
+):
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    clusters, atom_start, atoms, slot_atoms = piece(h, h, 0), piece(h, h, 2), piece(u, h, 1), piece(u, h, 3)
+    kinds, links, columns, targets = piece(u, h, 4), piece(u, h, 5), piece(u, h, 6), piece(u, h, 7)
+    triple, sides, masses, scale = piece(u, h, 8), piece(u, h, 9), piece(t, h, 10), piece(t, h, 11)
+    lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
+    values, inverse_rounding, base, moves = piece(t, h, 17), piece(t, h, 18), piece(t, h, 19), piece(t, h, _MOVES)
+    solution, kept_moves, kept_solution = piece(t, h, _SOLUTION), piece(t, h, 22), piece(t, h, 23)
+    if not wanted.size:
+        wanted = piece(t, h, 12)
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
@@ -359,16 +344,16 @@ def _positions(  # type: ignore[no-untyped-def]
             )
             if overshot(careful, iteration, error, total, best):
                 if halvings == MAX_HALVINGS:
-                    return True, error, iteration, bad
+                    return False, error, iteration, bad
                 halvings += 1
                 go_back(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
                 go_back(first, last, solution, kept_solution)
                 error = previous
                 continue
             if not (total < np.inf):
-                return True, np.inf, iteration, _first_not_finite(first, last, state)
+                return False, np.inf, iteration, _first_not_finite(first, last, state)
             if hopeless(iteration, error, previous):
-                return True, error, iteration, bad
+                return False, error, iteration, bad
             # Go on to the rounding of the relative coordinates as long as Newton still gains.
             if excess <= 1.0 and (error <= step_control.NEWTON_TOLERANCE or error > 0.1 * previous):
                 break
@@ -391,18 +376,28 @@ def _positions(  # type: ignore[no-untyped-def]
                 along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
             # A gradient must not have turned by 90 degrees or more within the step.
             if not (along > 0.0):
-                return True, np.inf, iteration, k
+                return False, np.inf, iteration, k
         if error >= worst:
             worst, worst_row = error, bad
         most = max(most, iteration)
-    return False, worst, most, worst_row
+    if alone:
+        _apply(x_new, 1.0, tables)
+        if inv_dt != 0.0:
+            _apply(velocities, inv_dt, tables)
+    return True, worst, most, worst_row
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _tangents(  # type: ignore[no-untyped-def]
-    x, y, wanted, driven, lattice, periodic, clusters, atoms, atom_start, slot_atoms, kinds, parameters, links,
-    columns, targets, triple, sides, masses, lines, state, entries, pivots, values, base, moves, speeds, solution,
-):  # fmt: skip
+def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # type: ignore[no-untyped-def]
+    """As `kcons.solvers.called_solvers` says."""
+    t, h, u = tables, integers(tables), halves(tables)
+    clusters, atom_start, atoms, slot_atoms = piece(h, h, 0), piece(h, h, 2), piece(u, h, 1), piece(u, h, 3)
+    kinds, links, columns, targets = piece(u, h, 4), piece(u, h, 5), piece(u, h, 6), piece(u, h, 7)
+    triple, sides, masses = piece(u, h, 8), piece(u, h, 9), piece(t, h, 10)
+    lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
+    values, base, moves = piece(t, h, 17), piece(t, h, 19), piece(t, h, _MOVES)
+    solution, speeds = piece(t, h, _SOLUTION), piece(t, h, 24)
+    driven = wanted.size > 0
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
         first, last = clusters[c], clusters[c + 1]
@@ -433,7 +428,7 @@ def _tangents(  # type: ignore[no-untyped-def]
             total += size
             solution[k] = 0.0
         if not (total < np.inf):
-            return True, np.inf, 0, _first_not_finite(first, last, state)
+            return False, np.inf, 0, _first_not_finite(first, last, state)
         _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
@@ -455,20 +450,16 @@ def _tangents(  # type: ignore[no-untyped-def]
                     error = abs(off)
                     bad = k
             if not (total < np.inf):
-                return True, np.inf, iteration, bad
+                return False, np.inf, iteration, bad
             if not refines(iteration, error, previous, allowed):
                 break
             previous = error
             _forward(first, last, links, columns, state, entries)
         if error > 1e3 * allowed:
-            return True, error, iteration, bad
+            return False, error, iteration, bad
         if error >= worst:
             worst, worst_row = error, bad
         most = max(most, iteration)
-    return False, worst, most, worst_row
-
-
-@nb.njit(cache=True, fastmath=FAST)
-def _apply(x, factor, atoms, moves):  # type: ignore[no-untyped-def]
-    for a in range(len(atoms)):
-        add_to_point(x, 3 * entry(atoms, a), factor * load_quad(moves, 4 * a))
+    if alone:
+        _apply(y, 1.0, tables)
+    return True, worst, most, worst_row

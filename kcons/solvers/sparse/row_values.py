@@ -79,7 +79,7 @@ def _put(lines, place, x, y, z):  # type: ignore[no-untyped-def]
     put(lines, place + 4, z)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def angle(u, w):  # type: ignore[no-untyped-def]
     """Angle between u and w and its gradients by both: dtheta/du = u x (u x w) / (u^2 |u x w|)."""
     ux, uy, uz = u

@@ -111,7 +111,7 @@ class SplittingStep(ArrayStep):
         circles = system.great_circles if exact else None
         self.flight: Drift = system.drift if circles is None else circles
         self.flights = None if exact else system.flights
-        self.tables: Packed = (NO_WORK, None, None, None) if self.flights is None else self.flights.tables()
+        self.tables: Packed = (NO_WORK, None, None, None, None) if self.flights is None else self.flights.tables()
         self.point = Point(self.x, self.v, system.weights, exact=many or exact)
         self.out = self.x
         #: Whether a drift has come after the last forces.

@@ -137,7 +137,7 @@ def check_finite(values: FloatArray, item: str, step: int) -> None:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def add_kick(v, kick, f, weights):  # type: ignore[no-untyped-def]
     sound = kick == 0.0 or all_finite(f)
     b, g, w = flat(v), flat(f), flat(weights)

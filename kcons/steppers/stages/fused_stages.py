@@ -1,4 +1,4 @@
-"""Whole stages in one compiled call, where distances at rest and fixed atoms are all that is held.
+"""Whole stages in one compiled call, where all that is held is at rest, and few rows of it are no distances.
 
 A call from Python to a kernel costs as much as the kernel's work on ten molecules of water or more. A stage - a kick,
 then flights that are each brought back onto the constraints - is therefore one call here, and so is the end of a step.
@@ -8,21 +8,26 @@ as it was for the engine, which has more means and names the row.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.motion.motion import Motion
+from kcons.solvers.called_solvers import CalledSolver
 from kcons.solvers.chains.open_chains import Chains
+from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
 from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
-from kcons.solvers.kernels.array_views import piece
+from kcons.solvers.kernels.array_views import integers, piece
 from kcons.solvers.rigid_triangles import RigidTriangles
+from kcons.solvers.single_rows import SingleRows
+from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.steppers.stages.compensated_steps import (
     Point,
     add_kick,
@@ -70,16 +75,27 @@ class Tables:
     Parameters
     ----------
     motion : Motion
-    found : tuple
+    found : PackedRows
         All its rows, and more, from `packed_rows`.
+    made_of : tuple
+        What `of` was given.
     """
 
-    def __init__(self, motion: Motion, found: Packed) -> None:
+    def __init__(self, motion: Motion, found: PackedRows, made_of: tuple[Any, ...]) -> None:
         self.motion = motion
-        self._tables = found
+        self._tables, self._called = found
+        self._made_of = made_of
         self._cell = motion.cell
         self._lattice = motion.lattice
-        set_lattice(found[0], self._lattice)
+        set_lattice(self._tables[0], self._lattice)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).of, self._made_of  # addresses are of no use elsewhere
+
+    @classmethod
+    def of(cls, *made_of: Any) -> Tables | None:
+        """For all that is held, or None where that is not for compiled stages."""
+        raise NotImplementedError
 
     def tables(self) -> Packed:
         """What the kernels need to know, for one step: the rows, and the cell as it is now."""
@@ -96,20 +112,23 @@ class Flights(Tables):
     Parameters
     ----------
     motion : Motion
-    found : tuple
+    found : PackedRows
         All its rows, from `packed_rows`, 1/m for each coordinate, the atoms that show whether the system is
         far from the origin, the first of them the one that positions are then taken relative to, and how far is far.
+    made_of : tuple
     """
 
-    def __init__(self, motion: Motion, found: Packed) -> None:
-        super().__init__(motion, found)
+    def __init__(self, motion: Motion, found: PackedRows, made_of: tuple[Any, ...]) -> None:
+        super().__init__(motion, found, made_of)
         #: Iterations that the engine has been told of.
         self.took = _UNKNOWN
         self._kernels: dict[Any, Any] = {}
 
     @classmethod
-    def of(cls, motion: Motion, weights: FloatArray, held: IntArray, far: float) -> Flights | None:
-        """For the rows of `motion`, or None if they are too many, move, or hold anything but distances.
+    def of(  # type: ignore[override]
+        cls, motion: Motion, weights: FloatArray, held: IntArray, far: float
+    ) -> Flights | None:
+        """For the rows of `motion`, or None if they are too many, move, or hold what no kernel knows.
 
         Parameters
         ----------
@@ -121,8 +140,8 @@ class Flights(Tables):
         far : float
             The system is far if the first is this many times farther from the origin than from any other.
         """
-        found = packed_rows(motion, weights.ravel(), held.astype(np.uint32), np.array([far]))
-        return None if found is None else cls(motion, found)
+        found = packed_rows(motion, weights.ravel(), held, np.array([far]))
+        return None if found is None else cls(motion, found, (motion, weights, held, far))
 
     @property
     def one(self) -> Any:
@@ -267,7 +286,14 @@ class Flights(Tables):
         return found == _FAR
 
 
-def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
+class PackedRows(NamedTuple):
+    """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
+
+    tables: Packed
+    called: list[CalledSolver]
+
+
+def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
     if plan.driven or held.moving or plan.loose is not None or any(plan.whole):
@@ -282,26 +308,39 @@ def packed_rows(motion: Motion, *more: NDArray[Any]) -> Packed | None:
     triangles: RigidTriangles | None = None
     chains: Chains | None = None
     rows: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    mixed = [solver for solver in plan.solvers if not isinstance(solver, DistanceClusters)]
     for solver in plan.solvers:
-        if not isinstance(solver, DistanceClusters):
-            return None
-        if triangles is None and not compact and isinstance(solver, RigidTriangles):
-            triangles = solver
-        elif chains is None and isinstance(solver, Chains):
-            chains = solver
-        else:
-            rows.append(solver.rows)
+        if isinstance(solver, DistanceClusters):
+            if triangles is None and not compact and not mixed and isinstance(solver, RigidTriangles):
+                triangles = solver
+            elif chains is None and not mixed and isinstance(solver, Chains):
+                chains = solver
+            else:
+                rows.append(solver.rows)
     if chains is not None and not _worth_it(chains, sum(map(len, rows))):
         rows.append(chains.rows)
         chains = None
     others = np.concatenate(rows)
-    if len(others) > MOST_ROWS:
+    if len(others) > MOST_ROWS or not all(isinstance(each, SparseRows | SingleRows) for each in mixed):
         return None
+    if mixed and (held.images is not None or sum(len(each.rows) for each in mixed) > MOST_ROWS):
+        return None
+    # Solvers of their own, for the atoms of the whole system: those of the plan may be at work for another one.
+    called = [_solver_like(each, held, inverse_masses, plan.late) for each in mixed]
     pairs = np.array([held.row_atoms(int(row)) for row in others], dtype=np.int64).reshape(-1, 2)
     lengths = held.target(0.0)[others]
     places, numbers = plan.pinned_targets(None), held.touched if compact else None
-    late = plan.late[others]
-    return packed(triangles, chains, pairs, lengths, inverse_masses, pinned, places, *more, numbers=numbers, late=late)
+    given = triangles, chains, pairs, lengths, inverse_masses, pinned, places
+    return PackedRows(packed(*given, *more, numbers=numbers, late=plan.late[others], called=called), called)
+
+
+def _solver_like(
+    solver: ClusterSolver, held: ConstraintSet, inverse_masses: FloatArray, late: NDArray[np.bool_]
+) -> CalledSolver:
+    rows = np.sort(solver.rows)
+    if isinstance(solver, SingleRows):
+        return SingleRows(held, rows, inverse_masses)
+    return SparseRows(held, rows, inverse_masses, late[rows])
 
 
 def _worth_it(chains: Chains, others: int) -> bool:
@@ -311,18 +350,18 @@ def _worth_it(chains: Chains, others: int) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     if fresh:
         sound = fly_first(x, work[0], v0, v, work[1], kick, force, weights, h, out)
     else:
         sound = fly(x, work[0], v, work[1], kick, force, weights, h, out)
-    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others, chains) if sound else -2
+    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others, chains, called) if sound else -2
 
 
 @numba.njit(cache=True, nogil=True)
 def one_flight(  # type: ignore[no-untyped-def]
-    what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others, chains
+    what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others, chains, called
 ):
     """The end of a step, the first stage of the next, or both, where nothing adds up remainders.
 
@@ -333,7 +372,7 @@ def one_flight(  # type: ignore[no-untyped-def]
         a flight of `h` from `x` to `out`. `BOTH`: one after the other.
     v : ndarray, shape (n_atoms, 3)
         The velocities after the flight; may be `v0`.
-    tables, triangles, others, chains
+    tables, triangles, others, chains, called
         From `Flights.tables`, in this step.
 
     Returns
@@ -342,28 +381,45 @@ def one_flight(  # type: ignore[no-untyped-def]
         Of an end alone 0, or what `Flights.ended` has to do. Otherwise iterations, or what `Flights.landed` has to do,
         or `UNENDED`.
     """
-    weights = piece(tables, tables.view(np.int64), MORE)
+    weights = piece(tables, integers(tables), MORE)
     if what != FLY:
-        found = _ended(add_kick(v0, last_kick, force, weights), x, v0, tables, triangles, others, chains)
+        found = _ended(add_kick(v0, last_kick, force, weights), x, v0, tables, triangles, others, chains, called)
         if what == END or found != 0:
             return found if what == END else UNENDED
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
-    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others, chains)
+    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others, chains, called)
     return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
 
 
 @numba.njit(cache=True, nogil=True)
 def many_flights(  # type: ignore[no-untyped-def]
-    what, fractions, dt, first, x, v0, v, work, last_kick, kick, force, fresh, out, tables, triangles, others, chains
+    what,
+    fractions,
+    dt,
+    first,
+    x,
+    v0,
+    v,
+    work,
+    last_kick,
+    kick,
+    force,
+    fresh,
+    out,
+    tables,
+    triangles,
+    others,
+    chains,
+    called,
 ):
     """The same with a stage of flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
 
     `work` is that of `Point`, `fresh` whether it holds nothing yet.
     """
-    weights = piece(tables, tables.view(np.int64), MORE)
+    weights = piece(tables, integers(tables), MORE)
     if what != FLY:
-        found = _ended(land(v0, work[1], last_kick, force, weights), x, v0, tables, triangles, others, chains)
+        found = _ended(land(v0, work[1], last_kick, force, weights), x, v0, tables, triangles, others, chains, called)
         if what == END or found != 0:
             return found if what == END else UNENDED
         fresh = True
@@ -377,27 +433,41 @@ def many_flights(  # type: ignore[no-untyped-def]
             start = out if (n - i) % 2 == 0 else work[2]
             v0, kick, fresh = v, 0.0, False
         took = _flight(
-            start, v0, v, work, kick, force, weights, fresh, fractions[i] * dt, end, tables, triangles, others, chains
+            start,
+            v0,
+            v,
+            work,
+            kick,
+            force,
+            weights,
+            fresh,
+            fractions[i] * dt,
+            end,
+            tables,
+            triangles,
+            others,
+            chains,
+            called,
         )
         if not 0 <= took <= MANY_ITERATIONS:
             return _FORCE if took == -2 else _ENGINE - i
     return took
 
 
-@numba.njit(cache=True, nogil=True)
-def _ended(sound, x, v, tables, triangles, others, chains):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, inline="always")
+def _ended(sound, x, v, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
     """Velocities projected after a kick, sound or not; 0, or what `Flights.ended` has to do."""
     if not sound:
         return _BAD_FORCE
     if not all_finite(x):
         return _BAD_POSITION
-    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains) else -1
+    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains, called) else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def _after(x, v, tables):  # type: ignore[no-untyped-def]
     if not all_finite(v):
         return _BAD_VELOCITY
-    header = tables.view(np.int64)
-    held, far = piece(tables.view(np.uint32), header, MORE + 1), piece(tables, header, MORE + 2)
+    header = integers(tables)
+    held, far = piece(header, header, MORE + 1), piece(tables, header, MORE + 2)
     return _FAR if held.size and beyond(x, held, held[0], far[0]) else 0

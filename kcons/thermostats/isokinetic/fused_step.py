@@ -7,16 +7,18 @@ and of the closed form, with all of their checks; what they cannot do is left to
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.motion.local_projections import MANY_ITERATIONS
 from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents
-from kcons.solvers.kernels.array_views import piece
+from kcons.solvers.kernels.array_views import integers, piece
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import all_finite
-from kcons.steppers.stages.fused_stages import Tables, packed_rows
+from kcons.steppers.stages.fused_stages import PackedRows, Tables, packed_rows
 from kcons.thermostats.isokinetic.kick import after_drift, before_drift
 
 #: Square of a velocity across the constraints, relative to 2K, that is too much for a drift to take out exactly.
@@ -32,18 +34,21 @@ class IsokineticStages(Tables):
     Parameters
     ----------
     system : System
-    found : tuple
+    found : PackedRows
         All its rows, from `fused_distances`; then 1/m for each coordinate, the masses of the thermostatted atoms,
         and whether others move.
+    made_of : tuple
     """
 
-    def __init__(self, system: System, found: Packed) -> None:
-        super().__init__(system.motion, found)
+    def __init__(self, system: System, found: PackedRows, made_of: tuple[Any, ...]) -> None:
+        super().__init__(system.motion, found, made_of)
         self._shape = (system.n_atoms, 3)
 
     @classmethod
-    def of(cls, system: System, masses: FloatArray, others: bool) -> IsokineticStages | None:
-        """For `system`, or None if its rows are too many, move, or hold anything but distances.
+    def of(  # type: ignore[override]
+        cls, system: System, masses: FloatArray, others: bool
+    ) -> IsokineticStages | None:
+        """For `system`, or None if its rows are too many, move, or hold what no kernel knows.
 
         Parameters
         ----------
@@ -56,7 +61,7 @@ class IsokineticStages(Tables):
         if system.force is None:
             return None
         found = packed_rows(system.motion, system.weights.ravel(), masses.ravel(), np.array([float(others)]))
-        return None if found is None else cls(system, found)
+        return None if found is None else cls(system, found, (system, masses, others))
 
     def before(
         self,
@@ -149,9 +154,9 @@ def _accelerations(f, weights, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest, chains):  # type: ignore[no-untyped-def]
+def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest, chains, called):  # type: ignore[no-untyped-def]
     """`IsokineticStages.before`; status, log of the growth, and iterations."""
-    header = tables.view(np.int64)
+    header = integers(tables)
     weights, masses, apart = (
         piece(tables, header, MORE),
         piece(tables, header, MORE + 1),
@@ -164,16 +169,16 @@ def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest,
         _accelerations(f, weights, out)
         _push_others(u0, out, t, weights, masses, u)
     _fly(x, u, h, out)
-    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest, chains)
+    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest, chains, called)
     if not all_finite(out):
         return POSITION, log_growth, 0
     return (DONE if 0 <= iterations <= MANY_ITERATIONS else ENGINE), log_growth, iterations
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chains):  # type: ignore[no-untyped-def]
+def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chains, called):  # type: ignore[no-untyped-def]
     """`IsokineticStages.after`; status, f.M_par^+ f, factor, and log of the growth."""
-    header = tables.view(np.int64)
+    header = integers(tables)
     weights, masses, apart = (
         piece(tables, header, MORE),
         piece(tables, header, MORE + 1),
@@ -186,7 +191,7 @@ def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chai
     _accelerations(f, weights, pace)
     # One call site, which is compiled once.
     for y in (u, pace):
-        if not packed_tangents(x, y, tables, triangles, rest, chains):
+        if not packed_tangents(x, y, tables, triangles, rest, chains, called):
             return ENGINE, 0.0, 0.0, 0.0
     square, factor, log_growth, done = after_drift(u, pace, masses, twice, t, out)
     if not done:

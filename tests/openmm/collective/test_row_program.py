@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import openmm
 import pytest
 from collective_cases import (
     CHAIN,
@@ -20,10 +21,11 @@ from collective_cases import (
     with_variable,
 )
 from openmm import app, unit
-from openmm_systems import PLATFORMS
+from openmm_systems import DATA, PLATFORMS
 
+from kcons.constraints import Dihedral
 from kcons.errors import ConstraintError, ConvergenceError, InputError
-from kcons.openmm import ProjectedIntegrator
+from kcons.openmm import Langevin, NoseHooverMiddle, ProjectedIntegrator, hold
 from kcons.openmm.collective import CollectiveRows
 from kcons.openmm.collective.row_forces import Row
 
@@ -167,3 +169,53 @@ def test_another_target_from_now_on():
     assert part.values(context) == pytest.approx([0.25], abs=1e-12)
     with pytest.raises(InputError, match="without a rate"):
         part.set_target(integrator, 0, 0.25, rate=1.0)
+
+
+# -- a bath between two halves of the drift -------------------------------------------------------------
+
+PEPTIDE = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
+PHI = [4, 6, 8, 14]
+
+
+def held_peptide(ensemble, dt, carried=False):
+    """Alanine dipeptide with bonds of hydrogen held by the System and phi by rows."""
+    field = app.ForceField("amber14-all.xml")
+    system = field.createSystem(PEPTIDE.topology, constraints=app.HBonds, removeCMMotion=False)
+    force = openmm.CustomTorsionForce("theta")
+    force.addTorsion(*PHI, [])
+    x = PEPTIDE.positions
+    part = hold(system, [Dihedral([PHI])], x) if carried else CollectiveRows(system, [force], positions=x)
+    integrator = ProjectedIntegrator(dt, parts=[part], ensemble=ensemble)
+    integrator.setRandomNumberSeed(3)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(x)
+    integrator.applyConstraints()
+    return context, integrator, part
+
+
+@pytest.mark.filterwarnings("ignore:total momentum is not zero")
+@pytest.mark.parametrize(
+    "ensemble", [Langevin(300, 0), NoseHooverMiddle(300, 1e-6)], ids=["Langevin", "NoseHooverMiddle"]
+)
+def test_the_second_half_of_a_drift_begins_in_the_middle(ensemble):
+    """Where the bath does nothing: the trajectory of rows held by `hold`, whose code is another one."""
+    ends, starts = [], []
+    v = np.random.default_rng(5).normal(size=(22, 3))
+    for carried in (False, True):
+        context, integrator, _ = held_peptide(ensemble, 0.001, carried)
+        if starts:
+            context.setPositions(starts[0])
+        starts.append(state_of(context)[0])
+        context.setVelocities(v - v.mean(axis=0))
+        integrator.applyVelocityConstraints()
+        integrator.step(40)
+        ends.append(np.hstack(state_of(context)))
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-7)
+
+
+def test_langevin_beside_constraints_of_the_system_goes_on():
+    """Three picoseconds at 2 fs with a coordinate of atoms that the System constrains."""
+    context, integrator, rows = held_peptide(Langevin(300, 5), 0.002)
+    integrator.setVelocitiesToTemperature(context, 300, 1)
+    integrator.step(1500)
+    assert abs(rows.residuals(context)[0]) < 1e-12

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from kcons.solvers.kernels.array_views import bits, flat, piece
+from kcons.solvers.kernels.array_views import bits, flat, halves, integers, lattice_piece, octets, piece
 
 
 @njit
@@ -37,3 +37,28 @@ def test_without_a_compiler_they_are_numpys():
     array = np.arange(6.0).reshape(2, 3)
     assert np.array_equal(flat(array), array.ravel())
     assert np.array_equal(bits(array), array.ravel().view(np.int64))
+
+
+@njit
+def memory(array):
+    return integers(array), halves(array), octets(array)
+
+
+@njit
+def as_lattice(room, header, k):
+    found = lattice_piece(room, header, k)
+    found[1, 2, 0] += 100.0
+    return found.sum()
+
+
+def test_memory_as_integers_of_other_sizes():
+    array = np.arange(5.0)
+    for found, dtype in zip(memory(array), (np.int64, np.uint32, np.uint8), strict=True):
+        assert found.dtype == dtype and np.array_equal(found, array.view(dtype))
+        assert np.shares_memory(found, array)
+
+
+def test_a_piece_as_a_lattice():
+    room, header = np.arange(30.0), np.array([0, 4, 6, 24])
+    assert as_lattice(room, header, 1) == np.arange(6.0, 24.0).sum() + 100.0
+    assert room[6 + 9 + 6] == 121.0

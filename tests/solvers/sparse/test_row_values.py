@@ -5,6 +5,7 @@ import pytest
 
 from kcons.constraints import Angle, CenterDistance, Cylinder, Dihedral, Distance, LinearCombination, Plane, RowKind
 from kcons.constraints.constraint_set import ConstraintSet
+from kcons.solvers.kernels.aligned_memory import part_of
 from kcons.solvers.sparse.mixed_rows import SparseRows
 from kcons.solvers.sparse.row_values import evaluate, miss
 
@@ -23,14 +24,14 @@ def evaluated(constraints, x, cell=None, moves=0.0):
     constraint_set = ConstraintSet(constraints, x, np.ones(len(x)), cell=cell)
     n = constraint_set.n_rows
     solver = SparseRows(constraint_set, np.arange(n), np.ones(len(x)))
-    _, atoms, _, slot_atoms, kinds, parameters, links = solver._tables[:7]
+    atoms, slot_atoms, kinds, links = (part_of(solver.tables, k, np.uint32) for k in (1, 3, 4, 5))
     base, change = np.zeros((2, len(atoms), 4))
     base[:, :3], change[:, :3] = (x - moves)[atoms], np.broadcast_to(moves, x.shape)[atoms]
     lattice = np.zeros((2, 3, 3)) if cell is None else constraint_set.lattice
     values, lines = np.zeros(n), np.zeros(8 * len(slot_atoms))
     for which in range(2):
         evaluate(
-            0, n, kinds, links, slot_atoms, parameters, base.ravel(), change.ravel(), lattice, cell is not None,
+            0, n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(), lattice, cell is not None,
             values, lines, which,
         )  # fmt: skip
     slots = links.reshape(-1, 4)[:, 2]

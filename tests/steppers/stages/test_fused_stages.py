@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
-from kcons.constraints import Angle, Distance, FixedAtoms, MovingTarget, Plane
+from kcons.constraints import (
+    Angle,
+    CenterDistance,
+    Custom,
+    Cylinder,
+    Dihedral,
+    Distance,
+    Ellipsoid,
+    FixedAtoms,
+    Formula,
+    ImplicitSurface,
+    MovingTarget,
+    Plane,
+    Sphere,
+)
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import ConvergenceError, InputError, KconsError, NonFiniteError
 from kcons.motion.local_projections import MANY_ITERATIONS
@@ -429,12 +446,20 @@ def test_what_is_left_to_the_engine() -> None:
     lengths = np.linalg.norm(x[[0, 0, 1]] - x[[1, 2, 2]], axis=1)
     moving = MovingTarget(lambda t: lengths + 0.1 * t)
     assert flights(Distance(PAIRS, moving)) is None
-    assert flights(Distance([[0, 1]]), Angle([[1, 0, 2]])) is None
-    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0])) is None
+    assert flights(Distance([[0, 1]]), Angle([[1, 0, 2]])) is not None
+    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0])) is not None
+    assert flights(Distance([[0, 1]]), Plane(2, [0, 0, 1.0], MovingTarget(lambda t: 0.1 * t))) is None
+    assert (
+        flights(ImplicitSurface([0, 2], lambda r: r[:, 2] ** 3 + r[:, 2], lambda r: (3 * r**2 + 1) * [0, 0, 1.0]))
+        is None
+    )
     many = np.arange(6.0 * (MOST_ROWS + 1)).reshape(-1, 3)
     pairs = np.arange(2 * MOST_ROWS + 2).reshape(-1, 2)
     assert flights(Distance(pairs), x=many, m=np.ones(len(many))) is None
     assert flights(Distance(pairs[1:]), x=many, m=np.ones(len(many))) is not None
+    particles = np.arange(MOST_ROWS + 1)
+    assert flights(Sphere(particles, [0, 0, -9.0]), x=many, m=np.ones(len(many))) is None
+    assert flights(Sphere(particles[1:], [0, 0, -9.0]), x=many, m=np.ones(len(many))) is not None
 
 
 def test_a_new_cell_is_seen() -> None:
@@ -454,3 +479,131 @@ def test_reports_show_iterations() -> None:
     end = Rattle().step(system, state, 0.05)
     found = system.motion.report(end.positions, condition=False)
     assert all(3 <= kind.iterations <= MANY_ITERATIONS for kind in found.kinds)
+
+
+# -- rows of mixed kinds ----------------------------------------------------------------------------
+
+BUTANE = np.array([[0.0, 0, 0], [1.5, 0, 0], [2.0, 1.4, 0], [3.5, 1.4, 0.5]])
+BONDS = [[0, 1], [1, 2], [2, 3]]
+#: Name -> rows on a chain of four atoms and two atoms apart, fixed atoms among them, and further options.
+MIXED = {
+    "cylinder": ([Cylinder([4], [0.0, 0, 0], [0, 0, 1.0])], {}),
+    "two surfaces": ([Ellipsoid([4], [0, 0, 0], [1.0, 2, 3], target=None), Plane([5], [0, 0.6, 0.8])], {}),
+    "formula": ([Formula("x1**2 + y1**4 + z1**2", [4], target=None)], {}),
+    "angles": ([Distance(BONDS), Angle([[0, 1, 2], [1, 2, 3]])], {}),
+    "dihedral and a surface": ([Distance(BONDS), Dihedral([[0, 1, 2, 3]]), Sphere([4], [0.0, 0, 0])], {}),
+    "distances apart": ([Distance([*BONDS, [4, 5]]), Angle([[0, 1, 2]])], {}),
+    "rigid triangles, and more": ([Distance([[0, 1], [0, 2], [1, 2]]), Plane([5], [0, 0.6, 0.8])], {}),
+    "centres": ([CenterDistance([[0, 1], [2, 3]], [[4], [5]])], {}),
+    "fixed atoms": ([Distance(BONDS), Angle([[0, 1, 2]]), Sphere([4], [0.0, 0, 0]), FixedAtoms([0, 5])], {}),
+    "few among many": ([Distance([[4, 5]]), Sphere([4], [0.0, 0, 0])], {"ions": 30}),
+    "periodic": ([Distance([*BONDS, [4, 5]]), Angle([[0, 1, 2]])], {"cell": np.diag([9.0, 8.0, 7.0])}),
+    "far": ([Distance(BONDS), Angle([[0, 1, 2]])], {"at": 1e5, "force": lambda x, t: -0.1 * (x - x.mean(axis=0))}),
+    "no force": ([Distance(BONDS), Angle([[0, 1, 2]])], {"force": None}),
+}
+
+
+def mixed(name: str, *, force=springs, piecewise: bool = False) -> tuple[System, State]:
+    rows, given = MIXED[name]
+    options = dict(given)
+    ions, at, force = options.pop("ions", 0), options.pop("at", 0.0), options.pop("force", force)
+    rng = np.random.default_rng(7)
+    x = np.concatenate([BUTANE, [[0.3, 0.2, 4.0], [1.0, 1.0, 5.0]], rng.normal(size=(ions, 3))]) + at
+    m = np.concatenate([[12.0, 14.0, 1.0, 16.0, 2.0, 3.0], np.full(ions, 23.0)])
+    motion = Motion(ConstraintSet(rows, x, m, **options), x)
+    if "cell" in options:
+        x = x + rng.integers(-1, 2, size=x.shape) @ options["cell"]
+    system = System(motion, force)
+    assert system.flights is not None
+    if piecewise:
+        system.flights = None
+    return system, system.initial_state(x, 0.3 * rng.normal(size=x.shape), project=True)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS, ids=repr)
+@pytest.mark.parametrize("name", MIXED)
+def test_mixed_rows_are_those_made_piece_by_piece(stepper, name) -> None:
+    (system, state), (other, _) = mixed(name), mixed(name, piecewise=True)
+    calls = []
+    for call in ("project_positions", "project_velocities"):
+        setattr(system.motion, call, calls.append)
+    rounding = float(np.spacing(np.abs(state.positions).max()))
+    for dt in (0.02, -0.01, 0.015):
+        following, expected = stepper.step(system, state, dt), stepper.step(other, state, dt)
+        assert distance(following, expected) <= 2e-14 + 8 * rounding
+        assert distance(following, state) > 1e-4
+        assert (following.remainder is None) == (expected.remainder is None) == (name != "far")
+        state = following
+    assert not calls
+    del system.motion.project_positions, system.motion.project_velocities
+    one, two = (run(each, state, 0.01, 30, stepper=stepper) for each in (system, other))
+    assert distance(one, two) <= 1e-12 + 100 * rounding
+    assert one.step == two.step and one.time == two.time
+
+
+@pytest.mark.parametrize("name", ["two surfaces", "angles", "dihedral and a surface", "distances apart"])
+def test_mixed_steps_without_solution_are_the_engines(name) -> None:
+    """The same error, for the same row, after which a usual step is what it would have been."""
+    taken = failed = 0
+    for stepper in (Rattle(), Suzuki4(), BlanesMoan4()):
+        for dt in np.geomspace(0.5, 20.0, 12):
+            pair = [mixed(name, force=None, piecewise=p) for p in (False, True)]
+            outcomes = []
+            for system, state in pair:
+                before = state.positions.copy(), state.velocities.copy()
+                try:
+                    outcomes.append(stepper.step(system, state, float(dt)))
+                except KconsError as error:
+                    outcomes.append(error)
+                assert np.array_equal(state.positions, before[0]) and np.array_equal(state.velocities, before[1])
+            one, two = outcomes
+            if isinstance(two, State) and isinstance(one, State):
+                held = pair[0][0].motion.constraint_set
+                assert np.all(np.abs(held.value(one.positions)) <= held.tolerance(one.positions, 0.0))
+                taken += 1
+            else:
+                assert isinstance(one, KconsError) and isinstance(two, KconsError)
+                assert type(one) is type(two) and one.row == two.row and one.atoms == two.atoms and one.step == 1
+                failed += 1
+            (system, state), (other, _) = pair
+            assert distance(stepper.step(system, state, 0.02), stepper.step(other, state, 0.02)) <= 2e-14
+    assert taken >= 3 and failed >= 3
+
+
+def test_what_a_python_row_raises_comes_out_of_a_step() -> None:
+    broken = []
+
+    def function(r):
+        if broken:
+            raise ZeroDivisionError("of its own")
+        return float(r[0] @ r[0])
+
+    x = np.array([[1.0, 0.2, 0.1]])
+    system = System(Motion(ConstraintSet(Custom([[0]], function, lambda r: 2 * r), x, [1.0]), x), springs)
+    assert system.flights is not None
+    state = run(system, system.initial_state(x, [[0.0, 0.1, 0.0]], project=True), 0.01, 5)
+    kept = state.copied()
+    broken.append(True)
+    with pytest.raises(ZeroDivisionError, match="of its own"):
+        Rattle().step(system, state, 0.01)
+    assert distance(state, kept) == 0.0
+    broken.clear()
+    assert np.abs(system.motion.constraint_set.value(Rattle().step(system, state, 0.01).positions)).max() < 1e-13
+
+
+def test_copies_of_a_system_have_solvers_of_their_own() -> None:
+    """What kernels are called by is an address: that of the copy's rows, which live as long as the copy."""
+    system, state = mixed("dihedral and a surface")
+    end = run(system, state, 0.01, 3)
+    others = [copy.deepcopy(system), pickle.loads(pickle.dumps(system))]
+    del system
+    for other in others:
+        assert other.flights is not None
+        assert distance(run(other, state, 0.01, 3), end) == 0.0
+
+
+def test_two_systems_of_one_motion_do_not_share_rooms() -> None:
+    system, state = mixed("angles")
+    other = System(system.motion, springs)
+    assert not np.shares_memory(system.flights.tables()[0], other.flights.tables()[0])
+    assert distance(Rattle().step(system, state, 0.02), Rattle().step(other, state, 0.02)) == 0.0

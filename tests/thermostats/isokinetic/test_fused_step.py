@@ -115,7 +115,7 @@ def test_who_has_none() -> None:
     assert stages([bond], np.concatenate([pair, pair + 20.0, pair + 40.0])) is not None  # most atoms are free
     assert stages([bond], force=None) is None
     assert stages([Distance([[0, 1]], MovingTarget(lambda t: 1 + 0.1 * t, lambda t: 0.1, lambda t: 0.0))]) is None
-    assert stages([Angle([[0, 1, 2]])], np.array([[0.0, 0, 0], [1.0, 0, 0], [1.5, 1.0, 0]])) is None
+    assert stages([Angle([[0, 1, 2]])], np.array([[0.0, 0, 0], [1.0, 0, 0], [1.5, 1.0, 0]])) is not None
     many = np.arange(300.0).reshape(100, 3)
     assert stages([Distance(np.arange(100).reshape(-1, 2))], many) is not None
     assert stages([Distance(np.arange(200).reshape(-1, 2))], np.arange(600.0).reshape(200, 3)) is None  # too many rows
