@@ -256,6 +256,10 @@ class _Surface:
     def relaxed(self, attempt: Attempt, source: Attempt | None, fmax: float, evaluations: int) -> None:
         """Fill an attempt that starts from the structure of another, or from the first one."""
         before = self.start if source is None else source.positions
+        reset = getattr(self.atoms.calc, "reset", None)
+        if reset is not None:
+            # What a calculator remembers, such as a density, would make the bits depend on what was done before.
+            reset()
         constraints = [*self.held, *self.grid.held_at(attempt.point)]
         motion = self._engine(Constraints(constraints))
         try:

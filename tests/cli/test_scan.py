@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from ase.build import molecule
 
 from kcons.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -57,6 +65,26 @@ def test_points_that_fail_are_told_by_the_exit_status(run, capsys):
     held = ("--hold-distance", 0, 2, "--hold-distance", 1, 3)
     assert run("peroxide.xyz", *words, *held, *EMT) == 3
     assert "failed: Distance(2, 3) = 3.5: InfeasibleError" in capsys.readouterr().out
+
+
+def test_a_scan_outlives_being_killed(run, tmp_path):
+    """No relaxation that was done is lost, and the end is the same to the last bit."""
+    words = ["peroxide.xyz", "--dihedral", "2", "0", "1", "3", "--steps", "8", *EMT]
+    command = [sys.executable, "-m", "kcons", "scan", *words, "--out", "cut"]
+    process = subprocess.Popen(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while not (tmp_path / "cut" / "relaxations" / "00003.npz").exists():
+        assert process.poll() is None, "it ended before it could be killed"
+        time.sleep(0.002)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    done = {path: path.read_bytes() for path in (tmp_path / "cut" / "relaxations").glob("*.npz")}
+    assert run(*words, "--out", "cut") == 0 and run(*words, "--out", "whole") == 0
+    assert all(path.read_bytes() == content for path, content in done.items())
+    assert len(list((tmp_path / "cut" / "relaxations").glob("*.npz"))) > len(done)
+    for name in ("scan.json", "scan.extxyz"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_system_of_openmm(run, tmp_path, capsys):

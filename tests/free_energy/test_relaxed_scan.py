@@ -40,7 +40,7 @@ def test_a_torsion_has_its_profile():
         phi = TURN.measure(attempt.positions[None, :4], 0.0)[0] - RING[point]
         assert abs(phi - 2 * np.pi * np.round(phi / (2 * np.pi))) < 1e-13
         assert attempt.largest <= 1e-3
-    assert found.evaluations - 1 <= atoms.calc.calls <= found.evaluations  # ASE remembers the last place
+    assert found.evaluations == atoms.calc.calls
     there = found.structure((3,))
     assert there.info["dihedral_0_1_2_3"] == pytest.approx(-90) and there.info["energy"] == found.energies[3]
 
@@ -160,7 +160,7 @@ def test_a_scan_goes_on_where_it_stopped(tmp_path):
     atoms = built()
     found = scan(atoms, TURN, values, folder=tmp_path / "cut")
     calls += atoms.calc.calls
-    assert whole.evaluations - 3 <= calls <= whole.evaluations == found.evaluations
+    assert whole.evaluations == found.evaluations == calls
     assert np.array_equal(found.energies, whole.energies)
     for point, attempt in whole.best.items():
         assert np.array_equal(found.best[point].positions, attempt.positions)
