@@ -75,6 +75,7 @@ def fused_steps(
             else:
                 found = many(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
             if found == UNENDED:
+                flights.refuse()
                 return _at(before, start, made - 1), made - 1
             here = x, v, time, left_over
             if found < 0:
