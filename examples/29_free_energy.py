@@ -130,7 +130,7 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
     from multiprocessing import get_context
 
     from openmm import app
-    from pymbar import FES
+    from pymbar import FES, timeseries
 
     from kcons.free_energy import OpenMMWindows, Windows
 
@@ -151,6 +151,11 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         series = list(pool.map(umbrella, places, range(windows), [each] * windows, [str(folder)] * windows))
     kT = 0.00831446261815324 * TEMPERATURE
+    # MBAR's errors are those of independent samples.
+    series = [
+        each[:: int(np.ceil(timeseries.statistical_inefficiency((each - place + np.pi) % (2 * np.pi))))]
+        for each, place in zip(series, places, strict=True)
+    ]
     phi = np.concatenate(series)
     away = (phi[None] - places[:, None] + np.pi) % (2 * np.pi) - np.pi
     fes = FES(STIFFNESS / 2 * away**2 / kT, [len(s) for s in series])
@@ -158,7 +163,7 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
     fes.generate_fes(
         np.zeros(len(phi)), phi, fes_type="histogram", histogram_parameters={"bin_edges": [bins]}, n_bootstraps=0
     )
-    centres = (bins[1:] + bins[:-1]) / 2
+    centres = ((bins[1:] + bins[:-1]) / 2)[np.histogram(phi, bins)[0] > 0]
     known = fes.get_fes(centres, reference_point="from-lowest", uncertainty_method="analytical")
     at = int(np.argmin(known["f_i"]))
     ours = np.interp(centres, profile.x, profile.F)
