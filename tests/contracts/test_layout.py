@@ -117,7 +117,6 @@ LARGER = {
     "solvers/small_clusters.py: lines of _kernel": 140,
     "solvers/small_clusters.py: lines of _kernel.project": 132,
     "solvers/sparse/elimination.py: lines of _minimum_degree": 110,
-    "steppers/executors/fused.py: lines of fused_steps": 122,
 }
 
 

@@ -13,14 +13,14 @@ with positive coefficients. A periodic coordinate is a circle, on which the dist
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve, cholesky
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from kcons.constraints.arguments import FloatArray
 from kcons.thermostats import Estimate
@@ -31,6 +31,9 @@ _ROUNDING = 1e-10
 _WIDE, _LOCAL = 1.5, 0.5
 #: Prior standard deviation of a constant gradient, in units of the largest gradient seen.
 _TREND = 10.0
+#: Step of differences of logarithms of hyperparameters, least curvature of the likelihood that is believed, and the
+#: logarithm of the largest weight of a place against that of a normal distribution.
+_STEP, _FLATTEST, _HEAVIEST = 0.05, 0.5, 2.0
 #: Lengths from which the search for the most likely ones starts, as parts of the range.
 _STARTS = (0.3, 0.1)
 
@@ -209,10 +212,50 @@ def _parts(
     return [[value, -along * dw], [along * du[:, None], -twice * du[:, None] * dw]]
 
 
+class Learned:
+    """Processes with the hyperparameters that are likely, each with its weight.
+
+    The most likely ones alone would be too sure of what they do not know. So means and covariances are averaged over
+    two points for each eigenvector of the curvature of the likelihood (a cubature of third order: Arasaratnam and
+    Haykin, IEEE Trans. Automat. Contr. 54, 1254 (2009)), with the weights that their own likelihoods give them.
+
+    Parameters
+    ----------
+    best : GradientProcess
+        Of the most likely hyperparameters.
+    others : sequence of GradientProcess
+    weights : ndarray, shape (len(others),)
+        Their sum is 1.
+    """
+
+    def __init__(self, best: GradientProcess, others: Sequence[GradientProcess], weights: FloatArray) -> None:
+        self.best, self.others, self.weights = best, others, weights
+
+    def closed(self) -> Learned:
+        """The same without constant slopes."""
+
+        def without(process: GradientProcess) -> GradientProcess:
+            seen = (process.points, process.gradients, process.covariances)
+            return GradientProcess(*seen, process.axes, process.parameters, [False] * len(process.axes))
+
+        return Learned(without(self.best), [without(each) for each in self.others], self.weights)
+
+    def mean(self, x: FloatArray, components: Sequence[int]) -> FloatArray:
+        """Of `posterior` alone, shape (components, n)."""
+        return np.asarray(np.tensordot(self.weights, [each.mean(x, components) for each in self.others], axes=1))
+
+    def posterior(self, *asked: tuple[FloatArray, Sequence[int]]) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance as `GradientProcess.posterior` has them, and what the means differ by."""
+        means, covariances = zip(*(each.posterior(*asked) for each in self.others), strict=True)
+        mean = self.weights @ np.array(means)
+        away = np.array(means) - mean
+        return mean, np.asarray(np.tensordot(self.weights, covariances, axes=1) + (away.T * self.weights) @ away)
+
+
 def learn(
     x: FloatArray, gradients: FloatArray, covariances: FloatArray, axes: Sequence[Axis], trends: Sequence[bool]
-) -> GradientProcess:
-    """The process whose hyperparameters are most likely, in view of the gradients and of broad priors."""
+) -> Learned:
+    """Processes whose hyperparameters are likely, in view of the gradients and of broad priors."""
     counts = [axis.coefficients for axis in axes]
     points = Points(x, axes)
 
@@ -231,7 +274,35 @@ def learn(
 
     # Steps of differences that are well above the rounding of the likelihood.
     options = {"ftol": 1e-6, "maxiter": 100, "eps": 1e-4}
-    starts = [np.concatenate([[0.0], np.full(sum(counts), -math.log(part))]) for part in _STARTS]
-    bounds = [(-7.0, 7.0)] * (1 + sum(counts))
-    found = [minimize(unlikely, start, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
-    return process(min(found, key=lambda result: float(result.fun)).x)
+
+    def search(function: Callable[[FloatArray], float], start: FloatArray) -> OptimizeResult:
+        return minimize(function, start, method="L-BFGS-B", bounds=[(-7.0, 7.0)] * len(start), options=options)
+
+    # The same length everywhere along a coordinate first, from two starts; then lengths that differ.
+    spread = np.repeat(np.eye(1 + len(axes)), [1, *counts], axis=0)
+    starts = [np.array([0.0, *(-math.log(part) for _ in axes)]) for part in _STARTS]
+    found = min(
+        (search(lambda q: unlikely(spread @ q), start) for start in starts), key=lambda result: float(result.fun)
+    )
+    best = spread @ found.x if len(spread) == len(axes) + 1 else np.asarray(search(unlikely, spread @ found.x).x)
+    sizes, directions = np.linalg.eigh(_curvature(unlikely, best))
+    away = directions * np.sqrt(len(best) / np.maximum(sizes, _FLATTEST))
+    chosen = np.clip(np.concatenate([best + away.T, best - away.T]), -7.0, 7.0)
+    # The density of each over that of the normal distribution which the points stand for.
+    logarithms = unlikely(best) - np.array([unlikely(p) for p in chosen]) + 0.5 * len(best)
+    weights = np.exp(np.clip(logarithms, -50.0, _HEAVIEST))
+    kept = weights > 1e-3 * weights.max()
+    if not (logarithms[kept] > -50.0).all():  # nothing near is possible
+        chosen, weights, kept = best[None], np.ones(1), np.ones(1, dtype=bool)
+    return Learned(process(best), [process(p) for p in chosen[kept]], weights[kept] / weights[kept].sum())
+
+
+def _curvature(function: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
+    """Second derivatives by differences."""
+    n, steps = len(at), _STEP * np.eye(len(at))
+    found = np.empty((n, n))
+    for i, j in zip(*np.tril_indices(n), strict=True):
+        a, b = steps[i], steps[j]
+        corners = function(at + a + b) - function(at + a - b) - function(at - a + b) + function(at - a - b)
+        found[i, j] = found[j, i] = corners / (4 * _STEP**2)
+    return found

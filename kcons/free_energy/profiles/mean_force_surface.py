@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, difference, learn
 from kcons.thermostats import Estimate
 
 #: Sizes of the field that is no gradient, relative to the gradient, among which the most likely one is looked for.
@@ -78,7 +78,7 @@ class Surface:
     periods: tuple[float | None, ...]
     zero: FloatArray
     consistency: Consistency
-    _process: GradientProcess
+    _process: Learned
 
     def free_energy(self, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """F and its standard error, both against `zero`, at places of shape (m, d).
@@ -185,7 +185,7 @@ def fit_surface(
     )
     axes = [Axis(float(a), float(b - a), p is not None) for a, b, p in zip(low, high, turns, strict=True)]
     process = learn(places, forces, covariances, axes, [p is None for p in turns])
-    consistency = _consistency(process)
+    consistency = _consistency(process.best)
     if consistency.p_value < _CHANCE:
         warnings.warn(
             f"the mean forces are no gradient: a field beside it of {consistency.rotation:.0%} of its size is more "
@@ -206,7 +206,7 @@ def fit_surface(
 
 
 def _descended(
-    process: GradientProcess, start: FloatArray, low: FloatArray, high: FloatArray, periods: Sequence[float | None]
+    process: Learned, start: FloatArray, low: FloatArray, high: FloatArray, periods: Sequence[float | None]
 ) -> FloatArray:
     """Where the free energy is lowest near `start`, in the range."""
     size = high - low

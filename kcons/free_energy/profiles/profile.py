@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, numbers
 from kcons.errors import InputError
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, difference, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, Learned, difference, learn
 from kcons.thermostats import Estimate
 
 Method = Literal["gp", "spline"]
@@ -32,7 +32,7 @@ Method = Literal["gp", "spline"]
 #: Points of a profile unless they are given, and points at which a window may be proposed.
 _POINTS = 201
 #: Windows from which on lengths are learned that differ from place to place, and coefficients of those.
-_MANY, _COEFFICIENTS = 7, 4
+_MANY, _COEFFICIENTS = 7, 6
 #: Standard errors by which a closed profile may miss its beginning before that is warned of.
 _CLOSES = 4.0
 
@@ -52,8 +52,8 @@ class _Windows:
         return float(self.x[-1] if self.period is None else self.x[0] + self.period)
 
     @cached_property
-    def open_process(self) -> GradientProcess:
-        """A Gaussian process that need not close."""
+    def learned(self) -> Learned:
+        """Gaussian processes that need not close."""
         axis = Axis(
             float(self.x[0]),
             self.end - float(self.x[0]),
@@ -62,11 +62,12 @@ class _Windows:
         )
         return learn(self.x[:, None], self.f[:, None], self.e[:, None, None] ** 2, [axis], [True])
 
-    def process(self, closed: bool) -> GradientProcess:
-        free = self.open_process
-        if not closed:
-            return free
-        return GradientProcess(free.points, free.gradients, free.covariances, free.axes, free.parameters, [False])
+    @cached_property
+    def learned_closed(self) -> Learned:
+        return self.learned.closed()
+
+    def process(self, closed: bool) -> Learned:
+        return self.learned_closed if closed else self.learned
 
     def spline(self, at: FloatArray, closed: bool) -> tuple[FloatArray, FloatArray]:
         """Integrals from the first window, and their covariance."""

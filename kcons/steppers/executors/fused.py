@@ -38,10 +38,8 @@ def fused_steps(
 
     Raises
     ------
-    ConvergenceError, NonFiniteError
-        With `step`.
-    InputError
-        As of the force function.
+    ConvergenceError, NonFiniteError, InputError
+        With `step`; the last as of the force function.
     """
     # A step of few atoms takes a microsecond in the kernel: each line here can be seen in the time of a run.
     force, number, stage = system.force, start.step, drifts[0]
@@ -55,10 +53,9 @@ def fused_steps(
     first, last, fractions = kicks[0] * dt, kicks[-1] * dt, stage.lengths
     later, work = None, NO_WORK
     if len(drifts) * len(stage.flights) > 1:
-        later = list(zip(kicks[1:], drifts, drifts[1:], strict=False))
-        work = np.empty((3, *shape))
+        later, work = list(zip(kicks[1:], drifts, drifts[1:], strict=False)), np.empty((3, *shape))
     time, left_over, what, found, made = start.time, start.time_remainder, FLY, 0, 0
-    new, array, double, landed = np.empty, np.ndarray, _FLOAT, flights.landed
+    new, array, double, landed, out = np.empty, np.ndarray, _FLOAT, flights.landed, x
     # Where this step begins and where the last one did. Nobody else knows their velocities, so that the arrays are
     # used again.
     here = before = x, v, time, left_over
@@ -68,11 +65,9 @@ def fused_steps(
     tables, (given, held) = flights.tables(), system.motion.sources
     cell = held.lattice
     one = many = flights.one if later is None else flights.many
-    out = x
     try:
         for made in range(steps):
-            if held.lattice is not cell or given.lattice is not cell:
-                # The force function is a barostat, too.
+            if held.lattice is not cell or given.lattice is not cell:  # the force function is a barostat, too
                 tables, cell = flights.tables(), held.lattice
             out = new(shape)
             if later is None:
@@ -86,31 +81,20 @@ def fused_steps(
                 # The engine's kernels are compiled for arrays that can be written to.
                 found = landed(found, fractions, dt, x.copy(), u, work, f, out, time, number + made + 1, tables)
             if later is not None:
-                for kick, passed, stage in later:
-                    if force is not None:
-                        out.setflags(False)  # type: ignore[call-arg]
-                        now = time + (passed.ends[-1] * dt + left_over)
-                        f = system.accepted(force(out if shift is None else out + shift, now), number + made + 1, False)
-                    x, out = out, new(shape)
-                    found = many(FLY, stage.lengths, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
-                    if found < 0:
-                        lengths, now = stage.lengths, time + (stage.ends[-1] * dt + left_over)
-                        found = landed(found, lengths, dt, x.copy(), u, work, f, out, now, number + made + 1, tables)
+                begun = number + made + 1, time, left_over
+                x, out, f, found = _further(system, flights, later, dt, begun, x, u, f, out, work, shift, tables)
             # As State.later.
             change = dt + left_over
             then = time + change
             part = then - time
-            left_over = (time - (then - part)) + (change - part)
-            time = then
+            time, left_over = then, (time - (then - part)) + (change - part)
             if force is not None:
                 # The function can neither write to it nor will anybody else: it may keep what it sees.
                 out.setflags(False)  # type: ignore[call-arg]
                 raw: Any = force(out if shift is None else out + shift, time)
                 # What System.accepted finds most often.
-                if type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray:
-                    f = raw
-                else:
-                    f = system.accepted(raw, number + made + 1, False)
+                usual = type(raw) is array and raw.dtype is double and raw.shape == shape and raw.flags.carray
+                f = raw if usual else system.accepted(raw, number + made + 1, False)
             x, v, u, spare, next_spare, before, what = out, u, spare, next_spare, u, here, BOTH
         if force is not None:
             x = x.copy()  # other kernels are compiled for arrays that can be written to
@@ -130,16 +114,51 @@ def fused_steps(
     if found != flights.took:
         flights.took = found
         flights.motion.took(found)
-    remainder = None
-    if shift is not None:
-        out = x + shift
-        remainder = x - (out - shift)
-        x = out
-    elif far:  # by now: from here on relative to one atom
-        remainder = work[0].copy() if len(work) else np.zeros(shape)
+    x, remainder = _relative(x, shift, work) if shift is not None or far else (x, None)
     forces = start.forces if force is None else f.copy()
     state = system.last = State(x, v, time, forces, number + steps, remainder, left_over)
     return state, steps
+
+
+def _further(
+    system: System,
+    flights: Flights,
+    later: Sequence[tuple[float, Fly, Fly]],
+    dt: float,
+    begun: tuple[int, float, float],
+    x: FloatArray,
+    *arrays: Any,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """The kicks and drifts of a step after its first drift: where the last begins and ends, forces, what happened.
+
+    Parameters
+    ----------
+    later : sequence of (kick, drift before it, drift after it)
+    begun : tuple of (number of the step, time, its remainder)
+        Of its beginning.
+    x, *arrays
+        As in `fused_steps`: x, u, f, out, work, shift, tables.
+    """
+    (number, time, left_over), (u, f, out, work, shift, tables), found = begun, arrays, 0
+    for kick, passed, stage in later:
+        if system.force is not None:
+            out.setflags(False)
+            now = time + (passed.ends[-1] * dt + left_over)
+            f = system.accepted(system.force(out if shift is None else out + shift, now), number, False)
+        x, out = out, np.empty(x.shape)
+        found = flights.many(FLY, stage.lengths, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
+        if found < 0:
+            now = time + (stage.ends[-1] * dt + left_over)
+            found = flights.landed(found, stage.lengths, dt, x.copy(), u, work, f, out, now, number, tables)
+    return x, out, f, found
+
+
+def _relative(x: FloatArray, shift: FloatArray | None, work: Any) -> tuple[FloatArray, FloatArray]:
+    """Positions relative to one atom, as positions and what rounding takes from them."""
+    if shift is None:  # by now: from here on
+        return x, work[0].copy() if len(work) else np.zeros(x.shape)
+    out = x + shift
+    return out, x - (out - shift)
 
 
 def _at(begin: tuple[FloatArray, FloatArray, float, float], start: State, made: int) -> State:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad_vec
 
-from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Points, learn
+from kcons.free_energy.profiles.gaussian_process import Axis, GradientProcess, Learned, Points, learn
 
 AXES = {
     "line": Axis(-1.0, 3.0, False),
@@ -111,10 +111,39 @@ def test_lengths_are_learned():
     x = np.linspace(0.0, 4.0, 25)[:, None]
     slopes = 8 * np.cos(8 * x) * np.exp(-((x / 1.0) ** 4)) + 0.1 * np.cos(x)
     errors = np.full((25, 1, 1), 1e-4)
-    one, many = (learn(x, slopes, errors, [Axis(0.0, 4.0, False, k)], [True]) for k in (1, 8))
+    one, many = (learn(x, slopes, errors, [Axis(0.0, 4.0, False, k)], [True]).best for k in (1, 8))
     assert many.log_likelihood() > one.log_likelihood() + 10
     u = many.axes[0].design(np.array([0.5, 3.5]))[1] @ np.exp(many.parameters[1:])
     assert u[0] > 4 * u[1]
-    again = learn(x * 10, slopes / 10, errors / 100, [Axis(0.0, 40.0, False, 1)], [True])
+    again = learn(x * 10, slopes / 10, errors / 100, [Axis(0.0, 40.0, False, 1)], [True]).best
     assert again.parameters == pytest.approx(one.parameters, abs=0.02)  # no unit is preferred
     assert math.isfinite(one.log_likelihood())
+
+
+def test_an_average_over_processes_has_the_moments_of_a_mixture():
+    """Against samples that are drawn from one process or the other."""
+    axes = [AXES["line"]]
+    one, other = (process(axes, seed=5, n=4, rough=rough) for rough in (True, False))
+    mixed = Learned(one, [one, other], np.array([0.3, 0.7]))
+    x = np.array([[-0.5], [0.7], [1.9]])
+    mean, covariance = mixed.posterior((x, [-1]), (x[:1], [0]))
+    rng = np.random.default_rng(6)
+    drawn = [
+        rng.multivariate_normal(*each.posterior((x, [-1]), (x[:1], [0])), size=count, method="eigh")
+        for each, count in ((one, 60000), (other, 140000))
+    ]
+    samples = np.concatenate(drawn)
+    spread = np.sqrt(np.diag(covariance))
+    assert np.abs((samples.mean(axis=0) - mean) / spread).max() < 0.015  # 6/sqrt(200,000)
+    assert np.abs((np.cov(samples.T) - covariance) / np.outer(spread, spread)).max() < 0.02
+    assert mixed.mean(x, [-1])[0] == pytest.approx(mean[:3], rel=1e-12)
+    assert mixed.closed().weights is mixed.weights
+
+
+def test_what_is_learned_is_surer_than_nothing_and_less_sure_than_the_most_likely():
+    x = np.linspace(0.0, 3.0, 6)[:, None]
+    found = learn(x, np.sin(2 * x), np.full((6, 1, 1), 1e-3), [Axis(0.0, 3.0, False)], [True])
+    at = (np.array([[0.3], [2.6]]), [0])
+    assert found.weights.sum() == pytest.approx(1.0) and (found.weights > 0).all()
+    sure, careful = (np.diag(each.posterior(at)[1]) for each in (found.best, found))
+    assert (careful > sure).all() and (careful < 4 * sure + 0.2).all()

@@ -76,10 +76,10 @@ def test_errors_of_splines_are_as_large_as_they_say(name, n, error):
     ("name", "n", "error"), [("Lennard-Jones", 20, 0.3), ("double well", 9, 0.4), ("torsion", 14, 1.0)]
 )
 def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
-    """Few windows: what lies between them counts as well. 40 differences; their mean square has a standard deviation
-    of 0.22 if they are independent."""
+    """Few windows: what lies between them counts as well. 30 differences; their mean square has a standard deviation
+    of 0.26 if they are independent."""
     case = CASES[name]
-    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(8)])
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(6)])
     assert 0.4 < (away**2).mean() < 1.6
     assert (np.abs(away) < 1.96).mean() >= 0.85
 
@@ -219,10 +219,10 @@ def uniform(name, n, error, method="spline"):
     return math.sqrt(np.mean(np.square(found)))
 
 
-def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side():
+@pytest.mark.parametrize(("name", "to", "error"), [("Lennard-Jones", 10, 0.009), ("Morse", 11, 0.09)])
+def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side(name, to, error):
     """Each window is sampled equally long. Splines are the better method for equal distances here."""
-    error = 0.009
-    assert adapted("Lennard-Jones", 7, 11, error)[11] < uniform("Lennard-Jones", 22, error)
+    assert adapted(name, 7, to, error)[to] < uniform(name, 2 * to, error)
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():
