@@ -28,7 +28,7 @@ FEWEST, FEW_INDEPENDENT = 16, 10
 _ORIGINS = 50
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mean:
     """Means of d quantities.
 

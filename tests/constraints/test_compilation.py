@@ -125,6 +125,12 @@ for module in [module for name, module in sys.modules.items() if name.startswith
     assert set(counts.values()) <= {"0", "1"}
 
 
+@pytest.mark.parametrize("before", ["", "gc.disable(); "], ids=["on", "off"])
+def test_the_import_leaves_the_collector_of_garbage_as_it_was(before):
+    code = f"import gc; {before}import kcons; print(gc.isenabled())"
+    assert ended(started(code))[0] == str(not before)
+
+
 # -- the announcement -------------------------------------------------------------------------------
 
 

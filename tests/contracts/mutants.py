@@ -797,4 +797,71 @@ MUTANTS = [
         "same = True",
         "tests/free_energy/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
+    # -- free energies from mean forces and works --
+    (
+        "free_energy/averages.py",
+        "(n * (n - 1)) * np.outer(widening, widening)",
+        "(n * (n - 1))",
+        "tests/free_energy/test_averages.py::test_intervals_cover_as_often_as_they_say",
+    ),
+    (
+        "free_energy/averages.py",
+        "return factors[:, None] * (series",
+        "return 1.0 * (series",
+        "tests/free_energy/test_averages.py::test_weights_that_belong_to_the_values",
+    ),
+    (
+        "free_energy/profiles/gaussian_process.py",
+        "bend * first**2 + slope * second",
+        "bend * first**2 - slope * second",
+        "tests/free_energy/profiles/test_gaussian_process.py::test_covariances_of_gradients_are_derivatives_of_those_of_the_free_energy",
+    ),
+    (
+        "free_energy/profiles/gaussian_process.py",
+        "square = (2 * radius * np.sin(away / (2 * radius))) ** 2",
+        "square = away**2",
+        "tests/free_energy/profiles/test_gaussian_process.py::test_a_period_further_nothing_is_different",
+    ),
+    (
+        "free_energy/profiles/gaussian_process.py",
+        "axes=1) + (away.T * self.weights) @ away)",
+        "axes=1))",
+        "tests/free_energy/profiles/test_gaussian_process.py::test_an_average_over_processes_has_the_moments_of_a_mixture",
+    ),
+    (
+        "free_energy/profiles/profile.py",
+        "F=self.F + shift[:-1] - shift[-1]",
+        "F=self.F - shift[:-1] + shift[-1]",
+        "tests/free_energy/profiles/test_profile.py::test_jacobians",
+    ),
+    (
+        "free_energy/profiles/profile.py",
+        "rule = rule @ (np.eye(len(gain)) - np.outer(gain, whole))",
+        "pass",
+        "tests/free_energy/profiles/test_profile.py::test_a_period_closes",
+    ),
+    (
+        "free_energy/profiles/mean_force_surface.py",
+        "consistency.p_value < _CHANCE",
+        "consistency.p_value < 0.0",
+        "tests/free_energy/profiles/test_mean_force_surface.py::test_vectors_that_are_no_gradient_are_warned_of",
+    ),
+    (
+        "free_energy/profiles/pulls.py",
+        "(1 / _effective(works) - 1 / len(works))",
+        "(1 / _effective(works))",
+        "tests/free_energy/profiles/test_pulls.py::test_bias_of_the_exponential_average",
+    ),
+    (
+        "free_energy/profiles/pulls.py",
+        "_times(jarzynski_back, -kT)",
+        "_times(jarzynski_back, kT)",
+        "tests/free_energy/profiles/test_pulls.py::test_directions_are_alike",
+    ),
+    (
+        "free_energy/profiles/pulls.py",
+        "other**2 / w + np.log(v / w)",
+        "other**2 / w",
+        "tests/free_energy/profiles/test_pulls.py::test_distributions_of_different_width_cross_between_their_means",
+    ),
 ]

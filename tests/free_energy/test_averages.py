@@ -41,7 +41,7 @@ def test_intervals_cover_as_often_as_they_say(memory):
 
 def test_weights_that_belong_to_the_values():
     """x normal with weight exp(b x) has the mean b. The weights have the memory of x."""
-    rng, b = np.random.default_rng(2), 0.6
+    rng, b = np.random.default_rng(2), 1.0
     found = []
     for _ in range(300):
         x = ar1(rng, 3000, 0.6)

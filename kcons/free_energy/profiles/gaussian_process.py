@@ -136,10 +136,12 @@ class GradientProcess:
         self._rotation = rotation
         logarithms = np.split(parameters[1:], np.cumsum([axis.coefficients for axis in axes])[:-1])
         self._factors = [np.exp(each) for each in logarithms]
-        size = max(float(np.sqrt(np.mean(g**2))) * axis.length for g, axis in zip(gradients.T, axes, strict=True))
+        # Gradients that vanish within their errors may be as large as these.
+        squares = gradients**2 + np.diagonal(covariances, axis1=1, axis2=2)
+        size = max(float(np.sqrt(g.mean())) * axis.length for g, axis in zip(squares.T, axes, strict=True)) or 1.0
         level = float(np.mean([each.mean() for each in logarithms]))
         self._variance = (size * math.exp(parameters[0] - level)) ** 2
-        steepest = float(np.abs(gradients).max())
+        steepest = math.sqrt(float(squares.max())) or 1.0
         self._slopes = [_TREND * steepest if free else 0.0 for free in trends]
         n, d = gradients.shape
         self._seen: Asked = (points, range(d))

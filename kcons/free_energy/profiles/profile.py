@@ -37,7 +37,7 @@ _MANY, _COEFFICIENTS = 7, 6
 _CLOSES = 4.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Windows:
     """Mean forces in the order of their places; integrals by both methods."""
 
@@ -91,7 +91,7 @@ class _Windows:
         return self.process(closed).posterior((at[:, None], [-1]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Profile:
     """A free energy along one coordinate.
 

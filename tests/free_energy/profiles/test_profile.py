@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from functools import cache
 from typing import NamedTuple
 
@@ -93,6 +94,23 @@ def test_splines_are_of_fourth_order(name):
         errors.append(np.abs(profile.F - (case.F(profile.x) - case.F(profile.zero))).max())
     slopes = -np.diff(np.log(errors)) / np.diff(np.log(counts))
     assert slopes[-1] > 3.7, slopes
+
+
+def test_mean_forces_that_vanish_within_their_errors():
+    """The band is that of the errors: the profile may well be different from 0."""
+    x = np.linspace(0.0, 3.0, 12)
+    one, other = (integrate(x, np.zeros(12), np.full(12, 0.1), method=m, zero=0.0) for m in ("gp", "spline"))
+    assert np.abs(one.F).max() == 0.0
+    assert one.error[-1] == pytest.approx(other.error[-1], rel=0.15)
+    exact = integrate(x, np.zeros(12), np.zeros(12))
+    assert np.abs(exact.F).max() == 0.0 and exact.error.max() < 1e-2
+
+
+def test_profiles_go_through_pickle():
+    """As they do from one process to another."""
+    profile = made(CASES["torsion"], 12, 0.3, 1)
+    again = pickle.loads(pickle.dumps(profile))
+    assert (again.F == profile.F).all() and again.next_window() == profile.next_window()
 
 
 def test_both_methods_agree_where_there_are_many_windows():
