@@ -71,6 +71,10 @@ class CalledSolver(ABC):
     def numbers(self) -> FloatArray:
         return self._given.numbers
 
+    def refuse(self) -> None:
+        """Raise what a Python function among the rows has raised while a kernel ran."""
+        self._given.refuse()
+
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
         x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request

@@ -109,14 +109,12 @@ KERNELS = ("solvers/", "steppers/stages/fused_stages.py", "thermostats/isokineti
 LARGER = {
     "openmm/carried/carried_constraints.py: lines of CarriedConstraints": 385,
     "openmm/collective/collective_rows.py: lines of CollectiveRows": 383,
-    "openmm/ensembles/isokinetic_ensemble.py: lines of Isokinetic": 338,
     "openmm/integrator/guard.py: lines of Guard": 346,
     "openmm/integrator/projected.py: lines of ProjectedIntegrator": 443,
     "solvers/chains/sweeps.py: lines of _solve": 207,
     "solvers/rigid_triangles.py: lines of project_triangles": 163,
     "solvers/small_clusters.py: lines of _kernel": 140,
     "solvers/small_clusters.py: lines of _kernel.project": 132,
-    "solvers/sparse/elimination.py: lines of _minimum_degree": 110,
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 import openmm
@@ -42,6 +42,8 @@ ROUNDING = {"double": 1e-12, "mixed": 1e-7, "single": 1e-6}
 _CANCELS = 1e-4
 #: Boltzmann's constant times Avogadro's number, kJ/mol/K.
 GAS_CONSTANT = unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+#: Particles by number, or True and False for each; None for all.
+Atoms: TypeAlias = tuple[int, ...] | tuple[bool, ...] | None
 
 
 class Isokinetic(Value):
@@ -92,8 +94,7 @@ class Isokinetic(Value):
     temperature: float | None
     kinetic_energy: float | None
     convention: Literal["exact", "notes"]
-    #: Numbers, or True and False for each particle.
-    atoms: tuple[int, ...] | tuple[bool, ...] | None
+    atoms: Atoms
     momentum: Momentum
 
     def __init__(
@@ -231,7 +232,7 @@ class Isokinetic(Value):
                 f"the isokinetic thermostat in OpenMM needs constant targets, but those of {moving[0]!r} move; use "
                 "Langevin, or kcons.ase.IsokineticDynamics"
             )
-        masses, v = self._masses(integrator, context), velocities_of(context)
+        masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
         if self.atoms is None and removes_centre_of_mass_motion(context.getSystem()):
             v = np.where(masses[:, None] > 0, v - masses @ v / masses.sum(), v)  # what the remover would do
         found = float(masses @ np.einsum("ij,ij->i", v, v))
@@ -242,7 +243,7 @@ class Isokinetic(Value):
                 item="velocities",
             )
         momenta = self._momenta(integrator, context)
-        twice = self._twice_kinetic(self._count(integrator, context, momenta), int(np.sum(masses > 0)), found)
+        twice = self._twice_kinetic(_count(self.atoms, integrator, context, momenta), int(np.sum(masses > 0)), found)
         warn_of_conserved_momenta(momenta, masses, v, turns=momenta.angular and self.temperature is not None)
         if self.atoms is not None:
             share = np.repeat((masses > 0).astype(float)[:, None], 3, axis=1)
@@ -261,50 +262,10 @@ class Isokinetic(Value):
                 "step, and lost digits; take a smaller time step"
             )
 
-    def _masses(self, integrator: Integrator, context: openmm.Context) -> np.ndarray:
-        """Of thermostatted particles; 0 for others."""
-        system = context.getSystem()
-        n = system.getNumParticles()
-        masses = np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(n)])
-        if self.atoms is None:
-            return masses
-        inside = np.zeros(n, dtype=bool)
-        inside[atom_numbers(np.asarray(self.atoms), n)] = True
-        if integrator.parts:
-            raise UnsupportedError(
-                "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
-                "thermostat all particles"
-            )
-        for k in range(system.getNumConstraints()):
-            i, j, _ = system.getConstraintParameters(k)
-            if inside[i] != inside[j]:
-                raise UnsupportedError(
-                    f"constraint {k} of the System couples the thermostatted particle {i if inside[i] else j} to "
-                    f"{j if inside[i] else i}, which is not; choose particles such that every constraint is wholly "
-                    "inside or outside"
-                )
-        return np.where(inside, masses, 0.0)
-
     def _momenta(self, integrator: Integrator, context: openmm.Context) -> Momenta:
         if self.atoms is not None:
             return NONE
         return conserved_momenta(integrator, context, self.momentum)
-
-    def _count(self, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:
-        """g: momenta that are thermostatted and independent."""
-        if self.atoms is None:
-            count = integrator.independent_momenta(context)
-        else:
-            masses = self._masses(integrator, context)
-            rows = SystemRows.of(context.getSystem())
-            inside = masses[rows.pairs].any(axis=1)
-            some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
-            count = 3 * int(np.sum(masses > 0)) - some.rank(positions_of(context))
-        count -= len(momenta.directions)
-        if count < 1:
-            raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
-        integrator._watch().thermal = count
-        return count
 
     def _twice_kinetic(self, count: int, n_moving: int, found: float) -> float:
         if self.kinetic_energy is not None:
@@ -327,7 +288,7 @@ class Isokinetic(Value):
         """g of an integrator: its momenta that are thermostatted and independent."""
         guard = integrator._watch()
         if guard.thermal is None:
-            return self._count(integrator, guard.context, self._momenta(integrator, guard.context))
+            return _count(self.atoms, integrator, guard.context, self._momenta(integrator, guard.context))
         return guard.thermal
 
     def warmth(self, integrator: Integrator) -> float:
@@ -347,14 +308,14 @@ class Isokinetic(Value):
     def follow(self, integrator: Integrator) -> None:
         """Kicks scale the velocities from the next step on."""
         if integrator.getGlobalVariableByName("two_k"):
-            masses = self._masses(integrator, integrator.context)
+            masses = _masses(self.atoms, integrator, integrator.context)
             twice = self._twice_kinetic(self.count(integrator), int(np.sum(masses > 0)), 0.0)
             integrator.program.write("two_k", twice)
 
     def friction(self, integrator: Integrator) -> float:
         """alpha = v.f/(2K) in 1/ps at the present state (notes, eq. 113)."""
         context = integrator.context
-        masses, v = self._masses(integrator, context), velocities_of(context)
+        masses, v = _masses(self.atoms, integrator, context), velocities_of(context)
         state = context.getState(forces=True, groups=integrator.getIntegrationForceGroups())
         f = np.asarray(state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer))
         inside = masses > 0
@@ -369,6 +330,48 @@ class Isokinetic(Value):
         state = integrator.context.getState(energy=True, groups=integrator.getIntegrationForceGroups())
         heat = integrator.getGlobalVariableByName("two_k") * integrator.getGlobalVariableByName("growth")
         return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole)) + heat
+
+
+def _masses(atoms: Atoms, integrator: Integrator, context: openmm.Context) -> np.ndarray:
+    """Of thermostatted particles; 0 for others."""
+    system = context.getSystem()
+    n = system.getNumParticles()
+    masses = np.array([system.getParticleMass(k).value_in_unit(unit.dalton) for k in range(n)])
+    if atoms is None:
+        return masses
+    inside = np.zeros(n, dtype=bool)
+    inside[atom_numbers(np.asarray(atoms), n)] = True
+    if integrator.parts:
+        raise UnsupportedError(
+            "a thermostat on some of the particles works with constraints of the System only; leave out parts=, or "
+            "thermostat all particles"
+        )
+    for k in range(system.getNumConstraints()):
+        i, j, _ = system.getConstraintParameters(k)
+        if inside[i] != inside[j]:
+            raise UnsupportedError(
+                f"constraint {k} of the System couples the thermostatted particle {i if inside[i] else j} to "
+                f"{j if inside[i] else i}, which is not; choose particles such that every constraint is wholly "
+                "inside or outside"
+            )
+    return np.where(inside, masses, 0.0)
+
+
+def _count(atoms: Atoms, integrator: Integrator, context: openmm.Context, momenta: Momenta) -> int:
+    """g: momenta that are thermostatted and independent."""
+    if atoms is None:
+        count = integrator.independent_momenta(context)
+    else:
+        masses = _masses(atoms, integrator, context)
+        rows = SystemRows.of(context.getSystem())
+        inside = masses[rows.pairs].any(axis=1)
+        some = replace(rows, pairs=rows.pairs[inside], lengths=rows.lengths[inside], settled=rows.settled[inside])
+        count = 3 * int(np.sum(masses > 0)) - some.rank(positions_of(context))
+    count -= len(momenta.directions)
+    if count < 1:
+        raise OverdeterminedError("no degree of freedom is left for the thermostat: hold fewer rows", rows=())
+    integrator._watch().thermal = count
+    return count
 
 
 def kelvins(temperature: unit.Quantity | float) -> float:

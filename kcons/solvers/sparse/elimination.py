@@ -110,19 +110,7 @@ def make_pattern(
 def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-untyped-def]
     """Minimum-degree elimination; returns the position of each row and its pattern when eliminated."""
     n = len(row_start) - 1
-    atom_start = np.zeros(n_atoms + 1, np.int64)
-    for a in row_atoms:
-        atom_start[a + 1] += 1
-    for a in range(n_atoms):
-        atom_start[a + 1] += atom_start[a]
-    fill = atom_start[:-1].copy()
-    atom_rows = np.empty(len(row_atoms), np.int32)
-    for k in range(n):
-        for p in range(row_start[k], row_start[k + 1]):
-            a = row_atoms[p]
-            atom_rows[fill[a]] = k
-            fill[a] += 1
-
+    atom_start, atom_rows = _rows_of_atoms(row_start, row_atoms, n_atoms)
     mark = np.full(n, -1, np.int32)
     begin = np.empty(n, np.int64)
     count = np.zeros(n, np.int32)
@@ -217,6 +205,24 @@ def _minimum_degree(row_start, row_atoms, n_atoms, late):  # type: ignore[no-unt
     struct_start[n] = struct_used
     # Patterns are stored by step; hand them back with their owners through `position`.
     return position, struct_start, struct[:struct_used].copy()
+
+
+@register_jitable
+def _rows_of_atoms(row_start, row_atoms, n_atoms):  # type: ignore[no-untyped-def]
+    """The rows in which each atom is, one atom after another, and where those of an atom begin."""
+    atom_start = np.zeros(n_atoms + 1, np.int64)
+    for a in row_atoms:
+        atom_start[a + 1] += 1
+    for a in range(n_atoms):
+        atom_start[a + 1] += atom_start[a]
+    fill = atom_start[:-1].copy()
+    atom_rows = np.empty(len(row_atoms), np.int32)
+    for k in range(len(row_start) - 1):
+        for p in range(row_start[k], row_start[k + 1]):
+            a = row_atoms[p]
+            atom_rows[fill[a]] = k
+            fill[a] += 1
+    return atom_start, atom_rows
 
 
 @register_jitable

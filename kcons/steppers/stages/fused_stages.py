@@ -92,6 +92,11 @@ class Tables:
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).of, self._made_of  # addresses are of no use elsewhere
 
+    def refuse(self) -> None:
+        """Raise what a Python function among the rows has raised, where a kernel reports that it could not go on."""
+        for solver in self._called:
+            solver.refuse()
+
     @classmethod
     def of(cls, *made_of: Any) -> Tables | None:
         """For all that is held, or None where that is not for compiled stages."""
@@ -227,6 +232,7 @@ class Flights(Tables):
         while found < 0:
             if found == _FORCE:
                 check_finite(force, "force", number)
+            self.refuse()
             at = _ENGINE - found
             ends, starts, push, h = out, x, v, dt
             if len(work):
@@ -278,6 +284,7 @@ class Flights(Tables):
             Forces, positions or velocities are not finite.
         """
         if found < 0:
+            self.refuse()
             self.motion.project_velocities(x, v, time=time, out=v)
             found = _after(x, v, tables[0])
         if _BAD_FORCE <= found <= _BAD_VELOCITY:

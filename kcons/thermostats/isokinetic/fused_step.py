@@ -99,6 +99,7 @@ class IsokineticStages(Tables):
         status, log_growth, iterations = kick_and_fly(x, u, f, square, twice, t, h, speed, place, *tables)
         if status == DONE:
             self.motion.took(iterations)
+        self.refuse()
         return status, place, speed, log_growth
 
     def after(
@@ -127,6 +128,7 @@ class IsokineticStages(Tables):
         """
         speed, pace = np.empty(self._shape), np.empty(self._shape)
         status, square, factor, log_growth = project_and_kick(x, u, f, twice, t, speed, pace, *tables)
+        self.refuse()
         return status, speed, pace, square, factor, log_growth
 
 

@@ -591,6 +591,32 @@ def test_what_a_python_row_raises_comes_out_of_a_step() -> None:
     assert np.abs(system.motion.constraint_set.value(Rattle().step(system, state, 0.01).positions)).max() < 1e-13
 
 
+@pytest.mark.parametrize("stepper", [Rattle(), BlanesMoan4()], ids=repr)
+@pytest.mark.parametrize("march", [False, True], ids=["steps", "march"])
+def test_what_a_python_row_raises_once_is_not_lost(stepper, march) -> None:
+    """An interrupt comes in any call, of positions or velocities, and the next one would go well."""
+    left = 0
+
+    def function(r):
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise KeyboardInterrupt
+        return float(r[0] @ r[0])
+
+    x = np.array([[1.0, 0.2, 0.1]])
+    system = System(Motion(ConstraintSet(Custom([[0]], function, lambda r: 2 * r), x, [1.0]), x), springs)
+    state = system.initial_state(x, [[0.0, 0.1, 0.0]], project=True)
+    for calls in range(1, 40, 3):
+        left, kept = calls, state.copied()
+        with pytest.raises(KeyboardInterrupt):
+            if march:
+                stepper.march(system, state, 0.01, 12)
+            else:
+                run(system, state, 0.01, 12, stepper=stepper)
+        assert distance(state, kept) == 0.0
+
+
 def test_copies_of_a_system_have_solvers_of_their_own() -> None:
     """What kernels are called by is an address: that of the copy's rows, which live as long as the copy."""
     system, state = mixed("dihedral and a surface")
