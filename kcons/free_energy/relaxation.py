@@ -9,7 +9,7 @@ import numpy as np
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
-from kcons.errors import ConvergenceError
+from kcons.errors import ConvergenceError, KconsError
 from kcons.free_energy.model_hessian import Internals
 from kcons.motion.motion import Motion
 
@@ -120,10 +120,11 @@ class Descent:
                 )
             step, expected = self._step(here, radius)
             try:
-                there = self.place(self._moved(here, step))
-            except ConvergenceError:  # too far for the rows
+                x = self._moved(here, step)
+            except KconsError:  # too far for the rows
                 radius /= 4
                 continue
+            there = self.place(x)
             move = self.internals.change(there.values, here.values)
             self._learn(np.stack([move, there.slopes - here.slopes]))
             gain = there.energy - here.energy
@@ -241,4 +242,10 @@ def relax(
     ----------
     J. M. Bofill, Int. J. Quantum Chem. 94, 324 (2003); E. D. Hermes et al., J. Chem. Theory Comput. 18, 6974 (2022).
     """
-    return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
+    try:
+        with np.errstate(all="ignore"):
+            return Descent(motion, evaluate, internals, memory).relaxed(x, fmax, evaluations)
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError(
+            "an angle became straight, or two atoms met, where internal coordinates are undefined; start elsewhere"
+        ) from error

@@ -87,3 +87,13 @@ def test_forces_that_are_no_gradient_are_told():
     assert raised.value.positions.shape == x.shape
     with pytest.raises(ConvergenceError, match="3 evaluations; allow more"):
         relax(motion, evaluate, Internals(atoms.numbers, x), x, fmax=1e-5, evaluations=3)
+
+
+def test_undefined_internal_coordinates_are_told():
+    """Two atoms in one place."""
+    atoms, motion, x = setting([Dihedral([[0, 1, 2, 3]], 1.0)])
+    internals = Internals(atoms.numbers, x)
+    met = x.copy()
+    met[4] = met[3]
+    with pytest.raises(ConvergenceError, match="two atoms met"):
+        relax(motion, lambda y: (0.0, np.ones_like(y)), internals, met, fmax=1e-3)

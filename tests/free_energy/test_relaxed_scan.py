@@ -47,11 +47,11 @@ def test_a_torsion_has_its_profile():
 
 def test_two_coordinates():
     atoms = chain(5, threefold)
-    grid = [np.radians(np.arange(-180, 180, 60)), np.radians([40.0, 60.0, 80.0])]
+    grid = [np.radians([-120.0, -60.0]), np.radians([40.0, 60.0, 80.0])]
     found = scan(atoms, [TURN, Dihedral([[1, 2, 3, 4]])], grid, fmax=2e-3)
     a, b = np.meshgrid(*grid, indexing="ij")
     np.testing.assert_allclose(found.energies, 0.4 + 0.2 * (np.cos(3 * a) + np.cos(3 * b)), atol=1e-6)
-    assert found.energies.shape == (6, 3) and found.failed == {}
+    assert found.energies.shape == (2, 3) and found.failed == {}
 
 
 def lowest(a):
@@ -139,14 +139,14 @@ class Stop(BaseException):
 
 def test_a_scan_goes_on_where_it_stopped(tmp_path):
     """Nothing that was done is done again, and the end is the same to the last bit."""
-    values = np.radians(np.arange(-165, 180, 30))
+    values = np.radians(np.arange(-165, 0, 30))
 
     def built():
         return chain(5, two_wells, turns=[np.radians(-150), 0.3])
 
     whole = scan(built(), TURN, values, folder=tmp_path / "whole")
     calls = 0
-    for last in (3, 9):
+    for last in (3, 7):
         atoms, lines = built(), []
 
         def stop(finished, points, said, lines=lines, last=last):

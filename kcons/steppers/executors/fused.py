@@ -59,9 +59,8 @@ def fused_steps(
     # Where this step begins and where the last one did. Nobody else knows their velocities, so that the arrays are
     # used again.
     here = before = x, v, time, left_over
-    u = spare = next_spare = new(shape)
-    if steps > 1:
-        spare, next_spare = new(shape), new(shape)
+    u = new(shape)
+    spare, next_spare = (new(shape), new(shape)) if steps > 1 else (u, u)
     tables, (given, held) = flights.tables(), system.motion.sources
     cell = held.lattice
     one = many = flights.one if later is None else flights.many

@@ -85,6 +85,25 @@ def test_errors_of_gaussian_processes_are_as_large_as_they_say(name, n, error):
     assert (np.abs(away) < 1.96).mean() >= 0.85
 
 
+@pytest.mark.validation
+@pytest.mark.parametrize(
+    ("name", "n", "error"),
+    [
+        ("Lennard-Jones", 20, 0.3),
+        ("Lennard-Jones", 40, 0.5),
+        ("double well", 9, 0.4),
+        ("torsion", 14, 1.0),
+        ("Morse", 12, 0.5),
+    ],
+)
+def test_bands_over_many_sets_of_noise(name, n, error):
+    """What docs/free_energy.md says of them."""
+    case = CASES[name]
+    away = np.array([off(made(case, n, error, seed, zero=case.grid(n)[3]), case) for seed in range(25)])
+    assert 0.95 < math.sqrt((away**2).mean()) < 1.21
+    assert 0.89 < (np.abs(away) < 1.96).mean() < 0.98
+
+
 @pytest.mark.parametrize("name", ["Lennard-Jones", "torsion"])
 def test_splines_are_of_fourth_order(name):
     case, errors = CASES[name], []
@@ -213,10 +232,10 @@ def rms(profile, case):
 
 
 @cache
-def adapted(name, start, to, error):
-    """Windows proposed one by one, and the errors on the way by the number of windows; over two seeds."""
+def adapted(name, start, to, error, seeds=2):
+    """Windows proposed one by one, and the errors on the way by the number of windows."""
     case, found = CASES[name], {}
-    for seed in range(2):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         x = case.grid(start)
         f = case.f(x) + error * rng.standard_normal(start)
@@ -231,9 +250,9 @@ def adapted(name, start, to, error):
     return {n: math.sqrt(np.mean(np.square(each))) for n, each in found.items()}
 
 
-def uniform(name, n, error, method="spline"):
+def uniform(name, n, error, method="spline", seeds=2):
     case = CASES[name]
-    found = [rms(made(case, n, error, seed, method=method), case) for seed in range(2)]
+    found = [rms(made(case, n, error, seed, method=method), case) for seed in range(seeds)]
     return math.sqrt(np.mean(np.square(found)))
 
 
@@ -241,6 +260,17 @@ def uniform(name, n, error, method="spline"):
 def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side(name, to, error):
     """Each window is sampled equally long. Splines are the better method for equal distances here."""
     assert adapted(name, 7, to, error)[to] < uniform(name, 2 * to, error)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize(("name", "to", "equal"), [("Lennard-Jones", 10, 28), ("Morse", 9, 17), ("torsion", 14, 28)])
+def test_what_proposed_windows_save(name, to, equal):
+    """From the table in docs/free_energy.md: equal distances need as many windows for the same error, and no fewer."""
+    case = CASES[name]
+    error = 0.006 * float(np.ptp(case.F(np.linspace(case.low, case.high, 201)))) / (case.high - case.low)
+    reached = adapted(name, 7, to, error, seeds=3)[to]
+    assert uniform(name, equal, error, seeds=3) < 1.05 * reached
+    assert uniform(name, equal - 2, error, seeds=3) > reached
 
 
 def test_next_windows_lie_apart_and_where_little_is_known():

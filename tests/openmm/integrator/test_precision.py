@@ -280,15 +280,15 @@ def on_surfaces(system, x):
 
 SCHEMES = ("rattle", "geodesic", "suzuki4", "leapfrog")
 PARTS = (rows_of_two_kinds, on_surfaces)
-#: Kinds of rows, schemes and precisions: each of one meets each of another, in one half of the cases and in the other.
+#: Kinds of rows, schemes and precisions: each kind meets each scheme in each third of the cases.
 CASES = [(PARTS.index(h) + SCHEMES.index(s) + k, h, s, p) for h in PARTS for s in SCHEMES for k, p in enumerate(GPUS)]
 
 
-def cases_of(half):
+def cases_of(*thirds):
     return [
         pytest.param(held, scheme, *p.values, id=f"{held.__name__}-{scheme}-{p.id}", marks=p.marks)
         for k, held, scheme, p in CASES
-        if k % 2 == half
+        if k % 3 in thirds
     ]
 
 
@@ -318,7 +318,7 @@ def test_parts_run_in_any_precision(held, scheme, platform):
 
 
 @pytest.mark.validation
-@pytest.mark.parametrize("held, scheme, platform", cases_of(1))
+@pytest.mark.parametrize("held, scheme, platform", cases_of(1, 2))
 def test_parts_run_in_any_precision_in_the_other_cases(held, scheme, platform):
     check_parts(held, scheme, platform)
 
@@ -464,18 +464,27 @@ def beside_water(kind):
     return system, x, v, CollectiveRows(system, [Row(force)], positions=x, meets_system=kind == "meeting" or None)
 
 
-@more_than_single
-@pytest.mark.parametrize(
-    "kind, options",
-    [
-        ("carried", {"scheme": "rattle"}),
-        ("carried", {"scheme": "leapfrog"}),
-        ("meeting", {"scheme": "rattle"}),
-        ("meeting", {"scheme": "leapfrog"}),
-        ("meeting", {"ensemble": Langevin(300, 1)}),
-    ],
-)
-def test_rows_beside_constraints_of_the_system(kind, options, platform):
+BESIDE_WATER = {
+    "carried-rattle": ("carried", {"scheme": "rattle"}),
+    "carried-leapfrog": ("carried", {"scheme": "leapfrog"}),
+    "meeting-rattle": ("meeting", {"scheme": "rattle"}),
+    "meeting-leapfrog": ("meeting", {"scheme": "leapfrog"}),
+    "meeting-Langevin": ("meeting", {"ensemble": Langevin(300, 1)}),
+}
+#: All in mixed precision; in double precision one of each kind.
+USUAL_IN_DOUBLE = ("carried-rattle", "meeting-Langevin")
+
+
+def beside_water_on_gpus(usual):
+    return [
+        pytest.param(*case, *p.values, id=f"{name}-{p.id}", marks=p.marks)
+        for name, case in BESIDE_WATER.items()
+        for p in GPUS
+        if "single" not in p.id and usual == ("double" not in p.id or name in USUAL_IN_DOUBLE)
+    ]
+
+
+def check_beside_water(kind, options, platform):
     """On GPUs forces see what moves x only when constraints have been applied: those of the System come first."""
     system, x, v, part = beside_water(kind)
     integrator = ProjectedIntegrator(1e-3, parts=[part], check_every=5, **options)
@@ -484,6 +493,17 @@ def test_rows_beside_constraints_of_the_system(kind, options, platform):
     integrator.step(20)
     integrator.check()
     assert part.worst_miss(context, velocities=False) is None
+
+
+@pytest.mark.parametrize("kind, options, platform", beside_water_on_gpus(True))
+def test_rows_beside_constraints_of_the_system(kind, options, platform):
+    check_beside_water(kind, options, platform)
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("kind, options, platform", beside_water_on_gpus(False))
+def test_rows_beside_constraints_of_the_system_in_the_other_cases(kind, options, platform):
+    check_beside_water(kind, options, platform)
 
 
 @mixed
