@@ -6,8 +6,7 @@
 - `mean_forces`: the mean force of one window
 - `profiles`: free energies from mean forces, and where to sample next
 - `windows`: many windows, by any executor
-- `grid`, `attempts`, `model_hessian`, `relaxation`, `relaxed_scan`: minima at held values of coordinates
-- `scan_report`, `system_calculator`: what they look like, and OpenMM's energies for them
+- `scans`: relaxed scans
 """
 
 from importlib import import_module
@@ -30,8 +29,8 @@ _NAMES = {
     "profiles.mean_force_surface": ("Surface", "fit_surface"),
     "profiles.plots": ("plot_profile", "plot_surface", "plot_works"),
     "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
-    "relaxed_scan": ("Scan", "scan"),
-    "system_calculator": ("SystemCalculator",),
+    "scans.relaxed_scan": ("Scan", "scan"),
+    "scans.system_calculator": ("SystemCalculator",),
 }
 
 __all__ = sorted(name for names in _NAMES.values() for name in names)

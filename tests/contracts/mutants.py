@@ -768,34 +768,34 @@ MUTANTS = [
     ),
     # -- relaxed scans --
     (
-        "free_energy/relaxed_scan.py",
+        "free_energy/scans/relaxed_scan.py",
         "attempt.energy < best[point].energy:",
         "attempt.energy > best[point].energy:",
-        "tests/free_energy/test_relaxed_scan.py::test_both_ways_find_the_lower_of_two_minima",
+        "tests/free_energy/scans/test_relaxed_scan.py::test_both_ways_find_the_lower_of_two_minima",
     ),
     (
-        "free_energy/relaxed_scan.py",
+        "free_energy/scans/relaxed_scan.py",
         "if with_it.rank != rank + n + 1:",
         "if False:",
-        "tests/free_energy/test_relaxed_scan.py::test_bad_coordinates",
+        "tests/free_energy/scans/test_relaxed_scan.py::test_bad_coordinates",
     ),
     (
-        "free_energy/relaxation.py",
+        "free_energy/scans/relaxation.py",
         "missing = change - size - self._learned @ move",
         "missing = change - size + self._learned @ move",
-        "tests/free_energy/test_relaxation.py::test_what_was_learned_goes_along",
+        "tests/free_energy/scans/test_relaxation.py::test_what_was_learned_goes_along",
     ),
     (
-        "free_energy/model_hessian.py",
+        "free_energy/scans/model_hessian.py",
         "return [x[atoms] + images for",
         "return [lined_up(x[atoms], self.lattice) + 0 * images for",
-        "tests/free_energy/test_model_hessian.py::test_terms_keep_their_images",
+        "tests/free_energy/scans/test_model_hessian.py::test_terms_keep_their_images",
     ),
     (
-        "free_energy/attempts.py",
+        "free_energy/scans/attempts.py",
         'same = (tuple(head["point"]), head["source"]) == (point, source)',
         "same = True",
-        "tests/free_energy/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
+        "tests/free_energy/scans/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
     # -- free energies from mean forces and works --
     (

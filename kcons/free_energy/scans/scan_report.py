@@ -14,8 +14,8 @@ from rich import box
 from rich.table import Table
 
 from kcons import __version__
-from kcons.free_energy.grid import Point
-from kcons.free_energy.relaxed_scan import Scan
+from kcons.free_energy.scans.grid import Point
+from kcons.free_energy.scans.relaxed_scan import Scan
 from kcons.steppers.files import in_one_piece, text
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from ase import Atoms
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OccupiedError, UnreadableError
-from kcons.free_energy.grid import Grid, Point
+from kcons.free_energy.scans.grid import Grid, Point
 from kcons.steppers.files import in_one_piece, stored_arrays, text
 
 #: What is in a folder: the plan of the scan, and its relaxations.

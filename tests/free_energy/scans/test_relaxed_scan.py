@@ -217,7 +217,7 @@ def test_a_value_that_cannot_be_reached_is_a_failure_of_its_point():
 
 
 def test_large_structures_need_no_table(monkeypatch):
-    monkeypatch.setattr("kcons.free_energy.relaxed_scan.MOST_ATOMS", 3)
+    monkeypatch.setattr("kcons.free_energy.scans.relaxed_scan.MOST_ATOMS", 3)
     found = scan(chain(4, threefold), TURN, [0.5, 0.8], fmax=1e-3)
     np.testing.assert_allclose(found.energies, 0.2 * (1 + np.cos(3 * np.array([0.5, 0.8]))), atol=1e-6)
 

@@ -34,10 +34,10 @@ from kcons.errors import (
     KconsError,
     NonFiniteError,
 )
-from kcons.free_energy.attempts import Attempt, Attempts
-from kcons.free_energy.grid import Grid, Point
-from kcons.free_energy.model_hessian import Internals
-from kcons.free_energy.relaxation import FIRST, relax
+from kcons.free_energy.scans.attempts import Attempt, Attempts
+from kcons.free_energy.scans.grid import Grid, Point
+from kcons.free_energy.scans.model_hessian import Internals
+from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
 

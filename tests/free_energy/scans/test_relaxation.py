@@ -9,8 +9,8 @@ from scan_systems import ANGLE, LENGTH, chain, threefold
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Dihedral, Distance, FixedAtoms
 from kcons.errors import ConvergenceError
-from kcons.free_energy.model_hessian import Internals
-from kcons.free_energy.relaxation import relax
+from kcons.free_energy.scans.model_hessian import Internals
+from kcons.free_energy.scans.relaxation import relax
 from kcons.motion import minimise
 
 

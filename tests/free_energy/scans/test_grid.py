@@ -7,7 +7,7 @@ import pytest
 
 from kcons.constraints import Dihedral, Distance
 from kcons.errors import InputError
-from kcons.free_energy.grid import Grid
+from kcons.free_energy.scans.grid import Grid
 
 TURN, LENGTH = Dihedral([[0, 1, 2, 3]]), Distance([[0, 1]])
 

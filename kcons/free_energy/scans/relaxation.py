@@ -10,7 +10,7 @@ import numpy as np
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, KconsError
-from kcons.free_energy.model_hessian import Internals
+from kcons.free_energy.scans.model_hessian import Internals
 from kcons.motion.motion import Motion
 
 #: Energy in eV and forces in eV/angstrom at positions, shape (n_atoms, 3).

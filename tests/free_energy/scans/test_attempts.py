@@ -10,8 +10,8 @@ from scan_systems import chain, threefold
 
 from kcons.constraints import Custom, Dihedral
 from kcons.errors import InputError, OccupiedError, UnreadableError
-from kcons.free_energy.attempts import PLACE, PLAN, Attempt, Attempts
-from kcons.free_energy.grid import Grid
+from kcons.free_energy.scans.attempts import PLACE, PLAN, Attempt, Attempts
+from kcons.free_energy.scans.grid import Grid
 
 
 def made(folder, settings=None):
