@@ -31,8 +31,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from kcons.cli.progress import Bars
-    from kcons.free_energy import Windows, read_plan
-    from kcons.free_energy.windows import windows_report
+    from kcons.free_energy import Windows, read_plan, windows_report
 
     plan = read_plan(chosen.plan)
     if chosen.scheduler is not None:

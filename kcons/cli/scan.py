@@ -92,8 +92,7 @@ def _scan(chosen: argparse.Namespace) -> int:
     held += getattr(atoms.calc, "held", [])
 
     from kcons.cli.progress import Bars
-    from kcons.free_energy import scan
-    from kcons.free_energy.scans import scan_report
+    from kcons.free_energy import scan, scan_report
 
     folder: Path = chosen.out or Path(f"scan-{chosen.structure.stem}")
     with Bars() as watcher:

@@ -23,6 +23,7 @@ _NAMES = {
     "windows.ase_windows": ("AseWindows",),
     "windows.openmm_windows": ("OpenMMWindows",),
     "windows.driver": ("FreeEnergy", "WindowResult", "Windows"),
+    "windows.windows_report": ("windows_report",),
     "windows.plan_file": ("PlanFile", "read_plan"),
     "averages": ("Agreement", "Mean", "agreement", "weighted_mean"),
     "profiles.profile": ("Profile", "integrate"),
@@ -30,6 +31,7 @@ _NAMES = {
     "profiles.plots": ("plot_profile", "plot_surface", "plot_works"),
     "profiles.pulls": ("Pulled", "pull_free_energy", "work_along", "work_profile"),
     "scans.relaxed_scan": ("Scan", "scan"),
+    "scans.scan_report": ("scan_report",),
     "scans.system_calculator": ("SystemCalculator",),
 }
 
@@ -39,5 +41,6 @@ __all__ = sorted(name for names in _NAMES.values() for name in names)
 def __getattr__(name: str) -> Any:
     for module, names in _NAMES.items():
         if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
+            found = import_module(f"{__name__}.{module}")
+            return found if module.endswith(f".{name}") else getattr(found, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

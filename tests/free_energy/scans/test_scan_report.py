@@ -13,8 +13,7 @@ from scan_systems import chain, threefold, two_wells
 
 from kcons.cli.terminal import rendered
 from kcons.constraints import Dihedral, Distance
-from kcons.free_energy import scan
-from kcons.free_energy.scans import scan_report
+from kcons.free_energy import scan, scan_report
 
 TURN = Dihedral([[0, 1, 2, 3]])
 

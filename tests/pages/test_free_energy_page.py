@@ -1,0 +1,31 @@
+"""Free energies: the page shows the committed results, and they are within their errors."""
+
+from __future__ import annotations
+
+import json
+
+from committed_pages import FOLDER, page
+
+FOUND = json.loads((FOLDER / "free_energy.json").read_text(encoding="utf-8"))
+TEXT = " ".join(page("free_energy.md").split())
+
+
+def test_three_thermostats_agree_with_the_quadrature():
+    chain = FOUND["chain"]
+    assert chain["degrees of freedom"] <= 12 and chain["steps"] >= 400_000
+    assert f"{chain['quadrature']:.2f} by quadrature" in TEXT
+    for name, row in chain["thermostats"].items():
+        off = (row["mean force"] - chain["quadrature"]) / row["error"]
+        line = f"| {name} | {row['mean force']:.2f} ± {row['error']:.2f} | {off:+.1f} | {row['raw multiplier']:.2f} |"
+        assert line in TEXT
+        assert abs(off) < 3 and row["error"] < 0.01 * chain["quadrature"]
+
+
+def test_alanine_dipeptide_against_mbar():
+    found = FOUND["alanine dipeptide"]
+    assert f"square difference is {found['root mean square difference']:.2f} kJ/mol" in TEXT
+    assert f"the largest {found['largest difference below 30 kJ/mol']:.1f};" in TEXT
+    ours, theirs = found["largest error of the windows"], found["largest error of MBAR"]
+    assert f"standard error {ours:.2f} of the windows and {theirs:.2f} of MBAR" in TEXT
+    assert found["root mean square difference"] < (ours**2 + theirs**2) ** 0.5
+    assert found["doubtful windows"] == []
