@@ -57,3 +57,15 @@ class Fake:
             force = slope(q) + apart + self.noise * rng.normal()
             series.append(Sample(float(k), np.array([q]), np.array([force]), np.zeros(1), 0.0, np.zeros(1), 0.0))
         series.save(file)
+
+    def pull(self, window, settings, file):
+        """Normal works that fulfil Crooks' theorem, 4 kJ/mol up; Z is four times as large at the upper end."""
+        with Path(self.diary).open("a") as diary:
+            diary.write(f"{window.name}\n")
+        up = window.target[0] > window.start[0]
+        work = np.random.default_rng(window.seed).normal((4.0 if up else -4.0) + 4 / (2 * KT), 2.0)
+        series = Series(self.names)
+        for q in (window.start[0], window.target[0]):
+            force, log_z = work / (window.target[0] - window.start[0]), np.log(4.0) if q > 0 else 0.0
+            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0))
+        series.save(file)

@@ -84,6 +84,42 @@ class AseWindows:
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         held = self._rows()
+        atoms = self._prepared(held, window, settings)
+        if settings.pull:
+            self._moving(held, atoms, window, settings).run(settings.pull)
+        rows = [*held.others, *held.at(window.target)]
+        # Velocities of the pull's end have its rate.
+        free = settings.thermostat != "langevin" and all(row.translation_invariant for row in rows)
+        draw_velocities(atoms, settings.temperature, window.seed + 1, constraints=rows, zero_momentum=free)
+        dt, friction, common = _units(settings)
+        if settings.thermostat == "langevin":
+            common |= {"friction": friction, "rng": window.seed + 2}
+            dynamics: Any = ConstrainedLangevin(atoms, dt, constraints=rows, **common)
+        elif settings.thermostat == "nose-hoover":
+            dynamics = ConstrainedNoseHoover(atoms, dt, tdamp=1 / friction, constraints=rows, **common)
+        else:
+            dynamics = IsokineticDynamics(atoms, dt, constraints=rows, **common)
+        dynamics.run(settings.equilibration)
+        recorder = AseRecorder(dynamics, self.coordinates)
+        dynamics.attach(recorder, interval=settings.every)
+        dynamics.run(settings.production)
+        recorder.series.save(file)
+
+    def pull(self, window: Window, settings: Settings, file: Path) -> None:
+        held = self._rows()
+        atoms = self._prepared(held, window, settings)
+        dt, friction, common = _units(settings)
+        rows = [*held.others, *held.at(window.start)]
+        dynamics = ConstrainedLangevin(atoms, dt, friction=friction, rng=window.seed + 2, constraints=rows, **common)
+        dynamics.run(settings.equilibration)
+        moving = self._moving(held, atoms, window, settings)
+        recorder = AseRecorder(moving, self.coordinates)
+        moving.attach(recorder, interval=1)
+        moving.run(settings.pull)
+        recorder.series.save(file)
+
+    def _prepared(self, held: Held, window: Window, settings: Settings) -> Atoms:
+        """The atoms at the start of a window, relaxed, with velocities."""
         atoms = self.atoms.copy()
         atoms.calc = self.calculator()
         motion, x = held.placed(window.start)
@@ -100,27 +136,16 @@ class AseWindows:
                     raise
                 x = error.positions
         atoms.positions = x
-        dt, friction = settings.timestep * units.fs, settings.friction / (1000 * units.fs)
-        common: dict[str, Any] = {"temperature_K": settings.temperature}
-        moved = held.towards(window, max(settings.pull, 1) * dt)
         draw_velocities(atoms, settings.temperature, window.seed, constraints=[*held.others, *held.at(window.start)])
-        if settings.pull:
-            ConstrainedLangevin(
-                atoms, dt, friction=friction, rng=window.seed, constraints=[*held.others, *moved], **common
-            ).run(settings.pull)
-        rows = [*held.others, *held.at(window.target)]
-        # Velocities of the pull's end have its rate.
-        free = settings.thermostat != "langevin" and all(row.translation_invariant for row in rows)
-        draw_velocities(atoms, settings.temperature, window.seed + 1, constraints=rows, zero_momentum=free)
-        if settings.thermostat == "langevin":
-            common |= {"friction": friction, "rng": window.seed + 2}
-            dynamics: Any = ConstrainedLangevin(atoms, dt, constraints=rows, **common)
-        elif settings.thermostat == "nose-hoover":
-            dynamics = ConstrainedNoseHoover(atoms, dt, tdamp=1 / friction, constraints=rows, **common)
-        else:
-            dynamics = IsokineticDynamics(atoms, dt, constraints=rows, **common)
-        dynamics.run(settings.equilibration)
-        recorder = AseRecorder(dynamics, self.coordinates)
-        dynamics.attach(recorder, interval=settings.every)
-        dynamics.run(settings.production)
-        recorder.series.save(file)
+        return atoms
+
+    def _moving(self, held: Held, atoms: Atoms, window: Window, settings: Settings) -> ConstrainedLangevin:
+        """Langevin dynamics with the coordinates moving from the start of the window to its target."""
+        dt, friction, common = _units(settings)
+        rows = [*held.others, *held.towards(window, settings.pull * dt)]
+        return ConstrainedLangevin(atoms, dt, friction=friction, rng=window.seed, constraints=rows, **common)
+
+
+def _units(settings: Settings) -> tuple[float, float, dict[str, Any]]:
+    """Time step and friction in ASE's units, and the temperature as its classes take it."""
+    return settings.timestep * units.fs, settings.friction / (1000 * units.fs), {"temperature_K": settings.temperature}

@@ -27,15 +27,15 @@ from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
+from kcons.free_energy.profiles.pulls import Pulled, pull_free_energy
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import Sampler, Settings, Window
+from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window
 from kcons.steppers.files import in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
 BOLTZMANN = 0.00831446261815324
 #: How often a window is begun again whose process was killed.
 RETRIES = 3
-SIDES = ("up", "down")
 
 
 @dataclass(frozen=True)
@@ -289,6 +289,62 @@ class Windows:
             jobs.append(Window(number, side, begin, end, seed))
         return jobs
 
+    def pull(
+        self,
+        start: ArrayLike,
+        end: ArrayLike,
+        count: int = 20,
+        *,
+        both_ways: bool = True,
+        executor: Executor | None = None,
+        workers: int | None = None,
+        progress: Callable[[int, int, float], None] | None = None,
+    ) -> Pulled:
+        """F(end) - F(start) from the works of pulls, kJ/mol: Jarzynski, and BAR with pulls both ways.
+
+        Each pull begins in equilibrium (`Settings.equilibration`), takes `Settings.pull` steps at a constant rate, and
+        is recorded at every step. Finished ones are kept.
+
+        Parameters
+        ----------
+        start, end : float or array_like, shape (d,)
+            In angstrom and radian.
+        count : int
+            Pulls in each direction, 5 or more.
+        both_ways : bool
+
+        Raises
+        ------
+        InputError
+            No steps to pull in; fewer than 5 pulls that did not fail.
+        """
+        if not self.settings.pull:
+            raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
+        ends = np.array([np.atleast_1d(start), np.atleast_1d(end)], dtype=np.float64) / self.sampler.scales
+        jobs: dict[str, list[Window]] = {}
+        for k, direction in enumerate(DIRECTIONS[: 1 + both_ways]):
+            begin, target = (tuple(place.tolist()) for place in (ends if k == 0 else ends[::-1]))
+            seeds = (np.random.SeedSequence([self.seed, number, 2 + k]).generate_state(1)[0] for number in range(count))
+            jobs[direction] = [Window(n, direction, begin, target, int(seed)) for n, seed in enumerate(seeds)]
+        every = [job for each in jobs.values() for job in each]
+        missing = [job for job in every if not self.file(job).exists()]
+        self._sample(missing, executor, workers, progress, len(every))
+        kT = BOLTZMANN * self.settings.temperature
+        works, log_weights = [], []
+        for each in jobs.values():
+            series = [Series.load(self.file(job)) for job in each if self.file(job).exists()]
+            works.append(np.array([s.work[-1] * self.sampler.kJ for s in series]))
+            log_weights.append(np.array([-0.5 * s.log_det_z[[0, -1]] for s in series]).reshape(-1, 2))
+        # Pulls give the free energy of the held system; ln <Z^(-1/2)> at both ends makes it that of the coordinates.
+        if both_ways:
+            shift = kT * (_log_mean(log_weights[0][:, 0]) - _log_mean(log_weights[1][:, 0]))
+        else:
+            counts = -works[0] / kT  # what was pulled here counts as in equilibrium with these weights
+            at_end = _log_mean(log_weights[0][:, 1] + counts) - _log_mean(counts)
+            shift = kT * (_log_mean(log_weights[0][:, 0]) - at_end)
+        backward = works[1] - shift if both_ways else None
+        return pull_free_energy(works[0] + shift, backward, thermal_energy=kT)
+
     def file(self, window: Window) -> Path:
         """Where a finished window is kept."""
         return self.folder / f"{window.name}.npz"
@@ -395,7 +451,12 @@ def _problem(future: Future[None]) -> str | None:
 def _sampled(sampler: Sampler, window: Window, settings: Settings, file: Path) -> None:
     """In a worker: one window, unless another run has finished it meanwhile."""
     if not file.exists():
-        sampler.sample(window, settings, file)
+        (sampler.sample if window.side in SIDES else sampler.pull)(window, settings, file)
+
+
+def _log_mean(logarithms: FloatArray) -> float:
+    """ln of the mean of exp."""
+    return float(np.logaddexp.reduce(logarithms) - np.log(len(logarithms))) if len(logarithms) else 0.0
 
 
 def _processes(workers: int, jobs: int) -> ProcessPoolExecutor:

@@ -23,7 +23,7 @@ from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.hold import constraints_about
 from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massless_atoms
 from kcons.openmm.collective.formula_rows import formula_rows
-from kcons.openmm.integrator.guard import velocities_of
+from kcons.openmm.integrator.guard import positions_of, velocities_of
 from kcons.openmm.quantities import masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
@@ -104,35 +104,65 @@ class OpenMMWindows:
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         dt = settings.timestep / 1000
-        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
-        _, x = held.placed(window.start)
-        rates = [(b - a) / (max(settings.pull, 1) * dt) for a, b in zip(window.start, window.target, strict=True)]
         langevin = Langevin(settings.temperature, settings.friction)
-        simulation = self._simulation(window.start, rates, langevin, dt, window)
-        simulation.context.setPositions(x)
-        integrator: Any = simulation.integrator
-        if settings.relax:
-            integrator.minimizeEnergy(simulation.context, _FORCE, settings.relax)
-        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, window.seed % 2**31)
+        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
+        simulation = self._simulation(window.start, self._rates(window, settings), langevin, dt, window)
+        self._begin(simulation, held, window, settings)
         simulation.step(settings.pull)
-        pulled = simulation.context.getState(positions=True)
         ensemble: Any = langevin
         if settings.thermostat == "nose-hoover":
             ensemble = NoseHoover(settings.temperature, settings.friction)
         elif settings.thermostat == "isokinetic":
             ensemble = Isokinetic(settings.temperature)
-        simulation = self._simulation(window.target, [0.0] * len(rates), ensemble, dt, window)
-        simulation.context.setPositions(pulled.getPositions())
-        integrator = simulation.integrator
+        x = positions_of(simulation.context)
+        simulation = self._simulation(window.target, [0.0] * len(self.names), ensemble, dt, window)
+        simulation.context.setPositions(x)
+        integrator: Any = simulation.integrator
         integrator.applyConstraints()
         integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, (window.seed + 1) % 2**31)
         if settings.thermostat != "langevin":
             _without_momentum(simulation.context, held)
         simulation.step(settings.equilibration)
+        self._recorded(simulation, settings.every, settings.production, file)
+
+    def pull(self, window: Window, settings: Settings, file: Path) -> None:
+        dt = settings.timestep / 1000
+        langevin = Langevin(settings.temperature, settings.friction)
+        held = self._rows(openmm.XmlSerializer.deserialize(self._system))
+        simulation = self._simulation(window.start, [0.0] * len(self.names), langevin, dt, window)
+        self._begin(simulation, held, window, settings)
+        simulation.step(settings.equilibration)
+        x, v = positions_of(simulation.context), velocities_of(simulation.context)
+        simulation = self._simulation(window.start, self._rates(window, settings), langevin, dt, window)
+        simulation.context.setPositions(x)
+        simulation.context.setVelocities(v)
+        integrator: Any = simulation.integrator
+        integrator.applyVelocityConstraints()
+        self._recorded(simulation, 1, settings.pull, file, start=True)
+
+    def _begin(self, simulation: app.Simulation, held: Held, window: Window, settings: Settings) -> None:
+        """To the start of a window, relaxed, with velocities."""
+        simulation.context.setPositions(held.placed(window.start)[1])
+        integrator: Any = simulation.integrator
+        if settings.relax:
+            integrator.minimizeEnergy(simulation.context, _FORCE, settings.relax)
+        integrator.setVelocitiesToTemperature(simulation.context, settings.temperature, window.seed % 2**31)
+
+    def _rates(self, window: Window, settings: Settings) -> list[float]:
+        """In nm or radian in a ps."""
+        duration = max(settings.pull, 1) * settings.timestep / 1000
+        return [(b - a) / duration for a, b in zip(window.start, window.target, strict=True)]
+
+    def _recorded(self, simulation: app.Simulation, every: int, steps: int, file: Path, *, start: bool = False) -> None:
         simulation.currentStep = 0
-        reporter = HeldCoordinatesReporter(io.StringIO(), settings.every, self.coordinates)
+        reporter = HeldCoordinatesReporter(io.StringIO(), every, self.coordinates)
+        if start:
+            groups = simulation.integrator.getIntegrationForceGroups()
+            reporter.report(
+                simulation, simulation.context.getState(positions=True, velocities=True, forces=True, groups=groups)
+            )
         simulation.reporters.append(reporter)
-        simulation.step(settings.production)
+        simulation.step(steps)
         reporter.series.save(file)
 
     def _simulation(

@@ -22,9 +22,16 @@ from kcons.motion.motion import Motion
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
 
+#: What the sides of a window and the directions of a pull are called.
+SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
+
+
 @dataclass(frozen=True)
 class Window:
-    """Coordinates held at `target`, pulled there from `start`; both in the units of the MD engine."""
+    """Coordinates held at `target`, pulled there from `start`; both in the units of the MD engine.
+
+    `side` is 'up' or 'down' for windows, 'forward' or 'backward' for pulls, which begin in equilibrium at `start`.
+    """
 
     number: int
     side: str
@@ -34,7 +41,10 @@ class Window:
 
     @property
     def name(self) -> str:
-        return f"window-{self.number:04d}-{self.side}"
+        if self.side in SIDES:
+            return f"window-{self.number:04d}-{self.side}"
+        begin, end = ("_".join(f"{q:.6g}" for q in place) for place in (self.start, self.target))
+        return f"pull-{begin}-to-{end}-{self.number:04d}"
 
 
 @dataclass(frozen=True)
@@ -112,6 +122,9 @@ class Sampler(Protocol):
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
         """Run the window, and write its `Series` to `file` once it is finished."""
+
+    def pull(self, window: Window, settings: Settings, file: Path) -> None:
+        """Equilibrate at the start, pull to the target, and write the `Series` of the pull, every step of it."""
 
 
 def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatArray:

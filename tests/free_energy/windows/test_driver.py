@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from window_samplers import Fake, slope
+from window_samplers import KT, Fake, slope
 
 from kcons.errors import InputError, OccupiedError
 from kcons.free_energy import Settings, Windows
@@ -154,6 +154,21 @@ def test_a_cluster_of_dask_that_loses_a_worker(tmp_path, monkeypatch):
         result = Windows(fake, broken / "out", SETTINGS).run(PLACES, executor=client.get_executor(pure=False))
     assert diary(broken).count("window-0003-up") == 2
     assert result.failed == {} and json.dumps(result.numbers()) == json.dumps(expected.numbers())
+
+
+@pytest.mark.parametrize("both_ways", [True, False])
+def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
+    """That of the held system, and kT ln 2 for Z that is four times as large at the end."""
+    windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
+    with ThreadPoolExecutor(1) as executor:
+        found = windows.pull(-0.5, 0.5, 60, both_ways=both_ways, executor=executor)
+        again = windows.pull(-0.5, 0.5, 60, both_ways=both_ways, executor=executor)
+    exact = 4.0 + KT * np.log(2)
+    assert abs(found.best.value - exact) < 3 * found.best.error < 2
+    assert (found.bar is None) == (not both_ways) and again.best == found.best
+    assert len(diary(tmp_path)) == 60 * (1 + both_ways)
+    with pytest.raises(InputError, match=r"settings\.pull is 0"):
+        Windows(Fake(str(tmp_path / "diary")), tmp_path / "no", Settings(pull=0)).pull(0, 1)
 
 
 def test_bad_input(tmp_path):

@@ -70,3 +70,12 @@ def test_coordinates_that_cannot_be_held():
         tight.addConstraint(i, j, openmm.unit.norm(x[i] - x[j]))
     with pytest.raises(SingularGeometryError, match="q depends on the other"):
         sampler({"q": Angle([[4, 6, 8]])}, tight).begin()
+
+
+def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
+    settings = Settings(pull=100, equilibration=20, production=320, relax=3)
+    sampler({"phi": PHI}).pull(Window(0, "forward", (-1.2,), (-1.0,), 5), settings, tmp_path / "pull.npz")
+    series = Series.load(tmp_path / "pull.npz")
+    assert len(series) == 101
+    np.testing.assert_allclose(series.value[:, 0], np.linspace(-1.2, -1.0, 101), atol=1e-9)
+    assert series.work[0] == 0 and abs(series.work[-1]) > 1e-3
