@@ -125,8 +125,9 @@ class HeldCoordinatesReporter:
                 "them all, or give the others as beside: what is held beside a coordinate changes its mean force",
                 item="beside",
             )
-        mine = [(c.family, c.atoms.tolist()) for c in rows]
-        rows = [*(c for c in carried if (c.family, c.atoms.tolist()) not in mine), *rows]
+        # Those of `hold` know how their targets move.
+        known = [(c.family, c.atoms.tolist()) for c in carried]
+        rows = [*carried, *(c for c in rows if (c.family, c.atoms.tolist()) not in known)]
         touched = np.unique(np.concatenate([row.atoms.ravel() for row in rows]))
         if touched.max() >= len(masses):
             raise InputError(f"there is no atom {touched.max()}; the System has {len(masses)} particles", item="atoms")

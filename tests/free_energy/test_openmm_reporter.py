@@ -115,6 +115,28 @@ def test_work_of_a_pulled_torsion():
     assert reporter.series.work[-1] == pytest.approx(gained, rel=2e-3) and abs(gained) > 0.1
 
 
+def test_work_of_a_pull_by_hold_is_the_energy_that_it_adds():
+    """The target accelerates, which the constraint of `hold` knows and the one that names it does not."""
+    system = peptide(None)
+    x = np.array(PDB.positions.value_in_unit(unit.nanometer))
+    length = float(np.linalg.norm(x[8] - x[14]))
+    pull = Distance([[8, 14]], MovingTarget(lambda t: length + 8.0 * t * t))
+    part = hold(system, [pull], x)
+    integrator = ProjectedIntegrator(0.0001, parts=[part])
+    simulation = app.Simulation(PDB.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
+    simulation.context.setPositions(x)
+    simulation.context.setVelocities(np.zeros_like(x))
+    reporter = HeldCoordinatesReporter(io.StringIO(), 1, {"r": Distance([[8, 14]])})
+    energies = []
+    simulation.reporters.append(reporter)
+    for steps in (1, 300):
+        simulation.step(steps)
+        state = simulation.context.getState(energy=True)
+        energies.append((state.getPotentialEnergy() + integrator.kinetic_energy()) / unit.kilojoule_per_mole)
+    assert energies[1] - energies[0] > 1
+    assert reporter.series.work[-1] == pytest.approx(energies[1] - energies[0], rel=1e-3)
+
+
 def test_files_are_gone_on_with(tmp_path):
     file = tmp_path / "held.csv"
     for append in (False, True):
