@@ -10,8 +10,6 @@ torsion's distribution alone, and keeps thermostats without noise ergodic. Its m
 
 from __future__ import annotations
 
-import json
-import platform
 import sys
 import time
 from pathlib import Path
@@ -19,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from kcons import ConstraintSet, Motion, System, run
+from kcons.comparison import environment, json_files
 from kcons.constraints import Dihedral, Distance
 from kcons.free_energy import HeldCoordinates, Recorder, Settings, mean_force
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
@@ -240,9 +239,8 @@ def main(arguments: list[str]) -> None:
         found = {"chain": closed_forms("--full" in arguments)}
         if "--full" not in arguments:
             return
-    known = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-    known |= {**found, "machine": platform.processor() or platform.machine(), "python": platform.python_version()}
-    RESULT.write_text(json.dumps(known, indent=1) + "\n")
+    known = json_files.read(RESULT) if RESULT.exists() else {}
+    json_files.write(RESULT, known | {**found, "machine": environment()})
     print(f"wrote {RESULT}")
 
 
