@@ -29,3 +29,12 @@ def test_alanine_dipeptide_against_mbar():
     assert f"standard error {ours:.2f} of the windows and {theirs:.2f} of MBAR" in TEXT
     assert found["root mean square difference"] < (ours**2 + theirs**2) ** 0.5
     assert found["doubtful windows"] == []
+
+
+def test_butane_beside_its_relaxed_scan():
+    found = json.loads((FOLDER / "butane.json").read_text(encoding="utf-8"))
+    for name, (value, error) in found["free energy"].items():
+        energy = found["relaxed scan"][name]
+        assert f"| {name} | {value:.1f} ± {error:.1f} | {energy:.1f} |" in TEXT
+        assert abs(value - energy) < 3 * error
+    assert min(found["hysteresis"]) > 0.01
