@@ -34,6 +34,7 @@ class Fake:
     noise: float = 2.0
     shift: float = 0.0
     names: tuple[str, ...] = ("torsion",)
+    digest: str = "one system"
     angles: tuple[bool, ...] = (True,)
     kJ: float = 1.0
     scales: np.ndarray = field(default_factory=lambda: np.ones(1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError
 from kcons.free_energy.ase_recorder import AseRecorder
-from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
 from kcons.motion import minimise
 
 #: Largest force left by a relaxation, eV/angstrom, and the longest way of an atom in one of its steps, angstrom.
@@ -63,6 +64,14 @@ class AseWindows:
         self.held = [*from_ase_constraints(self.atoms), *held]
         self.atoms.set_constraint()
         self.names = tuple(self.coordinates)
+        made = (
+            (calculator.func, calculator.args, calculator.keywords)
+            if isinstance(calculator, partial)
+            else (calculator,)
+        )
+        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:]]
+        frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
+        self.digest = digest_of(frame, maker, self.held, list(self.coordinates.values()))
         self.angles = angles_of(self.coordinates)
         self.scales = scales_of(self.coordinates, 1.0)
 

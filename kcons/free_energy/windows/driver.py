@@ -161,7 +161,7 @@ class Windows:
     KconsError
         A coordinate that is undefined at the structure or depends on other constraints.
     OccupiedError
-        The folder has windows of other settings.
+        The folder has windows of other settings; in `run`, of other values.
     """
 
     def __init__(
@@ -185,7 +185,12 @@ class Windows:
 
     def _keep_settings(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        mine = {"coordinates": list(self.sampler.names), "settings": asdict(self.settings), "seed": self.seed}
+        mine = {
+            "coordinates": list(self.sampler.names),
+            "system": self.sampler.digest,
+            "settings": asdict(self.settings),
+            "seed": self.seed,
+        }
         mine |= {"both sides": self.both_sides, "approach": self.approach.tolist(), "start": self.start.tolist()}
         known = self.folder / "settings.json"
         if known.exists():
@@ -240,7 +245,7 @@ class Windows:
         first = len(self._targets)
         self._targets += [tuple(row) for row in places.tolist()]
         jobs = [job for number in range(first, len(self._targets)) for job in self._jobs(number)]
-        missing = [job for job in jobs if not self.file(job).exists()]
+        missing = [job for job in jobs if not self._finished(job)]
         failed = self._sample(missing, executor, workers, progress, len(jobs))
         return self.result(failed)
 
@@ -344,6 +349,23 @@ class Windows:
             shift = kT * (_log_mean(log_weights[0][:, 0]) - at_end)
         backward = works[1] - shift if both_ways else None
         return pull_free_energy(works[0] + shift, backward, thermal_energy=kT)
+
+    def _finished(self, window: Window) -> bool:
+        """Whether a window is there; raises where its file is one of other values."""
+        file = self.file(window)
+        if not file.exists():
+            return False
+        away = Series.load(file).value[:1] - np.array(window.target)
+        turns = self.periods > 0
+        away[:, turns] -= self.periods[turns] * np.round(away[:, turns] / self.periods[turns])
+        if np.abs(away).max(initial=0.0) > 1e-4:
+            wanted = ", ".join(f"{q:g}" for q in self._targets[window.number])
+            raise OccupiedError(
+                f"{file} was sampled elsewhere than at {wanted}, where window {window.number} is to be: the folder is "
+                "one of other values; choose another folder",
+                item="targets",
+            )
+        return True
 
     def file(self, window: Window) -> Path:
         """Where a finished window is kept."""

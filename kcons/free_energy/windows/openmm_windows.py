@@ -17,7 +17,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
-from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, scales_of
+from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.hold import constraints_about
@@ -75,6 +75,7 @@ class OpenMMWindows:
         self.scales = scales_of(self.coordinates, 10.0)
         self.platform, self.properties = platform, dict(properties or {})
         self._system = openmm.XmlSerializer.serialize(system)
+        self.digest = digest_of(self._system, self.positions, list(self.coordinates.values()))
         self._bonds: IntArray = bonds_of(system, self.positions)
         # A Topology cannot be pickled where its elements are; what a Simulation needs of it is the number of atoms.
         self._n = topology.getNumAtoms()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,8 +111,11 @@ class Sampler(Protocol):
         The units of its coordinates in angstrom and radian.
     angles : tuple of bool
         Which coordinates are angles.
+    digest : str
+        Of structure, forces and constraints: what a folder of windows belongs to.
     """
 
+    digest: str
     names: tuple[str, ...]
     kJ: float
     scales: FloatArray
@@ -135,6 +139,19 @@ def scales_of(coordinates: Mapping[str, Constraint], angstrom: float) -> FloatAr
 def angles_of(coordinates: Mapping[str, Constraint]) -> tuple[bool, ...]:
     """Which coordinates are angles."""
     return tuple(c.held is ANGLE for c in coordinates.values())
+
+
+def digest_of(*parts: Any) -> str:
+    """The same for the same numbers, texts and constraints, in any process."""
+    found = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Constraint):
+            part = (part.family, part.atoms, *(getattr(part, name) for name in part.per_row))
+        if isinstance(part, list | tuple):
+            found.update(digest_of(*part).encode())
+        else:
+            found.update(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    return found.hexdigest()[:16]
 
 
 @dataclass

@@ -76,3 +76,10 @@ def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
     assert len(series) == 201 and series.off.max() < 1e-10
     np.testing.assert_allclose(series.value[:, 0], np.linspace(2.0, 2.4, 201), atol=1e-9)
     assert series.work[0] == 0 and np.isfinite(series.work[-1])
+
+
+def test_what_a_folder_belongs_to():
+    """The same in another process; another calculator or other constraints are something else."""
+    assert sampler().digest == sampler().digest == pickle.loads(pickle.dumps(sampler())).digest
+    other = AseWindows(molecule("CH3OH"), partial(LennardJones, sigma=1.1), {"turn": TURN}, [PIECES])
+    assert len({sampler().digest, other.digest, sampler(held=[]).digest}) == 3

@@ -175,6 +175,11 @@ def test_bad_input(tmp_path):
     with pytest.raises(OccupiedError, match=r"windows of other settings; choose another folder"):
         run(tmp_path)
         Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
+    with pytest.raises(OccupiedError, match=r"windows of other system;"):
+        Windows(Fake(str(tmp_path / "diary"), digest="another system"), tmp_path / "out", SETTINGS)
+    with pytest.raises(OccupiedError, match=r"window-0001-up.npz was sampled elsewhere than at -1\.5708"):
+        run(tmp_path, PLACES[::2])
+    assert len(diary(tmp_path)) == 16
     windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
     for wrong in ([], [np.nan]):
         with pytest.raises(InputError, match="targets must be finite"):

@@ -8,7 +8,7 @@ import pytest
 from kcons.constraints import Dihedral, Distance, Formula, KnifeEdge
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy import Settings, Window
-from kcons.free_energy.windows.window import Held, scales_of
+from kcons.free_energy.windows.window import Held, digest_of, scales_of
 
 X = np.array([[0.0, 1.0, 0.1], [0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.6, 1.0, 0.2], [2.0, -0.6, 0.8]])
 TURN = Dihedral([[0, 1, 2, 3]])
@@ -55,3 +55,11 @@ def test_a_pull_ends_where_the_window_is():
 def test_a_coordinate_is_one_row_of_positions(wrong):
     with pytest.raises(UnsupportedError, match=r"q is .*one row that holds positions"):
         held({"q": wrong})
+
+
+def test_digests_tell_systems_apart():
+    parts = [X, "lj", {"sigma": 1.0}, [TURN, Distance(BONDS)]]
+    assert digest_of(*parts) == digest_of(X.copy(), "lj", {"sigma": 1.0}, [Dihedral([[0, 1, 2, 3]]), Distance(BONDS)])
+    others = [[X + 1e-9, *parts[1:]], [X, "emt", *parts[2:]], [X, "lj", {"sigma": 1.1}, parts[3]]]
+    others += [[*parts[:3], [TURN]], [*parts[:3], [TURN, Distance(BONDS[:3])]]]
+    assert len({digest_of(*each) for each in (parts, *others)}) == 6
