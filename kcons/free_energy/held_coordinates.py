@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -14,7 +14,7 @@ from kcons.constraints.arguments import as_array
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, NonFiniteError, SingularGeometryError
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.motion.motion import Motion
 
 #: A coordinate of which the other constraints leave less than this share of its Z depends on them.
@@ -86,6 +86,8 @@ class HeldCoordinates:
         A coordinate that is not held; a velocity constraint.
     SingularGeometryError
         A coordinate that depends on the other constraints, so that Z = 0.
+    UnsupportedError
+        Velocity constraints in the clusters of the coordinates.
 
     References
     ----------
@@ -125,6 +127,11 @@ class HeldCoordinates:
         self._own, own_atoms = held.subset(self.rows[order])
         self.periods = self._named(np.concatenate([np.full(c.n_rows, c.period or 0.0) for c in self._own.constraints]))
         others = np.setdiff1d(_joined_rows(held, self.rows), self.rows)
+        if not held.holonomic[others].all():
+            raise UnsupportedError(
+                f"{' and '.join(names)} share atoms with velocity constraints, under which configurations have no "
+                "known distribution; multipliers alone are those of Motion.multipliers"
+            )
         self._others, other_atoms = held.subset(others)
         self.atoms: IntArray = np.union1d(own_atoms, other_atoms).astype(np.int64)
         self._own_atoms = np.searchsorted(self.atoms, own_atoms)
@@ -301,16 +308,7 @@ def _rows_of(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
     found = []
     for k in range(wanted.n_rows):
         for start, item in zip(held.starts, held.constraints, strict=False):
-            if item.family != wanted.family or item.width != wanted.width:
-                continue
-            same = np.all(item.atoms == wanted.atoms[k], axis=1)
-            if wanted.family == "Distance":
-                same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
-            for data in item.per_row:
-                ours, theirs = getattr(item, data), getattr(wanted, data)[k]
-                same &= np.all(ours == theirs, axis=tuple(range(1, ours.ndim)))
-            same &= all(getattr(item, f, None) is getattr(wanted, f, None) for f in wanted.functions)
-            rows = start + np.flatnonzero(same)
+            rows = start + np.flatnonzero(same_rows(item, wanted, k))
             if len(rows):
                 found.append(int(rows[0]))
                 break
@@ -322,6 +320,24 @@ def _rows_of(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
                 atoms=wanted.atoms[k],
             )
     return found
+
+
+def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]:
+    """Which rows of `item` are row k of `wanted`, whatever they are held at, shape (n_rows,)."""
+    same = np.zeros(item.n_rows, dtype=bool)
+    if item.family != wanted.family or item.width != wanted.width:
+        return same
+    if any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions):
+        return same
+    if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
+        return same
+    same = np.all(item.atoms == wanted.atoms[k], axis=1)
+    if wanted.family == "Distance":
+        same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
+    for data in item.per_row:
+        ours, theirs = getattr(item, data), getattr(wanted, data)[k]
+        same &= np.all(ours == theirs, axis=tuple(range(1, ours.ndim)))
+    return same
 
 
 def _joined_rows(held: ConstraintSet, rows: IntArray) -> IntArray:

@@ -13,7 +13,7 @@ from openmm import unit
 from kcons.constraints import Constraint
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates
+from kcons.free_energy.held_coordinates import HeldCoordinates, same_rows
 from kcons.free_energy.series import Series
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
@@ -126,8 +126,11 @@ class HeldCoordinatesReporter:
                 item="beside",
             )
         # Those of `hold` know how their targets move.
-        known = [(c.family, c.atoms.tolist()) for c in carried]
-        rows = [*carried, *(c for c in rows if (c.family, c.atoms.tolist()) not in known)]
+        for row in rows:
+            new = [k for k in range(row.n_rows) if not any(same_rows(item, row, k).any() for item in carried)]
+            if new:
+                carried.append(row.select(new))
+        rows = carried
         touched = np.unique(np.concatenate([row.atoms.ravel() for row in rows]))
         if touched.max() >= len(masses):
             raise InputError(f"there is no atom {touched.max()}; the System has {len(masses)} particles", item="atoms")

@@ -17,7 +17,7 @@ from kcons.constraints import (
     MovingTarget,
     Plane,
 )
-from kcons.errors import InputError, NonFiniteError, SingularGeometryError
+from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.free_energy import HeldCoordinates
 
 N = 6
@@ -299,32 +299,50 @@ def test_coordinates_that_depend_on_others(coordinates, others, match):
         HeldCoordinates(constraint_set, coordinates, CHAIN)
 
 
+def test_formulas_on_the_same_atoms_are_told_apart():
+    formulas = [Formula(text, [[0, 3]], target=None) for text in ("x1*x2 - z1", "y1 + 3*y2")]
+    constraint_set = ConstraintSet(formulas, CHAIN, MASSES)
+    again = Formula("y1 + 3*y2", [[0, 3]], target=None)
+    assert HeldCoordinates(constraint_set, {"second": again}, CHAIN).rows.tolist() == [1]
+    with pytest.raises(InputError, match="not among"):
+        HeldCoordinates(constraint_set, {"third": Formula("y1 + 4*y2", [[0, 3]], target=None)}, CHAIN)
+
+
+def test_velocity_constraints_beside_are_refused():
+    r, edge = Distance([[0, 3]]), KnifeEdge(0, 1, (0, 0, 1))
+    with pytest.raises(UnsupportedError, match=r"r share.* velocity constraints.*Motion\.multipliers"):
+        HeldCoordinates(ConstraintSet([r, edge], CHAIN, MASSES), {"r": r}, CHAIN)
+    far = Distance([[4, 5]])
+    assert len(HeldCoordinates(ConstraintSet([far, edge], CHAIN, MASSES), {"far": far}, CHAIN)) == 1
+
+
 def test_bad_input():
     r, centre = Distance([[0, 3]]), CenterDistance([0, 1], [4, 5])
-    constraint_set = ConstraintSet([r, centre, KnifeEdge(0, 1, (0, 0, 1))], CHAIN, MASSES)
+    x, m = np.vstack([CHAIN, CHAIN[:2] + 9.0]), np.append(MASSES, [1.0, 2.0])
+    constraint_set = ConstraintSet([r, centre, KnifeEdge(6, 7, (0, 0, 1))], x, m)
     for wrong, match in (
         ({}, "no coordinates"),
         ({"a": r, "b": Distance([[3, 0]])}, "a and b are the same row 0"),
         ({"a": Distance([[0, 4]])}, r"a, Distance\(0, 4\), is not among the 3 rows"),
         ({"a": Dihedral([[0, 1, 2, 3]])}, "not among"),
-        ({"edge": KnifeEdge(0, 1, (0, 0, 1))}, "velocity constraint.*holds no coordinate"),
+        ({"edge": KnifeEdge(6, 7, (0, 0, 1))}, "velocity constraint.*holds no coordinate"),
         ({"a": 3}, "no kcons constraint"),
     ):
         with pytest.raises(InputError, match=match):
-            HeldCoordinates(constraint_set, wrong, CHAIN)
-    mine = HeldCoordinates(constraint_set, {"centres": centre, "r": r}, CHAIN)
-    still = np.zeros((N, 3))
+            HeldCoordinates(constraint_set, wrong, x)
+    mine = HeldCoordinates(constraint_set, {"centres": centre, "r": r}, x)
+    still = np.zeros((8, 3))
     with pytest.raises(InputError, match=r"forces must have shape"):
-        mine.sample(CHAIN, still, still[:4])
-    broken = CHAIN.copy()
+        mine.sample(x, still, still[:4])
+    broken = x.copy()
     broken[0] = np.nan
     with pytest.raises(NonFiniteError, match="positions of atom 0"):
         mine.sample(broken, still, still)
     broken = still.copy()
     broken[3, 1] = np.inf
     with pytest.raises(NonFiniteError, match="forces of atom 3"):
-        mine.sample(CHAIN, still, broken)
+        mine.sample(x, still, broken)
     # What no coordinate touches may be anything.
     broken = still.copy()
     broken[2] = np.nan
-    assert np.isfinite(mine.sample(CHAIN, still, broken).multiplier).all()
+    assert np.isfinite(mine.sample(x, still, broken).multiplier).all()

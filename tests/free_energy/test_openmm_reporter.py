@@ -85,7 +85,9 @@ def test_the_same_coordinate_held_in_three_ways(tmp_path):
             bond.addBond(*pair, [])
             parts = [CollectiveRows(system, [bond, bend], positions=x)]
         else:
-            parts = [hold(system, [Distance([pair], length), Angle([angle])], x)]
+            # One object of several rows, of which one is named.
+            far = float(np.linalg.norm(x[0] - x[1]))
+            parts = [hold(system, [Distance([[1, 0], pair], [far, length]), Angle([angle])], x)]
         integrator = ProjectedIntegrator(1e-6, parts=parts)
         simulation = simulation_of(system, integrator, x)
         simulation.context.setVelocities(np.zeros_like(x))

@@ -71,6 +71,7 @@ class AseWindows:
         )
         maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:]]
         frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
+        frame.append(self.atoms.get_masses())
         self.digest = digest_of(frame, maker, self.held, list(self.coordinates.values()))
         self.angles = angles_of(self.coordinates)
         self.scales = scales_of(self.coordinates, 1.0)

@@ -146,7 +146,10 @@ def digest_of(*parts: Any) -> str:
     found = hashlib.sha256()
     for part in parts:
         if isinstance(part, Constraint):
-            part = (part.family, part.atoms, *(getattr(part, name) for name in part.per_row))
+            data = [getattr(part, name) for name in (*part.per_row, *part.shared)]
+            made = [getattr(getattr(part, name), "__qualname__", name) for name in part.functions]
+            held = "moving" if isinstance(part.target, MovingTarget) else part.target
+            part = (part.family, part.atoms, held, *data, *made)
         if isinstance(part, list | tuple):
             found.update(digest_of(*part).encode())
         else:

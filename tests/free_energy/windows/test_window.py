@@ -62,4 +62,6 @@ def test_digests_tell_systems_apart():
     assert digest_of(*parts) == digest_of(X.copy(), "lj", {"sigma": 1.0}, [Dihedral([[0, 1, 2, 3]]), Distance(BONDS)])
     others = [[X + 1e-9, *parts[1:]], [X, "emt", *parts[2:]], [X, "lj", {"sigma": 1.1}, parts[3]]]
     others += [[*parts[:3], [TURN]], [*parts[:3], [TURN, Distance(BONDS[:3])]]]
-    assert len({digest_of(*each) for each in (parts, *others)}) == 6
+    others += [[*parts[:3], [TURN, Distance(BONDS, 1.5)]], [*parts[:3], [TURN, Distance(BONDS, 1.6)]]]
+    others += [[*parts[:3], [Formula(text, [[0]])]] for text in ("x1", "y1")]
+    assert len({digest_of(*each) for each in (parts, *others)}) == 10
