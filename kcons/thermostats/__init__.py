@@ -3,6 +3,7 @@
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
+- `monte_carlo`: without any error of the time step
 - `configurational_temperature`: the temperature of configurations
 """
 
@@ -15,18 +16,27 @@ from kcons.thermostats.configurational_temperature import (
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, HamiltonianMonteCarlo
+from kcons.thermostats.monte_carlo.replica_exchange import exchange
+from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
+    "Counts",
     "Estimate",
     "Freedom",
+    "HamiltonianMonteCarlo",
     "Isokinetic",
     "Langevin",
     "NoseHooverChain",
+    "Tuned",
+    "best_share",
     "configurational_sample",
     "configurational_temperature",
+    "exchange",
     "freedom",
     "mean",
     "thermal_velocities",
+    "tune",
 ]
