@@ -3,7 +3,7 @@
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
-- `configurational_temperature`: the temperature of configurations
+- `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
 """
 
 from kcons.thermostats.configurational_temperature import (
@@ -16,6 +16,7 @@ from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
@@ -24,6 +25,8 @@ __all__ = [
     "Isokinetic",
     "Langevin",
     "NoseHooverChain",
+    "SplitTemperatures",
+    "TemperatureSplit",
     "configurational_sample",
     "configurational_temperature",
     "freedom",
