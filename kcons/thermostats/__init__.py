@@ -4,7 +4,7 @@
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
 - `monte_carlo`: without any error of the time step
-- `configurational_temperature`: the temperature of configurations
+- `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
 """
 
 from kcons.thermostats.configurational_temperature import (
@@ -20,6 +20,7 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, Hamilt
 from kcons.thermostats.monte_carlo.replica_exchange import exchange
 from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
 from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
@@ -30,6 +31,8 @@ __all__ = [
     "Isokinetic",
     "Langevin",
     "NoseHooverChain",
+    "SplitTemperatures",
+    "TemperatureSplit",
     "Tuned",
     "best_share",
     "configurational_sample",
