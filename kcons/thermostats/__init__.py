@@ -3,6 +3,7 @@
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
+- `multistep`: several time steps, and isokinetic spheres
 - `configurational_temperature`: the temperature of configurations
 """
 
@@ -15,17 +16,22 @@ from kcons.thermostats.configurational_temperature import (
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.multistep import ForceGroups, IsokineticSpheres, LangevinRespa, evaluations_per_sample
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
     "Estimate",
+    "ForceGroups",
     "Freedom",
     "Isokinetic",
+    "IsokineticSpheres",
     "Langevin",
+    "LangevinRespa",
     "NoseHooverChain",
     "configurational_sample",
     "configurational_temperature",
+    "evaluations_per_sample",
     "freedom",
     "mean",
     "thermal_velocities",
