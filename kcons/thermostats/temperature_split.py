@@ -115,7 +115,7 @@ class Clusters:
     def add_up(self, values: FloatArray) -> FloatArray:
         """Sums over the atoms of each cluster, shape (count,) or (count, 3)."""
         if values.ndim == 1:
-            return np.bincount(self._of, values[self._moving], self.count)
+            return np.asarray(np.bincount(self._of, values[self._moving], self.count), dtype=np.float64)
         return np.stack([self.add_up(np.ascontiguousarray(column)) for column in values.T], axis=1)
 
     def spread(self, values: FloatArray) -> FloatArray:
