@@ -55,6 +55,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 130
 
 
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """The parser of each command."""
+    (found,) = (action for action in _parser()._actions if isinstance(action, argparse._SubParsersAction))
+    return dict(found.choices)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")

@@ -34,6 +34,8 @@ _NAMES = {
     "work_precision.measurement": ("Comparison", "Measurement"),
 }
 
+__all__ = sorted(name for names in (*_MODULES.values(), *_NAMES.values()) for name in names)
+
 
 def __getattr__(name: str) -> Any:
     for folder, modules in _MODULES.items():

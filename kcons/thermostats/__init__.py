@@ -4,7 +4,7 @@
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
 - `multistep`: several time steps, and isokinetic spheres
-- `configurational_temperature`: the temperature of configurations
+- `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
 """
 
 from kcons.thermostats.configurational_temperature import (
@@ -18,6 +18,7 @@ from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.multistep import ForceGroups, IsokineticSpheres, LangevinRespa, evaluations_per_sample
 from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
@@ -29,6 +30,8 @@ __all__ = [
     "Langevin",
     "LangevinRespa",
     "NoseHooverChain",
+    "SplitTemperatures",
+    "TemperatureSplit",
     "configurational_sample",
     "configurational_temperature",
     "evaluations_per_sample",
