@@ -21,7 +21,7 @@ _MODULES = {
     "work_precision": ("fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
-    "averages.extrapolation": ("extrapolate",),
+    "averages.step_zero": ("extrapolate",),
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
     "test_systems": ("Reference", "TestSystem"),

@@ -65,8 +65,9 @@ class SplitTemperatures:
     shifts, turns : int
         Degrees of freedom of the first two.
     shift_frequency, turn_frequency : float
-        Root mean square angular frequency of shifts and of turns, as of oscillators, in inverse units of time. Velocities
-        at the positions, as velocity Verlet has them, are colder than configurations by about (frequency dt/2)^2.
+        Root mean square angular frequency of shifts and of turns, as of oscillators, in inverse units of time.
+        Velocities at the positions, as velocity Verlet has them, are colder than configurations by about
+        (frequency dt/2)^2.
     samples : int
     left_out : tuple of str
         What does not count, and why.

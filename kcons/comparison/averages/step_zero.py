@@ -1,8 +1,8 @@
 """Averages at several time steps, extrapolated to step zero.
 
-Averages of a thermostat of order p are off by c h^p and less. So a weighted fit of a + c h^p to runs at two or more steps
-removes the bias (Coshic and Hummer, arXiv:2603.02383), at the price of noise: with steps h and 2h of order 2 the value
-is (4 a(h) - a(2h))/3, and its error a third more than that of the finer run alone.
+Averages of a thermostat of order p are off by c h^p and less. So a weighted fit of a + c h^p to runs at two or more
+steps removes the bias (Coshic and Hummer, arXiv:2603.02383), at the price of noise: with steps h and 2h of order 2 the
+value is (4 a(h) - a(2h))/3, and its error a third more than that of the finer run alone, or higher.
 """
 
 from __future__ import annotations
