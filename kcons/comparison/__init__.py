@@ -21,6 +21,7 @@ _MODULES = {
     "work_precision": ("fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
+    "averages.step_zero": ("extrapolate",),
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
     "test_systems": ("Reference", "TestSystem"),

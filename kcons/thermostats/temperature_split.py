@@ -64,6 +64,10 @@ class SplitTemperatures:
         Of all other motions that the constraints allow: within clusters, and of clusters tied to space.
     shifts, turns : int
         Degrees of freedom of the first two.
+    shift_frequency, turn_frequency : float
+        Root mean square angular frequency of shifts and of turns, as of oscillators, in inverse units of time.
+        Velocities at the positions, as velocity Verlet has them, are colder than configurations by about
+        (frequency dt/2)^2.
     samples : int
     left_out : tuple of str
         What does not count, and why.
@@ -74,6 +78,8 @@ class SplitTemperatures:
     internal: Estimate | None
     shifts: int
     turns: int
+    shift_frequency: float
+    turn_frequency: float
     samples: int
     left_out: tuple[str, ...]
 
@@ -297,12 +303,16 @@ class TemperatureSplit:
             else None
             for kind, there in enumerate(exists)
         )
+        counts = 3 * int(exists[0].sum()), int(exists[1].sum())
+        squares = [max(float(series[:, 1, kind].mean()), 0.0) / max(counts[kind], 1) for kind in (0, 1)]
         return SplitTemperatures(
             shift,
             turn,
             internal,
-            shifts=3 * int(exists[0].sum()),
-            turns=int(exists[1].sum()),
+            shifts=counts[0],
+            turns=counts[1],
+            shift_frequency=math.sqrt(squares[0]),
+            turn_frequency=math.sqrt(squares[1]),
             samples=len(series),
             left_out=tuple(self._left_out(inside)),
         )

@@ -47,3 +47,7 @@ def test_each_command_has_its_help():
     assert {"compare", "plan", "check", "scan", "freeenergy", "warmup"} <= set(main.commands())
     for name, parser in main.commands().items():
         assert f"usage: kcons {name}" in parser.format_help()
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120

@@ -43,6 +43,7 @@ def test_a_dumbbell_on_springs():
     assert np.abs(above[:, 1:]).max() < 1e-20 and np.abs(below[:, 1:]).max() < 1e-5
     found = split.result()
     assert (found.shifts, found.turns, found.samples) == (3, 2, 40)
+    assert found.shift_frequency == pytest.approx(math.sqrt(k / m), rel=1e-6) and found.turn_frequency < 0.01
     assert found.turn is None or found.turn.value == 0 or abs(found.turn.value) < 1e-6
     assert found.internal is None and found.left_out == ()
 
