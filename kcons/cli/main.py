@@ -120,6 +120,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
+    slow = "expensive and cheap forces: how long may the step be? For fluids how far molecules reach (--fast 6), for "
+    slow += "files forces as in --forces (--slow gfn2 --fast amber14-all,amber14/tip3p)"
+    layers = compare.add_argument_group(slow)
+    layers.add_argument("--slow", metavar="FORCES", help="the expensive ones (default for fluids: half the box)")
+    layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
     report = compare.add_argument_group("the whole comparison")
     report.add_argument(
         "--all",
@@ -168,6 +173,8 @@ def _compare(chosen: argparse.Namespace) -> int:
     target: float | None = chosen.target_error
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
+    if chosen.slow is not None or chosen.fast is not None:
+        return studies.compare_steps(chosen, budget, folder)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")

@@ -14,7 +14,7 @@ from typing import Any
 
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
-    "averages": ("sampling",),
+    "averages": ("long_steps", "long_steps_report", "sampling"),
     "test_systems": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),
