@@ -301,7 +301,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force, friction=self._friction, far=_FAR)
+            self._system = System(bound.motion, self._force, potential=self._energy, friction=self._friction, far=_FAR)
             self.stepper.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
@@ -324,12 +324,16 @@ class ConstrainedDynamics(MolecularDynamics):
             rows.extend(translated(self.atoms, [item]))
         return rows
 
-    def _force(self, x: FloatArray, time: float) -> ArrayLike:
+    def _energy(self, x: FloatArray, time: float) -> float:
+        """Of the calculator, and of Hookean and ExternalForce."""
+        self.atoms.arrays["positions"][...] = x
+        return float(self.atoms.get_potential_energy(apply_constraint=self._only_forces))
+
+    def _force(self, x: FloatArray, time: float) -> Any:
         self.atoms.arrays["positions"][...] = x
         if self._only_forces:
             return applied_forces(self.atoms)
-        forces: ArrayLike = self.atoms.get_forces(apply_constraint=False)
-        return forces
+        return self.atoms.get_forces(apply_constraint=False)
 
 
 def _cell_of(atoms: Atoms) -> bytes:

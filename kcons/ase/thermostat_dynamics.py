@@ -17,7 +17,7 @@ from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import Momentum, open_directions, positive
 from kcons.thermostats.isokinetic.isokinetic import Convention
 
@@ -29,7 +29,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
     ----------
     atoms, timestep
         As for `ConstrainedDynamics`.
-    stepper : Isokinetic, Langevin or NoseHooverChain
+    stepper : Isokinetic, Langevin, NoseHooverChain or HamiltonianMonteCarlo
     restart : path, optional
         File written by `save`.
     **kwargs
@@ -43,7 +43,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         self,
         atoms: Atoms,
         timestep: float,
-        stepper: Isokinetic | Langevin | NoseHooverChain,
+        stepper: Isokinetic | Langevin | NoseHooverChain | HamiltonianMonteCarlo,
         *,
         restart: str | PathLike[str] | None = None,
         **kwargs: Any,
@@ -103,12 +103,9 @@ class ThermostattedDynamics(ConstrainedDynamics):
 
     def get_conserved_energy(self) -> float:
         """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core."""
-        system = self._systems()
-        if system.potential is None:
-            # Only asked for where the atoms are, for which the calculator still knows the energy.
-            system.potential = lambda x, t: float(self.atoms.get_potential_energy(apply_constraint=False))
         stepper = cast(Isokinetic | Langevin | NoseHooverChain, self.stepper)
-        return float(stepper.conserved_energy(system, self._start(self._systems())))
+        system = self._systems()
+        return float(stepper.conserved_energy(system, self._start(system)))
 
 
 class IsokineticDynamics(ThermostattedDynamics):

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, freeenergy, scan, studies, warmup
+from kcons.cli import check, completion, doctor, freeenergy, scan, studies, warmup
+from kcons.cli.parser import Parser
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError, KconsError, did_you_mean, with_extra
 
 if TYPE_CHECKING:
     from kcons.comparison.methods.method import Method
@@ -38,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> int:
     parser = _parser()
-    chosen = parser.parse_args(arguments)
+    chosen = parser.parse_fully(arguments)
     if chosen.version:
         print(f"kcons {__version__}")
         return 0
@@ -47,6 +48,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 0
     try:
         return int(chosen.run(chosen))
+    except ModuleNotFoundError as error:
+        explained = with_extra(error, f"kcons {chosen.command}")
+        if not isinstance(explained, KconsError):
+            raise
+        print(f"kcons: {explained}", file=sys.stderr)
+        return 2
     except (KconsError, OSError) as error:
         print(f"kcons: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -55,19 +62,18 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 130
 
 
-def commands() -> dict[str, argparse.ArgumentParser]:
+def commands() -> dict[str, Parser]:
     """The parser of each command."""
-    (found,) = (action for action in _parser()._actions if isinstance(action, argparse._SubParsersAction))
-    return dict(found.choices)
+    return _parser().commands()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
+def _parser() -> Parser:
+    parser = Parser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
     names_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     common.add_argument("scene", nargs="?", help=names_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
@@ -125,6 +131,12 @@ def _parser() -> argparse.ArgumentParser:
     layers = compare.add_argument_group(slow)
     layers.add_argument("--slow", metavar="FORCES", help="the expensive ones (default for fluids: half the box)")
     layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
+    compare.add_argument(
+        "--criterion",
+        choices=("error", "drift", "temperature"),
+        help="what methods are ranked by: error of the trajectory (default), drift of the energy; for thermostats the "
+        "temperature of the configurations",
+    )
     report = compare.add_argument_group("the whole comparison")
     report.add_argument(
         "--all",
@@ -147,6 +159,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     plan.set_defaults(run=_plan)
     check.add(commands)
+    completion.add(commands, _parser)
+    doctor.add(commands)
     freeenergy.add(commands)
     scan.add(commands)
     studies.add(commands)
@@ -178,10 +192,22 @@ def _compare(chosen: argparse.Namespace) -> int:
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
+        if chosen.criterion not in (None, "temperature"):
+            raise InputError(
+                f"--criterion {chosen.criterion} is for trajectories; thermostats are ranked by temperature",
+                item="criterion",
+            )
         return _compare_averages(chosen, budget, folder, asked)
+    if chosen.criterion == "temperature":
+        raise InputError(
+            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}; here error and drift are known",
+            item="criterion",
+        )
+    if chosen.criterion == "drift" and target is not None:
+        raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
     from kcons.cli.progress import Bars
     from kcons.comparison.methods import methods
-    from kcons.comparison.work_precision import measure, recommendation, report
+    from kcons.comparison.work_precision import answer, measure, recommendation, report
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
@@ -203,8 +229,9 @@ def _compare(chosen: argparse.Namespace) -> int:
             settings=asked,
             reference=reference,
             rounds=rounds,
+            partial=True,
         )
-        if target is not None and reference is not None:
+        if target is not None and reference is not None and "interrupted" not in result.settings:
             result = recommendation.recommend(
                 test_system,
                 result,
@@ -217,11 +244,14 @@ def _compare(chosen: argparse.Namespace) -> int:
             )
     terminal = console()
     explained = report.explanation(result)
-    if target is not None:
-        explained += "\n\n" + recommendation.sentences(result)
+    ranked = answer.answer(result, chosen.criterion or "error", target)
+    first = [recommendation.sentences(result)] if result.recommendation is not None else []
+    first += [] if ranked is None else [answer.text(ranked)]
+    for words in first:
+        terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(report.table(result, narrow=not report.fits(result, terminal.width)), explained, terminal)
-    say_written(report.write(result, folder, tables=[rendered(report.table(result)), explained]))
-    return 0
+    say_written(report.write(result, folder, tables=[*first, rendered(report.table(result)), explained]))
+    return 130 if "interrupted" in result.settings else 0
 
 
 def _expression(chosen: argparse.Namespace) -> str:
@@ -272,6 +302,7 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import report as sampling_report
     from kcons.comparison.averages import sampling
+    from kcons.comparison.work_precision import answer
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_name(chosen)
@@ -289,8 +320,13 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
             fluid, methods=chosen.methods, budget=budget, seed=chosen.seed, watcher=watcher, settings=asked
         )
     table, explained = sampling_report.table(result), sampling_report.explanation(result)
-    show(table, explained, console())
-    say_written(sampling_report.write(result, folder, tables=[rendered(table), explained]))
+    ranked = answer.answer_of_averages(result)
+    first = [] if ranked is None else [answer.text(ranked)]
+    terminal = console()
+    for words in first:
+        terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
+    show(table, explained, terminal)
+    say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
     return 0
 
 
@@ -307,7 +343,10 @@ def _check_name(chosen: argparse.Namespace) -> None:
             raise InputError("a file has the size it has; leave --size out", item="size")
     elif chosen.scene not in test_systems.SYSTEMS and chosen.scene not in test_systems.FLUIDS:
         raise InputError(
-            f"there is no test system {chosen.scene!r}; there are {known}; or give a PDB file", item="scene"
+            f"there is no test system {chosen.scene!r}"
+            f"{did_you_mean(chosen.scene, (*test_systems.SYSTEMS, *test_systems.FLUIDS))}; "
+            f"there are {known}; or give a PDB file",
+            item="scene",
         )
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")

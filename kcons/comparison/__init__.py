@@ -12,13 +12,15 @@
 from importlib import import_module
 from typing import Any
 
+from kcons.errors import with_extra
+
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
     "averages": ("long_steps", "long_steps_report", "sampling"),
     "test_systems": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),
-    "work_precision": ("fronts", "measure", "recommendation", "report"),
+    "work_precision": ("answer", "fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
     "averages.step_zero": ("extrapolate",),
@@ -39,6 +41,13 @@ __all__ = sorted(name for names in (*_MODULES.values(), *_NAMES.values()) for na
 
 
 def __getattr__(name: str) -> Any:
+    try:
+        return _found(name)
+    except ModuleNotFoundError as error:
+        raise with_extra(error, f"{__name__}.{name}") from error
+
+
+def _found(name: str) -> Any:
     for folder, modules in _MODULES.items():
         if name in modules:
             return import_module(f"{__name__}.{folder}.{name}")
