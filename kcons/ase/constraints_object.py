@@ -16,7 +16,7 @@ from kcons.ase.binding import Binding, applied_forces, bind, check_company, touc
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
-from kcons.ase.virial import VOIGT, virial_of
+from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
