@@ -17,16 +17,19 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed
+from kcons.thermostats.pressure import Barostat, ConstantPressure
+from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
 _FAR = 128.0
@@ -65,6 +68,9 @@ class ConstrainedDynamics(MolecularDynamics):
         See `Constraints`.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
+    barostat : MonteCarloBarostat or CellRescaling, optional
+        Keeps the pressure, in eV/A^3 (1 bar is `ase.units.bar`), beside a thermostat: the cell changes
+        from one step to the next, and atoms with it. See `kcons.thermostats.pressure`.
     friction : array_like, shape () or (n_atoms,)
         Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
         come to rest; for a temperature use `ConstrainedLangevin`.
@@ -100,6 +106,7 @@ class ConstrainedDynamics(MolecularDynamics):
         state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
+        barostat: Barostat | None = None,
         friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
@@ -108,6 +115,7 @@ class ConstrainedDynamics(MolecularDynamics):
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
+        self.barostat = barostat
         self.time = float(time)
         self._degenerate = degenerate
         self._friction = friction
@@ -166,7 +174,13 @@ class ConstrainedDynamics(MolecularDynamics):
     def listing(self) -> str:
         """What a step consists of, a line for each operation; the name alone for steppers that have no list."""
         system = self._systems()
-        return self.stepper.listing(system) if isinstance(self.stepper, Listed) else repr(self.stepper)
+        mover = self._mover
+        return mover.listing(system) if isinstance(mover, Listed) else repr(mover)
+
+    @property
+    def _mover(self) -> Stepper:
+        """What makes the steps."""
+        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -183,7 +197,7 @@ class ConstrainedDynamics(MolecularDynamics):
         system = self._systems()
         state = self._start(system)
         try:
-            after = self.stepper.step(system, state, self.dt)
+            after = self._mover.step(system, state, self.dt)
             if self._check_every and self.dt and getattr(self.stepper, "holds", True):
                 system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
         except BaseException as error:
@@ -193,8 +207,10 @@ class ConstrainedDynamics(MolecularDynamics):
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
         self.time = after.time
-        carried = after.remainder, after.time_remainder, after.thermostat
+        carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
+        if after.barostat is not None:
+            self._cell = _cell_of(self.atoms)
 
     def _name_step(self, error: BaseException, number: int) -> None:
         if getattr(error, "step", None) is None:
@@ -260,14 +276,18 @@ class ConstrainedDynamics(MolecularDynamics):
             x[...] = state.positions
         else:
             self._momenta, v = self._put(state.positions, state.velocities)
-        self._state = State(state.positions, v, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat)
+        pressed = None if last is None else in_cell(last.barostat, atoms.cell.array)
+        carried = state.remainder, 0.0, thermostat, pressed
+        self._state = State(state.positions, v, self.time, forces, self.nsteps, *carried)
         self._cell = cell
         return self._state
 
     def _resume(self, state: State) -> None:
         """Go on from `state` exactly; the atoms are changed only if it fits them."""
-        system = self._systems()
         n = len(self.atoms)
+        if state.cell is not None and self.barostat is not None:
+            self.atoms.cell[...] = state.cell
+        system = self._systems()
         x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
         require_on_surface(system.motion.constraint_set, x, state.time)
         away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
@@ -301,8 +321,7 @@ class ConstrainedDynamics(MolecularDynamics):
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force, friction=self._friction, far=_FAR)
-            self.stepper.check(self._system)
+            self._system = self._made(bound.motion)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
             self._weights = (
@@ -313,6 +332,19 @@ class ConstrainedDynamics(MolecularDynamics):
             bound.follow_cell(atoms, atoms.cell.array)
         assert self._system is not None
         return self._system
+
+    def _made(self, motion: Motion) -> System:
+        if self.barostat is None:
+            system = System(motion, self._force, friction=self._friction, far=_FAR)
+        else:
+            if np.any(self._friction):
+                raise UnsupportedError(
+                    "friction has no temperature, and a barostat asks for one; use ConstrainedLangevin"
+                )
+            system = AtomsSystem(motion, self._force, self.atoms, only_forces=self._only_forces, far=_FAR)
+            self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
+        self._mover.check(system)
+        return system
 
     def _rows(self, present: Iterable[Any]) -> list[Constraint]:
         rows: list[Constraint] = []

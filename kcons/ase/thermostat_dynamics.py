@@ -20,6 +20,7 @@ from kcons.steppers import State
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import Momentum, open_directions, positive
 from kcons.thermostats.isokinetic.isokinetic import Convention
+from kcons.thermostats.pressure import ConstantPressure
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
@@ -52,13 +53,14 @@ class ThermostattedDynamics(ConstrainedDynamics):
             if "state" in kwargs:
                 raise InputError("give restart or state, not both", item="restart")
             kwargs["state"] = _read(restart, len(atoms))
-        before = atoms.positions.copy(), atoms.get_momenta()
+        before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
         try:
             super().__init__(atoms, timestep, stepper, **kwargs)
             self._begin()
         except BaseException:
             atoms.set_positions(before[0], apply_constraint=False)
             atoms.set_momenta(before[1], apply_constraint=False)
+            atoms.cell[...] = before[2]
             raise
 
     def _begin(self) -> None:
@@ -107,7 +109,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
         if system.potential is None:
             # Only asked for where the atoms are, for which the calculator still knows the energy.
             system.potential = lambda x, t: float(self.atoms.get_potential_energy(apply_constraint=False))
-        stepper = cast(Isokinetic | Langevin | NoseHooverChain, self.stepper)
+        stepper = cast(Isokinetic | Langevin | NoseHooverChain | ConstantPressure, self._mover)
         return float(stepper.conserved_energy(system, self._start(self._systems())))
 
 

@@ -3,6 +3,7 @@
 - `freedom`: which degrees of freedom a thermostat acts on
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
+- `pressure`: barostats beside them
 - `configurational_temperature`: the temperature of configurations
 """
 
