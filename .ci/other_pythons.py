@@ -52,13 +52,20 @@ def smoke(python, folder):
         [python, "-m", "venv", folder],
         [place / "python", "-m", "pip", "install", "--quiet", ROOT],
         [place / "python", "-c", STEP],
-        [place / "kcons", "compare", "--list"],
+        [place / "kcons", "doctor"],
     ]
     for command in commands:
         # Elsewhere than in the source tree, so that what was installed is what is imported.
         result = subprocess.run(command, cwd=folder.parent, capture_output=True, text=True)
         if result.returncode:
             print(f"   FAILED: {' '.join(map(str, command))}\n{result.stdout}{result.stderr}")
+            return False
+    # Without any extra, what needs one says which.
+    for words, extra in ((["kcons", "compare", "water"], "ase"), (["python", "-c", "import kcons.openmm"], "openmm")):
+        command = [place / words[0], *words[1:]]
+        result = subprocess.run(command, cwd=folder.parent, capture_output=True, text=True)
+        if not result.returncode or f"pip install 'kcons[{extra}]'" not in result.stderr:
+            print(f"   FAILED to name the extra {extra}: {' '.join(words)}\n{result.stdout}{result.stderr}")
             return False
     shutil.rmtree(folder)
     return True

@@ -7,6 +7,7 @@ the built-in that fits (`ValueError`, `RuntimeError`, ...), and carries its data
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 
@@ -215,3 +216,38 @@ class CalculatorError(KconsError, RuntimeError):
 
 class UnsupportedError(KconsError, NotImplementedError):
     """The MD engine or method cannot do this; the message says what to use instead."""
+
+
+class MissingPackageError(KconsError, ModuleNotFoundError):
+    """A package that is an extra is not installed."""
+
+
+#: Packages that not everybody needs, and the extra that installs each.
+EXTRAS = {
+    "ase": "ase",
+    "matplotlib": "plots",
+    "openmm": "openmm",
+    "MDAnalysis": "mdanalysis",
+    "tblite": "xtb",
+    "sympy": "formulas",
+    "pymbar": "free-energy",
+    "shtab": "completion",
+}
+
+
+def with_extra(error: ModuleNotFoundError, what: str) -> ModuleNotFoundError:
+    """The same error; where a package of `EXTRAS` is missing, one that says what `what` needs and how to install it."""
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRAS or isinstance(error, MissingPackageError):
+        return error
+    return MissingPackageError(
+        f"{what} needs {package}, which is not installed: python -m pip install 'kcons[{EXTRAS[package]}]'",
+        name=package,
+    )
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """What to add to a sentence about a name that is not known; '' where nothing is like it."""
+    names = {name.lower(): name for name in known}
+    near = get_close_matches(word.lower(), names, n=1, cutoff=0.6)
+    return f" (did you mean {names[near[0]]!r}?)" if near else ""

@@ -25,7 +25,7 @@ KINDS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if kind
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_one_root_beside_a_built_in(kind):
     assert issubclass(kind, KconsError)
-    assert kind is KconsError or issubclass(kind, ValueError | RuntimeError | FloatingPointError)
+    assert kind is KconsError or issubclass(kind, ValueError | RuntimeError | FloatingPointError | ImportError)
     assert inspect.getdoc(kind)
     needed = {"budget": 1.0, "consistent": 1.0, "time": 1.0} if kind is BudgetError else {}
     error = kind("what, and what to do", **needed)
@@ -57,3 +57,48 @@ def test_a_budget_says_what_the_start_allows():
 def test_errors_come_back_from_other_processes():
     error = pickle.loads(pickle.dumps(ConvergenceError("no", row=4, atoms=[1, 2], step=9)))
     assert str(error) == "no" and (error.row, error.atoms, error.step) == (4, (1, 2), 9)
+
+
+def test_a_missing_extra_is_named():
+    found = errors.with_extra(ModuleNotFoundError("no", name="openmm.app"), "kcons.openmm")
+    assert isinstance(found, errors.MissingPackageError) and isinstance(found, ModuleNotFoundError)
+    assert str(found) == "kcons.openmm needs openmm, which is not installed: python -m pip install 'kcons[openmm]'"
+    assert found.name == "openmm"
+    assert errors.with_extra(found, "other") is found
+    own = ModuleNotFoundError("no", name="kcons.nothing")
+    assert errors.with_extra(own, "other") is own
+
+
+def test_extras_are_those_of_the_package():
+    import tomllib
+    from pathlib import Path
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for package, extra in errors.EXTRAS.items():
+        listed = project["optional-dependencies"][extra]
+        assert any(entry.lower().startswith(package.lower()) for entry in listed), (package, extra)
+    needed = " ".join(project["dependencies"]).lower()
+    assert not [package for package in errors.EXTRAS if package.lower() in needed]
+
+
+@pytest.mark.parametrize(
+    ("module", "package"),
+    [("kcons.ase", "ase"), ("kcons.openmm", "openmm"), ("kcons.mdanalysis", "MDAnalysis")],
+)
+def test_a_folder_without_its_md_engine_names_the_extra(module, package, monkeypatch):
+    import sys
+    from importlib import import_module
+
+    gone = [name for name in sys.modules if f"{name}.".startswith((f"{module}.", f"{package}."))]
+    for name in gone:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(errors.MissingPackageError, match=rf"kcons\[{package.lower()}\]"):
+        import_module(module)
+
+
+def test_did_you_mean():
+    known = ["rattle", "suzuki4", "Water"]
+    assert errors.did_you_mean("ratle", known) == " (did you mean 'rattle'?)"
+    assert errors.did_you_mean("watr", known) == " (did you mean 'Water'?)"
+    assert errors.did_you_mean("xyz", known) == ""

@@ -8,29 +8,38 @@ the object with ASE, which makes files that contain it readable.
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `pressure`: the stress of the constraint forces, cells that change
 - `calculator`, `named_calculators`: forces along the constraints, for optimisers; calculators by name
-- `dynamics`, `thermostat_dynamics`: dynamics with any stepper
+- `dynamics`, `thermostat_dynamics`, `multiple_time_steps`, `monte_carlo`: dynamics with any stepper
 """
 
-from kcons.ase.calculator import ConstrainedCalculator
-from kcons.ase.constraints_object import Constraints, constrain
-from kcons.ase.dynamics import ConstrainedDynamics
-from kcons.ase.rigid_water import rigid_water
-from kcons.ase.thermostat_dynamics import (
-    ConstrainedLangevin,
-    ConstrainedNoseHoover,
-    IsokineticDynamics,
-    draw_velocities,
-)
-from kcons.ase.topology import constraints_of, mend_elements
-from kcons.ase.translation import from_ase_constraints
+from kcons.errors import with_extra
+
+try:
+    from kcons.ase.calculator import ConstrainedCalculator
+    from kcons.ase.constraints_object import Constraints, constrain
+    from kcons.ase.dynamics import ConstrainedDynamics
+    from kcons.ase.monte_carlo import ConstrainedMonteCarlo
+    from kcons.ase.multiple_time_steps import MultipleTimeSteps
+    from kcons.ase.rigid_water import rigid_water
+    from kcons.ase.thermostat_dynamics import (
+        ConstrainedLangevin,
+        ConstrainedNoseHoover,
+        IsokineticDynamics,
+        draw_velocities,
+    )
+    from kcons.ase.topology import constraints_of, mend_elements
+    from kcons.ase.translation import from_ase_constraints
+except ModuleNotFoundError as error:
+    raise with_extra(error, "kcons.ase") from error
 
 __all__ = [
     "ConstrainedCalculator",
     "ConstrainedDynamics",
     "ConstrainedLangevin",
+    "ConstrainedMonteCarlo",
     "ConstrainedNoseHoover",
     "Constraints",
     "IsokineticDynamics",
+    "MultipleTimeSteps",
     "constrain",
     "constraints_of",
     "draw_velocities",

@@ -17,22 +17,20 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed
-from kcons.thermostats.pressure import Barostat, ConstantPressure
 from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
-_FAR = 128.0
+FAR = 128.0
 
 _FLOAT = np.dtype(np.float64)
 
@@ -68,9 +66,6 @@ class ConstrainedDynamics(MolecularDynamics):
         See `Constraints`.
     check_every : int, optional
         As for `kcons.run`: steps from one certificate of the state to the next.
-    barostat : MonteCarloBarostat or CellRescaling, optional
-        Keeps the pressure, in eV/A^3 (1 bar is `ase.units.bar`), beside a thermostat: the cell changes
-        from one step to the next, and atoms with it. See `kcons.thermostats.pressure`.
     friction : array_like, shape () or (n_atoms,)
         Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
         come to rest; for a temperature use `ConstrainedLangevin`.
@@ -106,7 +101,6 @@ class ConstrainedDynamics(MolecularDynamics):
         state: State | None = None,
         degenerate: Literal["convert", "raise"] = "convert",
         check_every: int | None = None,
-        barostat: Barostat | None = None,
         friction: ArrayLike = 0.0,
         **kwargs: Any,
     ) -> None:
@@ -115,7 +109,6 @@ class ConstrainedDynamics(MolecularDynamics):
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
         self.stepper: Stepper = Rattle() if stepper is None else stepper
-        self.barostat = barostat
         self.time = float(time)
         self._degenerate = degenerate
         self._friction = friction
@@ -180,7 +173,7 @@ class ConstrainedDynamics(MolecularDynamics):
     @property
     def _mover(self) -> Stepper:
         """What makes the steps."""
-        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
+        return self.stepper
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -203,7 +196,7 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
-            self._name_step(error, self.nsteps + 1)
+            name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
         self.time = after.time
@@ -212,12 +205,6 @@ class ConstrainedDynamics(MolecularDynamics):
         if after.barostat is not None:
             self._cell = _cell_of(self.atoms)
 
-    def _name_step(self, error: BaseException, number: int) -> None:
-        if getattr(error, "step", None) is None:
-            with suppress(AttributeError):
-                error.step = number  # type: ignore[attr-defined]
-            error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
-
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
         if any(self.nsteps % every == 0 if every > 0 else self.nsteps == -every for _, every, *_ in self.observers):
@@ -225,7 +212,7 @@ class ConstrainedDynamics(MolecularDynamics):
             try:
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
             except Exception as error:
-                self._name_step(error, self.nsteps)
+                name_step(error, self.nsteps)
                 raise
 
     def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -276,18 +263,15 @@ class ConstrainedDynamics(MolecularDynamics):
             x[...] = state.positions
         else:
             self._momenta, v = self._put(state.positions, state.velocities)
-        pressed = None if last is None else in_cell(last.barostat, atoms.cell.array)
-        carried = state.remainder, 0.0, thermostat, pressed
+        carried = state.remainder, 0.0, thermostat, None if last is None else in_cell(last.barostat, atoms.cell.array)
         self._state = State(state.positions, v, self.time, forces, self.nsteps, *carried)
         self._cell = cell
         return self._state
 
     def _resume(self, state: State) -> None:
         """Go on from `state` exactly; the atoms are changed only if it fits them."""
-        n = len(self.atoms)
-        if state.cell is not None and self.barostat is not None:
-            self.atoms.cell[...] = state.cell
         system = self._systems()
+        n = len(self.atoms)
         x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
         require_on_surface(system.motion.constraint_set, x, state.time)
         away = np.abs(system.motion.project_velocities(x, v, time=state.time) - v).max(initial=0.0)
@@ -315,13 +299,14 @@ class ConstrainedDynamics(MolecularDynamics):
             self._bound = None
         bound = self._bound
         if bound is None or not bound.fits(atoms):
-            rows = [*self._rows(present), *self._more]
+            rows = [*_rows(atoms, present), *self._more]
             bound = bind(rows, atoms, self._degenerate, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
             self._system = self._made(bound.motion)
+            self._mover.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
             self._weights = (
@@ -334,34 +319,37 @@ class ConstrainedDynamics(MolecularDynamics):
         return self._system
 
     def _made(self, motion: Motion) -> System:
-        if self.barostat is None:
-            system = System(motion, self._force, friction=self._friction, far=_FAR)
-        else:
-            if np.any(self._friction):
-                raise UnsupportedError(
-                    "friction has no temperature, and a barostat asks for one; use ConstrainedLangevin"
-                )
-            system = AtomsSystem(motion, self._force, self.atoms, only_forces=self._only_forces, far=_FAR)
-            self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
-        self._mover.check(system)
-        return system
+        return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
 
-    def _rows(self, present: Iterable[Any]) -> list[Constraint]:
-        rows: list[Constraint] = []
-        for item in present:
-            if isinstance(item, FORCES_ONLY):
-                continue
-            if isinstance(item, Constraints):
-                item.engine(self.atoms)  # settles targets that are open
-            rows.extend(translated(self.atoms, [item]))
-        return rows
+    def _energy(self, x: FloatArray, time: float) -> float:
+        """Of the calculator, and of Hookean and ExternalForce."""
+        self.atoms.arrays["positions"][...] = x
+        return float(self.atoms.get_potential_energy(apply_constraint=self._only_forces))
 
-    def _force(self, x: FloatArray, time: float) -> ArrayLike:
+    def _force(self, x: FloatArray, time: float) -> Any:
         self.atoms.arrays["positions"][...] = x
         if self._only_forces:
             return applied_forces(self.atoms)
-        forces: ArrayLike = self.atoms.get_forces(apply_constraint=False)
-        return forces
+        return self.atoms.get_forces(apply_constraint=False)
+
+
+def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
+    rows: list[Constraint] = []
+    for item in present:
+        if isinstance(item, FORCES_ONLY):
+            continue
+        if isinstance(item, Constraints):
+            item.engine(atoms)  # settles targets that are open
+        rows.extend(translated(atoms, [item]))
+    return rows
+
+
+def name_step(error: BaseException, number: int) -> None:
+    """Note in an error which step it belongs to."""
+    if getattr(error, "step", None) is None:
+        with suppress(AttributeError):
+            error.step = number  # type: ignore[attr-defined]
+        error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
 
 def _cell_of(atoms: Atoms) -> bytes:

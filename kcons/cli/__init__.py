@@ -1,7 +1,8 @@
 """The command `kcons`.
 
 - `terminal`, `progress`: what is written to the terminal
-- `check`, `freeenergy`, `scan`, `warmup`: the commands of these names
+- `parser`: what is said of names that are not known
+- `check`, `completion`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
 - `studies`: `kcons hardcases`, `kcons stability`
 - `main`: all others
 """

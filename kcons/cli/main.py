@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons import __version__
-from kcons.cli import check, freeenergy, scan, studies, warmup
+from kcons.cli import check, completion, doctor, freeenergy, scan, studies, warmup
+from kcons.cli.parser import Parser
 from kcons.cli.terminal import console, names, numbers, patient_streams, rendered, say_written, show
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError, KconsError, did_you_mean, with_extra
 
 if TYPE_CHECKING:
     from kcons.comparison.methods.method import Method
@@ -38,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> int:
     parser = _parser()
-    chosen = parser.parse_args(arguments)
+    chosen = parser.parse_fully(arguments)
     if chosen.version:
         print(f"kcons {__version__}")
         return 0
@@ -47,6 +48,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 0
     try:
         return int(chosen.run(chosen))
+    except ModuleNotFoundError as error:
+        explained = with_extra(error, f"kcons {chosen.command}")
+        if not isinstance(explained, KconsError):
+            raise
+        print(f"kcons: {explained}", file=sys.stderr)
+        return 2
     except (KconsError, OSError) as error:
         print(f"kcons: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -55,13 +62,18 @@ def _main(arguments: Sequence[str] | None) -> int:
         return 130
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="kcons", description="Constraints in molecular dynamics.")
+def commands() -> dict[str, Parser]:
+    """The parser of each command."""
+    return _parser().commands()
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="kcons", description="Constraints in molecular dynamics.")
     parser.add_argument("--version", action="store_true", help="print the version and leave")
     commands = parser.add_subparsers(title="commands", dest="command")
 
     names_help = "one of the built-in test systems, --list shows them; or a file: PDB, mmCIF, or what MDAnalysis reads"
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     common.add_argument("scene", nargs="?", help=names_help)
     common.add_argument("--size", type=int, help="number of molecules, bonds or particles")
     common.add_argument("--seed", type=int, default=1, help="of the initial velocities (default 1)")
@@ -136,6 +148,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     plan.set_defaults(run=_plan)
     check.add(commands)
+    completion.add(commands, _parser)
+    doctor.add(commands)
     freeenergy.add(commands)
     scan.add(commands)
     studies.add(commands)
@@ -294,7 +308,10 @@ def _check_name(chosen: argparse.Namespace) -> None:
             raise InputError("a file has the size it has; leave --size out", item="size")
     elif chosen.scene not in test_systems.SYSTEMS and chosen.scene not in test_systems.FLUIDS:
         raise InputError(
-            f"there is no test system {chosen.scene!r}; there are {known}; or give a PDB file", item="scene"
+            f"there is no test system {chosen.scene!r}"
+            f"{did_you_mean(chosen.scene, (*test_systems.SYSTEMS, *test_systems.FLUIDS))}; "
+            f"there are {known}; or give a PDB file",
+            item="scene",
         )
     if chosen.seed < 0:
         raise InputError(f"the seed is {chosen.seed}; give a non-negative number", item="seed")

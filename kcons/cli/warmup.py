@@ -29,7 +29,7 @@ from kcons.constraints import (
 )
 from kcons.constraints.compilation import announcer
 from kcons.constraints.constraint import Constraint
-from kcons.errors import InputError
+from kcons.errors import InputError, did_you_mean
 from kcons.steppers import BlanesMoan6, Rattle, Stepper
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
 
@@ -62,7 +62,10 @@ def _warmup(chosen: argparse.Namespace) -> int:
         return 0
     wanted = [name for given in chosen.what for name in names(given)] or list(KINDS)
     if unknown := sorted(set(wanted) - set(KINDS)):
-        raise InputError(f"nothing here is called {unknown[0]!r}; choose of {', '.join(KINDS)}", item="what")
+        raise InputError(
+            f"nothing here is called {unknown[0]!r}{did_you_mean(unknown[0], KINDS)}; choose of {', '.join(KINDS)}",
+            item="what",
+        )
     terminal = console()
     announcer.announced = True  # it is said here
     for name in wanted:

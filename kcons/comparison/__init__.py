@@ -12,6 +12,8 @@
 from importlib import import_module
 from typing import Any
 
+from kcons.errors import with_extra
+
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
     "averages": ("sampling",),
@@ -21,6 +23,7 @@ _MODULES = {
     "work_precision": ("fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
+    "averages.step_zero": ("extrapolate",),
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),
     "test_systems": ("Reference", "TestSystem"),
@@ -34,8 +37,17 @@ _NAMES = {
     "work_precision.measurement": ("Comparison", "Measurement"),
 }
 
+__all__ = sorted(name for names in (*_MODULES.values(), *_NAMES.values()) for name in names)
+
 
 def __getattr__(name: str) -> Any:
+    try:
+        return _found(name)
+    except ModuleNotFoundError as error:
+        raise with_extra(error, f"{__name__}.{name}") from error
+
+
+def _found(name: str) -> Any:
     for folder, modules in _MODULES.items():
         if name in modules:
             return import_module(f"{__name__}.{folder}.{name}")

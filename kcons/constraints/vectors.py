@@ -22,7 +22,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """The same numbers as `numpy.cross`, several times faster for few vectors."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    result = np.empty(np.broadcast(a, b).shape)
     np.subtract(ay * bz, az * by, out=result[..., 0])
     np.subtract(az * bx, ax * bz, out=result[..., 1])
     np.subtract(ax * by, ay * bx, out=result[..., 2])

@@ -12,6 +12,8 @@
 from importlib import import_module
 from typing import Any
 
+from kcons.errors import with_extra
+
 #: Public names by the module that has them, which is imported when one is asked for.
 _NAMES = {
     "held_coordinates": ("HeldCoordinates", "Sample"),
@@ -41,6 +43,9 @@ __all__ = sorted(name for names in _NAMES.values() for name in names)
 def __getattr__(name: str) -> Any:
     for module, names in _NAMES.items():
         if name in names:
-            found = import_module(f"{__name__}.{module}")
+            try:
+                found = import_module(f"{__name__}.{module}")
+            except ModuleNotFoundError as error:
+                raise with_extra(error, f"{__name__}.{name}") from error
             return found if module.endswith(f".{name}") else getattr(found, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -177,18 +177,23 @@ class HeldCoordinates:
         here, speed, force = arrays
         metric = self._at(here, time)
         pushed = np.einsum("ian,an->i", metric.kept, force)
-        rest = self._targets(here, np.zeros_like(here), time, metric) if self._source.moving else np.zeros(len(self))
-        still = metric.inverse @ (rest - pushed)
-        moving = metric.inverse @ (self._targets(here, speed, time, metric) - pushed)
-        own = here[self._own_atoms]
+        bent = self._curvatures(here, self._fields(speed, metric.directions), time, metric)
+        if self._source.moving:
+            rest, driven = (self._targets(here, u, time, metric) for u in (np.zeros_like(here), speed))
+        else:
+            rest, driven = np.zeros(len(self)), -bent[0]
+        still, moving = metric.inverse @ (rest - pushed), metric.inverse @ (driven - pushed)
+        value = self._named(self._own.measure(here[self._own_atoms], time))
+        off = value - self._named(self._own.target(time))
+        off -= self.periods * np.round(off / np.where(self.periods, self.periods, np.inf))
         return Sample(
             time,
-            self._named(self._own.measure(own, time)),
+            value,
             moving,
             moving - still,
-            float(np.linalg.slogdet(metric.z)[1]),
-            self._change_of_z(here, time, metric),
-            float(np.abs(self._own.value(own, time)).max()),
+            metric.log_det_z,
+            self._change_of_z(bent[1:]),
+            float(np.abs(off).max()),
         )
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
@@ -213,8 +218,7 @@ class HeldCoordinates:
         self._own.lattice = self._others.lattice = self._source.lattice
         d, near = len(self), self._other_atoms
         gradients = np.zeros((d, *x.shape))
-        dense = self._own.jacobian(x[self._own_atoms], time).toarray()
-        gradients[:, self._own_atoms] = self._named(dense).reshape(d, -1, 3)
+        gradients[:, self._own_atoms] = self._named(_gradients(self._own, x[self._own_atoms], time))
         kept = gradients * self._inverse_masses
         free = np.einsum("ian,ian->i", gradients, kept)
         reactions = np.zeros((d, 0))
@@ -231,7 +235,7 @@ class HeldCoordinates:
             share = z / np.sqrt(np.outer(free, free))
         if not np.all(np.isfinite(share)):
             raise NonFiniteError(f"the gradient of {', '.join(self.names)} is not finite", item="positions")
-        left, mixture = np.linalg.eigh(share)
+        left, mixture = np.linalg.eigh(share) if d > 1 else (share[0], np.ones((1, 1)))
         if left[0] < DEPENDENT:
             worst = [k for k in range(d) if abs(mixture[k, 0]) > 0.1]
             raise SingularGeometryError(
@@ -241,8 +245,9 @@ class HeldCoordinates:
                 rows=self.rows[worst],
                 atoms=self.atoms[self._own_atoms],
             )
-        inverse = np.linalg.inv(z)
-        return _Metric(z, inverse, kept, reactions, np.einsum("ij,jan->ian", inverse, kept))
+        inverse = np.linalg.inv(z) if d > 1 else 1 / z
+        log_det_z = float(np.linalg.slogdet(z)[1] if d > 1 else np.log(z[0, 0]))
+        return _Metric(log_det_z, inverse, kept, reactions, np.tensordot(inverse, kept, 1))
 
     def _seen(self, own: FloatArray, others: FloatArray | None, metric: _Metric) -> FloatArray:
         """What a quantity of rows means for the coordinates once the other constraints have had their share."""
@@ -260,25 +265,25 @@ class HeldCoordinates:
         )
 
     def _curvatures(self, x: FloatArray, u: FloatArray, time: float, metric: _Metric) -> FloatArray:
-        """u^T q'' u of the coordinates, followed on the surface of the other constraints."""
+        """u^T q'' u of the coordinates on the surface of the other constraints, for k fields u at once, (k, d)."""
         own, near = self._own_atoms, self._other_atoms
-        others = None if self.motion is None else self.motion.constraint_set
-        return self._seen(
-            self._own.curvature(x[own], u[own], time),
-            None if others is None else others.curvature(x[near], u[near], time),
-            metric,
-        )
+        seen = self._named(_curvatures(self._own, x[own], u[:, own], time).T).T
+        if self.motion is not None:
+            seen = seen + _curvatures(self.motion.constraint_set, x[near], u[:, near], time) @ metric.reactions.T
+        return seen
 
-    def _change_of_z(self, x: FloatArray, time: float, metric: _Metric) -> FloatArray:
+    def _fields(self, v: FloatArray, along: FloatArray) -> FloatArray:
+        """The velocities, the directions, and of each two directions the sum and the difference."""
+        pairs = [along[s] + sign * along[j] for s in range(len(along)) for j in range(s) for sign in (1, -1)]
+        return np.array([v, *along, *pairs])
+
+    def _change_of_z(self, bent: FloatArray) -> FloatArray:
         """Half the derivative of ln det Z along each direction s: sum_j d_j^T q_j'' d_s, polarised."""
-        along = metric.directions
-        result = np.zeros(len(self))
-        for s in range(len(self)):
-            result[s] += self._curvatures(x, along[s], time, metric)[s]
+        d = len(self)
+        result, pairs = np.diagonal(bent).copy(), iter(bent[d:])
+        for s in range(d):
             for j in range(s):
-                both = self._curvatures(x, along[s] + along[j], time, metric)
-                apart = self._curvatures(x, along[s] - along[j], time, metric)
-                mixed = (both - apart) / 4
+                mixed = (next(pairs) - next(pairs)) / 4
                 result[s] += mixed[j]
                 result[j] += mixed[s]
         return result
@@ -287,15 +292,35 @@ class HeldCoordinates:
 class _Metric(NamedTuple):
     """At one configuration, on n atoms.
 
-    `z`, `inverse` (d, d); `kept` (d, n, 3), M_par^+ times the gradients; `reactions` (d, rows), the multipliers with
+    `inverse` (d, d) of Z; `kept` (d, n, 3), M_par^+ times the gradients; `reactions` (d, rows), the multipliers with
     which the other constraints answer a gradient; `directions` (d, n, 3).
     """
 
-    z: FloatArray
+    log_det_z: float
     inverse: FloatArray
     kept: FloatArray
     reactions: FloatArray
     directions: FloatArray
+
+
+def _gradients(held: ConstraintSet, x: FloatArray, time: float) -> FloatArray:
+    """The rows' gradients, shape (n_rows, n_atoms, 3)."""
+    result = np.zeros((held.n_rows, *x.shape))
+    for start, item in zip(held.starts, held.constraints, strict=False):
+        rows = start + np.arange(item.n_rows)[:, None]
+        np.add.at(result, (rows, item.atoms), item.gradient(held.gather(item, x), time))
+    return result
+
+
+def _curvatures(held: ConstraintSet, x: FloatArray, u: FloatArray, time: float) -> FloatArray:
+    """u^T q'' u of all rows for k fields, shape (k, n_rows): the rows once more for each field, in one call."""
+    many, parts = len(u), []
+    for item in held.constraints:
+        again = item.select(np.tile(np.arange(item.n_rows), many))
+        r = np.tile(held.gather(item, x), (many, 1, 1))
+        v = u[:, item.atoms].reshape(r.shape)
+        parts.append(again.curvature(r, v, time).reshape(many, -1))
+    return np.concatenate(parts, axis=1)
 
 
 def _rows_of(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:

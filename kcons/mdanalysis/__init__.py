@@ -9,21 +9,26 @@ Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnaly
 - `check`: how well a trajectory kept its constraints
 """
 
-from kcons.mdanalysis.check.check_files import check_trajectory
-from kcons.mdanalysis.check.constraint_check import ConstraintCheck
-from kcons.mdanalysis.check.result import CheckResult
-from kcons.mdanalysis.conversions import (
-    ase_to_openmm,
-    from_ase,
-    from_openmm,
-    openmm_to_ase,
-    to_ase,
-    to_openmm,
-    universe_of,
-)
-from kcons.mdanalysis.loading import load_trajectory, open_universe
-from kcons.mdanalysis.topology import constraints_of, selected, snapshot_of
-from kcons.mdanalysis.writing import ASE_UNITS, OPENMM_UNITS, OpenMMReporter, RunUnits, TrajectoryWriter, write_ase
+from kcons.errors import with_extra
+
+try:
+    from kcons.mdanalysis.check.check_files import check_trajectory
+    from kcons.mdanalysis.check.constraint_check import ConstraintCheck
+    from kcons.mdanalysis.check.result import CheckResult
+    from kcons.mdanalysis.conversions import (
+        ase_to_openmm,
+        from_ase,
+        from_openmm,
+        openmm_to_ase,
+        to_ase,
+        to_openmm,
+        universe_of,
+    )
+    from kcons.mdanalysis.loading import load_trajectory, open_universe
+    from kcons.mdanalysis.topology import constraints_of, selected, snapshot_of
+    from kcons.mdanalysis.writing import ASE_UNITS, OPENMM_UNITS, OpenMMReporter, RunUnits, TrajectoryWriter, write_ase
+except ModuleNotFoundError as error:
+    raise with_extra(error, "kcons.mdanalysis") from error
 
 __all__ = [
     "ASE_UNITS",

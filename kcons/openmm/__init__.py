@@ -12,22 +12,27 @@ collective variables, surfaces and the constraint objects of kcons.
 - `surfaces`: particles on surfaces
 """
 
-from kcons.openmm.carried.carried_constraints import CarriedConstraints
-from kcons.openmm.carried.hold import hold, take_constraints
-from kcons.openmm.collective.collective_rows import CollectiveRows
-from kcons.openmm.collective.row_forces import Row, each_term
-from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
-from kcons.openmm.ensembles.langevin_ensemble import Langevin
-from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
-from kcons.openmm.integrator.guard import positions_of, velocities_of
-from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.projected import ProjectedIntegrator
-from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
-from kcons.openmm.integrator.schemes import SCHEMES
-from kcons.openmm.quantities import masses_of
-from kcons.openmm.surfaces.formulas import ExpressionSurface
-from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
-from kcons.openmm.topology import constraints_of
+from kcons.errors import with_extra
+
+try:
+    from kcons.openmm.carried.carried_constraints import CarriedConstraints
+    from kcons.openmm.carried.hold import hold, take_constraints
+    from kcons.openmm.collective.collective_rows import CollectiveRows
+    from kcons.openmm.collective.row_forces import Row, each_term
+    from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
+    from kcons.openmm.ensembles.langevin_ensemble import Langevin
+    from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+    from kcons.openmm.integrator.guard import positions_of, velocities_of
+    from kcons.openmm.integrator.precision import Precision
+    from kcons.openmm.integrator.projected import ProjectedIntegrator
+    from kcons.openmm.integrator.rattle_integrator import RattleIntegrator
+    from kcons.openmm.integrator.schemes import SCHEMES
+    from kcons.openmm.quantities import masses_of
+    from kcons.openmm.surfaces.formulas import ExpressionSurface
+    from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator, surface_parts
+    from kcons.openmm.topology import constraints_of
+except ModuleNotFoundError as error:
+    raise with_extra(error, "kcons.openmm") from error
 
 __all__ = [
     "SCHEMES",

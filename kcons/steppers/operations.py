@@ -39,7 +39,8 @@ class Operation:
 
     def __str__(self) -> str:
         share = f"{self.fraction:.8g}" if isinstance(self, Timed) else ""
-        return f"{self.verb:<9} {share:<13} {self.meaning}"
+        group = getattr(self, "group", "")
+        return f"{self.verb:<9} {share:<13} {self.meaning}" + (f": {group}" if group else "")
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,19 @@ class Timed(Operation):
     fraction: float = field()  # type: ignore[misc]
 
 
+@dataclass(frozen=True)
 class Kick(Timed):
-    """v changes by h M^-1 f, with the forces last evaluated."""
+    """v changes by h M^-1 f, with the forces last evaluated.
+
+    Attributes
+    ----------
+    group : str
+        Whose forces, where they come in groups (`kcons.thermostats.multistep`); empty for all.
+    """
 
     verb, meaning = "kick", "change velocities by forces"
+
+    group: str = ""
 
 
 class Settle(Timed):
@@ -61,10 +71,19 @@ class Settle(Timed):
     verb, meaning = "settle", "change velocities by the forces at the new velocities, by iteration, on the constraints"
 
 
+@dataclass(frozen=True)
 class Turn(Timed):
-    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic.kick`)."""
+    """The isokinetic kick: v turns towards M_par^+ f and keeps its length (`kcons.thermostats.isokinetic.kick`).
+
+    Attributes
+    ----------
+    group : str
+        As for `Kick`.
+    """
 
     verb, meaning = "turn", "change velocities by forces at constant kinetic energy"
+
+    group: str = ""
 
 
 class Damp(Timed):
@@ -117,10 +136,19 @@ class Fly(Timed):
         return np.array(self.flights)
 
 
+@dataclass(frozen=True)
 class Evaluate(Operation):
-    """Forces at the positions and the time that the step has come to."""
+    """Forces at the positions and the time that the step has come to.
+
+    Attributes
+    ----------
+    group : str
+        As for `Kick`.
+    """
 
     verb, meaning = "evaluate", "forces at the new positions"
+
+    group: str = ""
 
 
 class Project(Operation):

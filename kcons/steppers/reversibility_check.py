@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, InputError, ReversibilityError, UnsupportedError
 from kcons.steppers.operations import Operation
 from kcons.steppers.state import KICK_ROUNDING, State, System
@@ -77,16 +78,9 @@ class ReversibilityCheck(Listed):
         except ConvergenceError as error:
             message = f"step {after.step} cannot be taken back: {error}"
             raise retold(error, message, ReversibilityError, after.step) from error
-        speed = max(_largest(state.velocities), _largest(after.velocities))
-        length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
-        rounding = 8 * float(np.spacing(_largest(state.positions)))
         forces = system.with_forces(after).forces
         assert forces is not None
-        kick = abs(dt) * _largest(forces * system.inverse_masses)
-        moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
-        turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
-        # A speed of zero both before and after leaves nothing to compare with.
-        off = np.maximum(moved / (length or 1.0), turned / (speed or 1.0))
+        off = missed(state, after, back, dt, _largest(forces * system.inverse_masses))
         residual = float(off.max(initial=0.0))
         if not residual <= self.tolerance:
             atom = int(np.argmax(off.max(axis=1)))
@@ -99,6 +93,27 @@ class ReversibilityCheck(Listed):
                 step=after.step,
             )
         return after
+
+
+def missed(state: State, after: State, back: State, dt: float, acceleration: float) -> FloatArray:
+    """How far a step that was taken back misses its start, relative as in `ReversibilityCheck`, shape (n_atoms, 3).
+
+    Parameters
+    ----------
+    state, after, back : State
+        Before the step, after it, and after the step back.
+    dt : float
+    acceleration : float
+        The largest that forces cause.
+    """
+    speed = max(_largest(state.velocities), _largest(after.velocities))
+    length = max(_largest(np.ptp(state.positions, axis=0)), speed * abs(dt))
+    rounding = 8 * float(np.spacing(_largest(state.positions)))
+    kick = abs(dt) * acceleration
+    moved = np.maximum(np.abs(back.positions - state.positions) - rounding, 0.0)
+    turned = np.maximum(np.abs(back.velocities - state.velocities) - KICK_ROUNDING * kick, 0.0)
+    # A speed of zero both before and after leaves nothing to compare with.
+    return np.asarray(np.maximum(moved / (length or 1.0), turned / (speed or 1.0)))
 
 
 def _largest(values: np.ndarray) -> float:

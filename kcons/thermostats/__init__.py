@@ -4,7 +4,9 @@
 - `thermal_velocities`: velocities drawn on the constraints
 - `langevin`, `nose_hoover`, `isokinetic`: the thermostats
 - `pressure`: barostats beside them
-- `configurational_temperature`: the temperature of configurations
+- `monte_carlo`: without any error of the time step
+- `multistep`: several time steps, and isokinetic spheres
+- `configurational_temperature`, `temperature_split`: the temperature of configurations, whole and by kind of motion
 """
 
 from kcons.thermostats.configurational_temperature import (
@@ -16,18 +18,35 @@ from kcons.thermostats.configurational_temperature import (
 from kcons.thermostats.freedom import Freedom, freedom
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
 from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, HamiltonianMonteCarlo
+from kcons.thermostats.monte_carlo.replica_exchange import exchange
+from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
+from kcons.thermostats.multistep import ForceGroups, IsokineticSpheres, LangevinRespa, evaluations_per_sample
 from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
+    "Counts",
     "Estimate",
+    "ForceGroups",
     "Freedom",
+    "HamiltonianMonteCarlo",
     "Isokinetic",
+    "IsokineticSpheres",
     "Langevin",
+    "LangevinRespa",
     "NoseHooverChain",
+    "SplitTemperatures",
+    "TemperatureSplit",
+    "Tuned",
+    "best_share",
     "configurational_sample",
     "configurational_temperature",
+    "evaluations_per_sample",
+    "exchange",
     "freedom",
     "mean",
     "thermal_velocities",
+    "tune",
 ]

@@ -17,7 +17,92 @@ from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
 
 
-class Langevin(Listed):
+class SeededBath(Listed):
+    """What baths share whose noise is a function of a seed and of the number of the step.
+
+    Attributes
+    ----------
+    thermal_energy, friction : float
+    seed, substeps : int
+        See `Langevin`.
+    """
+
+    order = 2
+    reversible = False
+    symplectic = False
+    force_evaluations = 1
+
+    def __init__(self, thermal_energy: float, friction: float, seed: int, substeps: int) -> None:
+        self.thermal_energy = positive(thermal_energy, "thermal_energy")
+        refuse_units(friction, "friction")
+        if np.ndim(friction) or not (math.isfinite(friction) and friction >= 0):
+            raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
+        if int(substeps) != substeps or substeps < 1:
+            raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
+        if int(seed) != seed or not 0 <= seed < 2**64:
+            raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
+        self.friction = float(friction)
+        self.seed = int(seed)
+        self.substeps = int(substeps)
+        self._bits = np.random.Philox(0)
+        self._normal = np.random.Generator(self._bits)
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
+        refuse_friction(system)
+        if system.velocity_dependent:
+            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        InputError
+            A negative time step: noise cannot be taken back. The state carries variables of another thermostat.
+        UnsupportedError
+            Momentum is to be conserved where rows hold atoms in space.
+        ConvergenceError, NonFiniteError, InputError, UnsupportedError
+            As for all splittings.
+        """
+        self.check(system)
+        still = stays(state, dt)
+        if still is not None:
+            return still
+        if dt < 0:
+            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
+            return self.begun(system, state, dt).through(self.operations(system))
+
+    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
+        """A step that is about to be made from the state.
+
+        Raises
+        ------
+        InputError
+            The state carries variables of another thermostat.
+        """
+        raise NotImplementedError
+
+    def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
+        """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
+        # A counter-based generator, set to the step's own stretch of the seed's stream.
+        bits = self._bits
+        bits.state = {
+            "bit_generator": "Philox",
+            "state": {
+                "counter": np.array([0, 0, number, part], dtype=np.uint64),
+                "key": np.array([self.seed, 0], dtype=np.uint64),
+            },
+            "buffer": np.zeros(4, dtype=np.uint64),
+            "buffer_pos": 4,
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
+        return self._normal.standard_normal(shape)
+
+
+class Langevin(SeededBath):
     """Canonical sampling on constraints: kick, drift, friction and noise, drift, kick (g-BAOAB).
 
     Friction and noise act on velocities in the tangent plane, v = M_par^+ M (e^{-gamma dt} v + noise), exactly; the
@@ -56,11 +141,6 @@ class Langevin(Listed):
     Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138 (2016).
     """
 
-    order = 2
-    reversible = False
-    symplectic = False
-    force_evaluations = 1
-
     def __init__(
         self,
         thermal_energy: float,
@@ -70,20 +150,8 @@ class Langevin(Listed):
         substeps: int = 3,
         conserve_momentum: bool = False,
     ) -> None:
-        self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        refuse_units(friction, "friction")
-        if np.ndim(friction) or not (math.isfinite(friction) and friction >= 0):
-            raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
-        if int(substeps) != substeps or substeps < 1:
-            raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
-        if int(seed) != seed or not 0 <= seed < 2**64:
-            raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
-        self.friction = float(friction)
-        self.seed = int(seed)
-        self.substeps = int(substeps)
+        super().__init__(thermal_energy, friction, seed, substeps)
         self.conserve_momentum = bool(conserve_momentum)
-        self._bits = np.random.Philox(0)
-        self._normal = np.random.Generator(self._bits)
         self._substeps = _geodesic_baoab((1.0 / self.substeps,) * self.substeps)
         self._great_circles = _geodesic_baoab((1.0,), exact=True)
         self._open: tuple[System, FloatArray] | None = None
@@ -95,50 +163,9 @@ class Langevin(Listed):
         exact = system is not None and system.great_circles is not None
         return self._great_circles if exact else self._substeps
 
-    def check(self, system: System) -> None:
-        """Raise `UnsupportedError` for velocity-dependent forces, and friction besides that of the thermostat."""
-        refuse_friction(system)
-        if system.velocity_dependent:
-            raise UnsupportedError("forces that depend on the velocities have no place in this scheme; use friction")
-
-    def step(self, system: System, state: State, dt: float) -> State:
-        """Advance by `dt`.
-
-        Raises
-        ------
-        InputError
-            A negative time step: noise cannot be taken back. The state carries variables of another thermostat.
-        UnsupportedError
-            Momentum is to be conserved where rows hold atoms in space.
-        ConvergenceError, NonFiniteError, InputError, UnsupportedError
-            As for all splittings.
-        """
-        self.check(system)
-        still = stays(state, dt)
-        if still is not None:
-            return still
-        if dt < 0:
-            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
         carried(state, 1, "Langevin")
-        with np.errstate(over="ignore", invalid="ignore"):  # checked, with the step's number
-            return LangevinStep(system, system.with_forces(state), dt, self).through(self.operations(system))
-
-    def drawn(self, number: int, shape: tuple[int, ...]) -> FloatArray:
-        """Normal numbers that are a function of the seed and of the number of the step."""
-        # A counter-based generator, set to the step's own stretch of the seed's stream.
-        bits = self._bits
-        bits.state = {
-            "bit_generator": "Philox",
-            "state": {
-                "counter": np.array([0, 0, number, 0], dtype=np.uint64),
-                "key": np.array([self.seed, 0], dtype=np.uint64),
-            },
-            "buffer": np.zeros(4, dtype=np.uint64),
-            "buffer_pos": 4,
-            "has_uint32": 0,
-            "uinteger": 0,
-        }
-        return self._normal.standard_normal(shape)
+        return LangevinStep(system, system.with_forces(state), dt, self)
 
     def directions(self, system: System, x: FloatArray, time: float) -> FloatArray:
         """Those in which no row knows a place in space."""
@@ -181,7 +208,7 @@ class LangevinStep(ArrayStep):
         before = system.kinetic_energy(v)
         keep = math.exp(-thermostat.friction * dt)
         spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
-        noise = thermostat.drawn(self.number, v.shape)
+        noise = self.noise(v.shape)
         noise *= spread * np.sqrt(system.inverse_masses)
         # What friction does not act on: velocities that the targets demand, and of the centre of mass.
         kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
@@ -193,6 +220,10 @@ class LangevinStep(ArrayStep):
         noise += keep * v if kept is None else kept + keep * (v - kept)
         self.v = motion.project_velocities(x, noise, time=time, out=noise)
         self.heat += system.kinetic_energy(self.v) - before
+
+    def noise(self, shape: tuple[int, ...]) -> FloatArray:
+        """Normal numbers for this exchange."""
+        return self.thermostat.drawn(self.number, shape)
 
     def evaluate(self, operation: Operation) -> None:
         check_finite(self.x, "position", self.number)

@@ -469,6 +469,42 @@ MUTANTS = [
         "tests/thermostats/test_langevin.py::test_each_substep_meets_targets_at_its_own_time",
     ),
     (
+        "thermostats/monte_carlo/hamiltonian_monte_carlo.py",
+        "velocities=-begin.velocities)",
+        "velocities=begin.velocities)",
+        "tests/thermostats/monte_carlo/test_hamiltonian_monte_carlo.py::test_every_decision_follows_from_the_energies[0.7]",
+    ),
+    (
+        "thermostats/monte_carlo/hamiltonian_monte_carlo.py",
+        "ACCEPTED if threshold < -change",
+        "ACCEPTED if threshold < change",
+        "tests/thermostats/monte_carlo/test_hamiltonian_monte_carlo.py::test_every_decision_follows_from_the_energies[0.0]",
+    ),
+    (
+        "thermostats/monte_carlo/hamiltonian_monte_carlo.py",
+        "np.sqrt((1 - self.keep**2)",
+        "np.sqrt((1 - self.keep)",
+        "tests/thermostats/monte_carlo/test_hamiltonian_monte_carlo.py::test_velocities_are_those_of_the_temperature",
+    ),
+    (
+        "thermostats/monte_carlo/hamiltonian_monte_carlo.py",
+        "kept += (1 - self.keep) * drift_velocity",
+        "kept += self.keep * drift_velocity",
+        "tests/thermostats/monte_carlo/test_hamiltonian_monte_carlo.py::test_atoms_at_rest_stay_and_planes_keep_their_momentum",
+    ),
+    (
+        "thermostats/monte_carlo/reversed_steps.py",
+        "if not residual <= self.tolerance:",
+        "if not residual < 1e300:",
+        "tests/thermostats/monte_carlo/test_reversed_steps.py::test_what_cannot_be_taken_back_is_seen",
+    ),
+    (
+        "thermostats/monte_carlo/replica_exchange.py",
+        "(1 / kt[k] - 1 / kt[k + 1])",
+        "(1 / kt[k + 1] - 1 / kt[k])",
+        "tests/thermostats/monte_carlo/test_replica_exchange.py::test_the_rule_and_what_changes_places",
+    ),
+    (
         "thermostats/nose_hoover.py",
         "q[0] *= count",
         "q[0] *= 1.0",

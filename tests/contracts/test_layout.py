@@ -78,7 +78,11 @@ def test_documents_and_examples_import_public_names():
     """`kcons` and `kcons.X`; of what is deeper the folders that are a subject of their own."""
     own = {"cli.progress", "models.flows", "models.growth", "comparison.hard_cases", "comparison.stability"}
     deep = []
-    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "examples").glob("*.py"))]:
+    for path in [
+        ROOT / "README.md",
+        *sorted((ROOT / "docs").rglob("*.md")),
+        *sorted((ROOT / "examples").rglob("*.py")),
+    ]:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             found = re.match(r"\s*(?:from|import) kcons\.(\w+\.[\w.]+)", line)
             if found and found[1] not in own:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -28,13 +29,15 @@ from kcons.steppers import (
 )
 from kcons.steppers.operations import Fly, Settle, Timed
 from kcons.steppers.stepper import Listed
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
+from kcons.thermostats import Isokinetic, IsokineticSpheres, Langevin, LangevinRespa, NoseHooverChain
 
 ALL = [
     *(Rattle(), Geodesic(3), Suzuki4(), Yoshida4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()),
     *(Composition((0.25, 0.5, 0.25), 2), RungeKuttaNystrom((1.0,), (0.5, 0.5)), Splitting((1.0,), (0.5, 0.5))),
     *(Langevin(1.0, 0.5, 1), Langevin(1.0, 0.5, 1, substeps=1), ReversibilityCheck(Suzuki4())),
     *(Isokinetic(1.0), Isokinetic(1.0, order=4), Isokinetic(1.0, order=6)),
+    *(LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 3}), LangevinRespa(1.0, 0.5, 1, order=4)),
+    *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}, order=4), IsokineticSpheres(1.0, 0.5, 1)),
     *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
 ]
 STEPPERS = pytest.mark.parametrize("stepper", ALL, ids=repr)
@@ -78,8 +81,10 @@ def test_every_public_stepper_is_here() -> None:
 @STEPPERS
 def test_fractions_share_the_step(stepper, system) -> None:
     operations = stepper.operations(system)
-    for verbs in SHARING:
-        fractions = [operation.fraction for operation in operations if operation.verb in verbs]
+    groups = {getattr(operation, "group", "") for operation in operations}
+    for verbs, group in product(SHARING, groups):
+        shared = [op for op in operations if op.verb in verbs and getattr(op, "group", "") == group]
+        fractions = [operation.fraction for operation in shared]
         assert not fractions or math.fsum(fractions) == pytest.approx(1.0, abs=2e-15)
     drifts = [operation for operation in operations if isinstance(operation, Fly)]
     # A drift ends where its flights have led, the last one at the end of the step.
@@ -120,7 +125,8 @@ def test_a_line_for_each_operation(stepper, system) -> None:
     assert len(lines) == len(operations)
     for line, operation in zip(lines, operations, strict=True):
         verb, *rest = line.split()
-        assert verb == operation.verb and line.endswith(operation.meaning)
+        group = getattr(operation, "group", "")
+        assert verb == operation.verb and line.endswith(operation.meaning + (f": {group}" if group else ""))
         if isinstance(operation, Timed):
             assert float(rest[0]) == pytest.approx(operation.fraction, rel=1e-7)
 

@@ -18,12 +18,16 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 #: Between the cells of a table.
 BAR = re.compile(r"(?<!\\)\|")
+
+
+def name_of(page):
+    return page.name if page.parent in (ROOT, ROOT / "docs") else page.relative_to(ROOT / "docs").as_posix()
 
 
 def snippets(language):
@@ -33,7 +37,7 @@ def snippets(language):
         for match in FENCE.finditer(text):
             if match.group(1) == language:
                 line = text.count("\n", 0, match.start()) + 1
-                found.append(pytest.param(page, match.group(2), id=f"{page.name}:{line}"))
+                found.append(pytest.param(page, match.group(2), id=f"{name_of(page)}:{line}"))
     return found
 
 
@@ -43,7 +47,7 @@ def python_pages():
     for parameter in snippets("python"):
         page, code = parameter.values
         pages.setdefault(page, []).append(code)
-    return [pytest.param("\n".join(codes), id=page.name) for page, codes in pages.items()]
+    return [pytest.param("\n".join(codes), id=name_of(page)) for page, codes in pages.items()]
 
 
 @pytest.mark.parametrize("code", python_pages())
@@ -87,13 +91,13 @@ def test_pages_and_examples_were_found():
     assert EXAMPLES
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=name_of)
 def test_links_within_the_project_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
@@ -102,9 +106,24 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
         assert [row for row in rows if len(BAR.findall(row)) != cells] == []
 
 
-def test_readme_links_to_every_page():
-    linked = re.findall(r"\]\((docs/[\w-]+\.md)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {ROOT / page for page in linked} == set(PAGES) - {ROOT / "README.md"}
+def in_the_tables(page):
+    """The pages that the tables of contents of a page name, and those that these name."""
+    found = set()
+    for listing in re.findall(
+        r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        for entry in listing.split():
+            if not entry.startswith(":") and (inner := page.parent / f"{entry}.md").is_file():
+                found |= {inner, *in_the_tables(inner)}
+    return found
+
+
+def test_every_page_is_found_from_the_front():
+    """In the tables of contents of the site, or linked from README."""
+    linked = re.findall(r"\]\((docs/[\w/-]+\.md)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    index = ROOT / "docs" / "index.md"
+    found = {index, ROOT / "README.md", *in_the_tables(index), *(ROOT / page for page in linked)}
+    assert sorted(page.relative_to(ROOT).as_posix() for page in set(PAGES) - found) == []
 
 
 def test_names_in_the_notation_exist():

@@ -25,11 +25,11 @@ class AtomsSystem(CellSystem):
     Parameters
     ----------
     motion : Motion
-    force : callable
-        Forces at positions and time; where it leaves the atoms, energy and stress are asked for.
+    force, potential : callable
+        Of positions and time, in the cell that the atoms have.
     atoms : ase.Atoms
         With a periodic cell.
-    only_forces : bool
+    stressless : bool
         Whether constraints of ASE add forces, which no stress knows of.
     far : float
 
@@ -43,9 +43,10 @@ class AtomsSystem(CellSystem):
         self,
         motion: Motion,
         force: Callable[[FloatArray, float], ArrayLike],
+        potential: Callable[[FloatArray, float], float],
         atoms: Atoms,
         *,
-        only_forces: bool = False,
+        stressless: bool = False,
         far: float,
     ) -> None:
         self.atoms = atoms
@@ -54,9 +55,9 @@ class AtomsSystem(CellSystem):
                 "the atoms have no periodic cell, and a barostat nothing to change: set atoms.cell and atoms.pbc",
                 item="cell",
             )
-        self._only_forces = only_forces
+        self._stressless = stressless
         super().__init__(
-            motion, lambda x, t, cell: force(x, t), lambda x, t, cell: self._energy(x), self._stress, far=far
+            motion, lambda x, t, cell: force(x, t), lambda x, t, cell: potential(x, t), self._stress, far=far
         )
 
     @property
@@ -68,13 +69,8 @@ class AtomsSystem(CellSystem):
         self.atoms.cell[...] = cell
         self.atoms.arrays["positions"][...] = positions
 
-    def _energy(self, x: FloatArray) -> float:
-        self.atoms.arrays["positions"][...] = x
-        # That of ASE's Hookean and ExternalForce belongs to it; ours have none.
-        return float(self.atoms.get_potential_energy(apply_constraint=self._only_forces))
-
     def _stress(self, x: FloatArray, time: float, cell: FloatArray) -> FloatArray:
-        if self._only_forces:
+        if self._stressless:
             raise UnsupportedError(
                 "forces that constraints of ASE add have no stress; use MonteCarloBarostat, which judges by energies"
             )

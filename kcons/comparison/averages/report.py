@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,8 @@ EXPLANATION = (
     "kT off by: temperature of the configurations over the temperature asked for, less 1, with its standard error.",
     "<U> off by: mean potential energy a molecule less that of Metropolis sampling, {energy:.4g} ± {error:.1g} {unit}, "
     "with the error of both.",
+    "T of shifts, turns: the same of whole molecules that move and that turn, apart.",
+    "→ 0: extrapolated to step zero, off + c step², by weighted least squares; ? where that does not fit (chi²).",
     "s.e.: the larger of the two in standard errors; beyond 3, what is off is not chance.",
     "forces, wall: force evaluations and wall time until the standard error of kT is {goal:.0%}: speed, and "
     "how fast configurations are forgotten. Good to a third or so.",
@@ -36,10 +39,12 @@ EXPLANATION = (
 def table(comparison: SamplingComparison) -> Table:
     """One line for each thermostat and time step."""
     units, goal = comparison.scene["units"], f"to {GOAL:.0%}"
+    kinds = [name for name in ("shift", "turn") if any("turn" in m.kinds for m in comparison.measurements)]
     headings = [
         "thermostat",
         f"step\n{units['time']}",
         "kT off by\n%",
+        *(f"T of {name}s\n%" for name in kinds),
         f"<U> off by\n{units['energy']} a molecule",
         "off\ns.e.",
         "time\na step",
@@ -47,27 +52,59 @@ def table(comparison: SamplingComparison) -> Table:
         f"wall\n{goal}",
     ]
     notes = numbered(m.note for m in comparison.measurements)
-    rows = [[m.title, *_cells(m, notes)] for m in comparison.measurements]
+    rows = []
+    for m, after in zip_longest(comparison.measurements, comparison.measurements[1:]):
+        rows.append([m.title, *_cells(m, notes, kinds)])
+        if after is None or after.method != m.method:
+            rows += [[m.title, *cells] for cells in _at_zero(comparison, m.method, kinds)]
     return Table(headings, rows, title=comparison.scene["title"], grouped=True)
 
 
-def _cells(m: Sampled, notes: Mapping[str, int]) -> list[str]:
+def _cells(m: Sampled, notes: Mapping[str, int], kinds: Sequence[str]) -> list[str]:
     step = "" if m.step_seconds is None else duration(m.step_seconds)
     if m.status != "ok":
-        return [f"{m.setting:.4g}", verdict(m.status, m.status, notes.get(m.note)), "", "", step, "", ""]
+        return [
+            f"{m.setting:.4g}",
+            verdict(m.status, m.status, notes.get(m.note)),
+            *[""] * (2 + len(kinds)),
+            step,
+            "",
+            "",
+        ]
     away = off(m)
     assert m.temperature_error is not None and m.temperature_standard_error is not None
     assert m.energy_error is not None and m.energy_standard_error is not None
-    digits = _digits(m.energy_standard_error)
     return [
         f"{m.setting:.4g}",
-        f"{100 * m.temperature_error:+.2f} ± {100 * m.temperature_standard_error:.2f}",
-        f"{m.energy_error:+.{digits}f} ± {m.energy_standard_error:.{digits}f}",
+        _percent(m.temperature_error, m.temperature_standard_error),
+        *(_percent(*m.kinds[name]) for name in kinds),
+        _energy(m.energy_error, m.energy_standard_error),
         Marked(f"{away:.1f}", "yellow" if away > 3 else ""),
         step,
         f"{m.evaluations_to_goal:,.0f}",
         duration(m.seconds_to_goal or 0.0),
     ]
+
+
+def _at_zero(comparison: SamplingComparison, method: str, kinds: Sequence[str]) -> list[list[str]]:
+    """The line of a thermostat whose steps were extrapolated to zero, with a question mark at what does not fit."""
+    found = comparison.extrapolated(method)
+    if not {"temperature", "energy", *kinds} <= set(found):
+        return []
+    marks = {name: "" if value.fits else "?" for name, value in found.items()}
+    percents = [_percent(*found[name].estimate) + marks[name] for name in ("temperature", *kinds)]
+    away = max(abs(found[name].value) / found[name].error for name in ("temperature", "energy"))
+    off_by = Marked(f"{away:.1f}", "yellow" if away > 3 else "")
+    return [["→ 0", *percents, _energy(*found["energy"].estimate) + marks["energy"], off_by, "", "", ""]]
+
+
+def _percent(value: float, error: float) -> str:
+    return f"{100 * value:+.2f} ± {100 * error:.2f}"
+
+
+def _energy(value: float, error: float) -> str:
+    digits = _digits(error)
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
 
 
 def _digits(error: float) -> int:

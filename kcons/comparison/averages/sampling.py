@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import textwrap
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from kcons.comparison.averages.step_zero import Extrapolated, extrapolate
 from kcons.comparison.study.machine import environment
 from kcons.comparison.study.study import Watcher, picked
 from kcons.comparison.test_systems.fluid import Fluid
@@ -119,6 +121,8 @@ class Sampled:
         kT of the configurations over kT asked for, less 1.
     energy_error, energy_standard_error : float
         Mean potential energy a molecule less that of Metropolis sampling; the error of both.
+    kinds : mapping of str to (float, float)
+        The same as `temperature_error` for 'shift' and 'turn' of whole molecules, as far as there are any.
     seconds_to_goal, evaluations_to_goal : float
         Wall time and force evaluations until the standard error of the temperature is `GOAL`.
     growth : list of Moment
@@ -139,6 +143,7 @@ class Sampled:
     temperature_standard_error: float | None = None
     energy_error: float | None = None
     energy_standard_error: float | None = None
+    kinds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     seconds_to_goal: float | None = None
     evaluations_to_goal: float | None = None
     growth: Sequence[Moment] = ()
@@ -168,10 +173,37 @@ class SamplingComparison:
         """Measurements of one thermostat that have an error, coarsest first."""
         return [m for m in self.measurements if m.method == method and m.status == "ok"]
 
+    def extrapolated(self, method: str) -> dict[str, Extrapolated]:
+        """Errors of one thermostat at step zero: 'temperature', 'energy', and those of `kinds`; see `extrapolate`.
+
+        Empty for fewer than two steps. The error of the reference comes on top of that of the energy, and is in it.
+        """
+        runs = self.of(method)
+        if len({m.setting for m in runs}) < 2:
+            return {}
+        steps, known = [m.setting for m in runs], float(self.reference["standard_error"])
+        series: dict[str, list[tuple[float, float]]] = {name: [m.kinds[name] for m in runs] for name in runs[0].kinds}
+        series["temperature"] = [(m.temperature_error or 0.0, m.temperature_standard_error or 0.0) for m in runs]
+        # All runs are compared with one reference, whose error they share.
+        own = [math.sqrt(max((m.energy_standard_error or 0.0) ** 2 - known**2, 0.0)) for m in runs]
+        series["energy"] = [(m.energy_error or 0.0, error) for m, error in zip(runs, own, strict=True)]
+        found = {}
+        for name, averages in series.items():
+            if all(error > 0 for _, error in averages):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # said in the table
+                    found[name] = extrapolate(steps, averages)
+        if "energy" in found:
+            found["energy"] = replace(found["energy"], error=math.hypot(found["energy"].error, known))
+        return found
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data, as it goes to JSON."""
+        names = dict.fromkeys(m.method for m in self.measurements)
+        at_zero = {name: {what: asdict(e) for what, e in self.extrapolated(name).items()} for name in names}
         return {
             "format": "kcons-sampling-1",
+            "extrapolated": {name: found for name, found in at_zero.items() if found},
             "scene": dict(self.scene),
             "reference": dict(self.reference),
             "settings": dict(self.settings),
@@ -332,7 +364,7 @@ def _measured(
                 state = stepper.step(system, state, dt)
             now = clock()
             log.add(now - then, counted.calls, fluid, state.positions)
-            if not all(map(math.isfinite, (log.squares[-1], log.curvatures[-1], log.energies[-1]))):
+            if not all(map(math.isfinite, (*log.slopes[-1], log.energies[-1]))):
                 raise ArithmeticError("energies are not finite")
             watcher.advance(min(now - begun, share))
             if most is None and now - begun > share:
@@ -369,9 +401,20 @@ def _measured(
         # By the median: other work on the machine comes in bursts.
         seconds_to_goal=waits * last.steps * common["step_seconds"],
         evaluations_to_goal=waits * last.evaluations,
+        kinds=_kinds(log, fluid),
         growth=growth,
         **common,
     )
+
+
+def _kinds(log: _Log, fluid: Fluid) -> dict[str, tuple[float, float]]:
+    """Temperatures of shifts and of turns over the one asked for, less 1, with their errors."""
+    shift, bend, turn, twist = np.transpose(log.slopes)
+    found = {"shift": configurational_temperature(shift, bend)}
+    if turn.any():
+        found["turn"] = configurational_temperature(turn, twist)
+    kt = fluid.thermal_energy
+    return {name: (thermal.value / kt - 1, thermal.error / kt) for name, thermal in found.items()}
 
 
 class _Log:
@@ -379,21 +422,21 @@ class _Log:
         self.every = every
         self.seconds: list[float] = []
         self.calls: list[int] = []
-        self.squares: list[float] = []
-        self.curvatures: list[float] = []
+        #: Squares and curvatures of shifts, then of turns.
+        self.slopes: list[tuple[float, float, float, float]] = []
         self.energies: list[float] = []
 
     def add(self, seconds: float, calls: int, fluid: Fluid, x: FloatArray) -> None:
-        square, curvature = fluid.forces.rigid_sample(x, fluid.arm)
+        slopes = fluid.forces.split_sample(x)
         self.seconds.append(seconds)
         self.calls.append(calls)
-        self.squares.append(square)
-        self.curvatures.append(curvature)
+        self.slopes.append(slopes)
         self.energies.append(fluid.forces.potential(x))
 
 
 def _moment(log: _Log, count: int, fluid: Fluid, energy: Estimate) -> Moment:
-    thermal = configurational_temperature(log.squares[:count], log.curvatures[:count])
+    shift, bend, turn, twist = np.transpose(log.slopes[:count])
+    thermal = configurational_temperature(shift + turn / fluid.arm**2, bend + twist / fluid.arm**2)
     found = mean(log.energies[:count])
     return Moment(
         steps=count * log.every,

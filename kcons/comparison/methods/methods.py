@@ -23,7 +23,7 @@ from kcons.comparison.test_systems import TestSystem
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, KconsError
+from kcons.errors import InputError, KconsError, did_you_mean
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 
@@ -379,7 +379,9 @@ def chosen(names: Iterable[str] | None = None, test_system: TestSystem | None = 
             picked[name] = METHODS[name]
         else:
             known = ", ".join((*METHODS, "openmm", "all"))
-            raise InputError(f"there is no method {name!r}; there are {known}", item="methods")
+            raise InputError(
+                f"there is no method {name!r}{did_you_mean(name, METHODS)}; there are {known}", item="methods"
+            )
     if not picked:
         raise InputError(f"no method is named; there are {', '.join(METHODS)}", item="methods")
     return list(picked.values())

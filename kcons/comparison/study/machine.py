@@ -34,7 +34,7 @@ def environment() -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             versions[name] = None
     return {
-        "cpu": _processor(),
+        "cpu": processor(),
         "cores": os.cpu_count(),
         "threads": 1,
         "system": f"{platform.system()} {platform.machine()}",
@@ -51,7 +51,8 @@ def kernels_cached() -> bool:
     return next(here.rglob("*.nbi"), None) is not None
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Its name."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import environment
-from kcons.errors import InputError
+from kcons.errors import InputError, did_you_mean
 
 Name = TypeVar("Name")
 Found = TypeVar("Found")
@@ -108,7 +108,9 @@ def picked(names: Iterable[str] | None, known: Iterable[str], what: str, item: s
         raise InputError(f"no {what} is named; there are {', '.join(there)}", item=item)
     for name in wanted:
         if name not in there:
-            raise InputError(f"there is no {what} {name!r}; there are {', '.join(there)}", item=item)
+            raise InputError(
+                f"there is no {what} {name!r}{did_you_mean(name, there)}; there are {', '.join(there)}", item=item
+            )
     return wanted
 
 

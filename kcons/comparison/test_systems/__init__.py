@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kcons.comparison.test_systems.system import Reference, TestSystem, Units
-from kcons.errors import InputError
+from kcons.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from kcons.comparison.test_systems.fluid import Fluid
@@ -119,7 +119,9 @@ def build_fluid(name: str, size: int | None = None, seed: int = 1, *, quick: boo
         Unknown name; a size the fluid cannot be built at.
     """
     if name not in FLUIDS:
-        raise InputError(f"there is no fluid {name!r}; there are {', '.join(FLUIDS)}", item="scene")
+        raise InputError(
+            f"there is no fluid {name!r}{did_you_mean(name, FLUIDS)}; there are {', '.join(FLUIDS)}", item="scene"
+        )
     entry = FLUIDS[name]
     if size is None:
         size = entry.quick_size if quick else entry.size
@@ -150,7 +152,10 @@ def build(name: str, size: int | None = None, seed: int = 1, *, quick: bool = Fa
     try:
         entry = SYSTEMS[name]
     except KeyError:
-        raise InputError(f"there is no test system {name!r}; there are {', '.join(SYSTEMS)}", item="scene") from None
+        raise InputError(
+            f"there is no test system {name!r}{did_you_mean(name, SYSTEMS)}; there are {', '.join(SYSTEMS)}",
+            item="scene",
+        ) from None
     if size is None:
         size = entry.quick_size if quick else entry.size
     if entry.module != "structure" and set(options) & STRUCTURE_OPTIONS:

@@ -94,8 +94,13 @@ class LennardJones:
         For `kcons.thermostats.configurational_temperature`. Any scale `arm` of angles against lengths will do.
         Molecules must be whole, not wrapped.
         """
-        s = _rigid(x, self.molecule, self.first, self.sites, self.box, self.cutoff)
-        return s[0] + s[2] / arm**2, s[1] + s[3] / arm**2
+        shift, bend, turn, twist = self.split_sample(x)
+        return shift + turn / arm**2, bend + twist / arm**2
+
+    def split_sample(self, x: FloatArray) -> tuple[float, float, float, float]:
+        """|grad U|^2 and laplacian of U in the shifts of whole molecules, and both in their turns (per radian)."""
+        found = _rigid(x, self.molecule, self.first, self.sites, self.box, self.cutoff)
+        return (float(found[0]), float(found[1]), float(found[2]), float(found[3]))
 
     def metropolis(
         self,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from kcons.errors import InputError
+from kcons.errors import InputError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -202,6 +202,7 @@ def chosen(keys: Sequence[str] | None = None) -> list[Item]:
         fitting = [item for item in PLAN if key == item.key] or [item for item in PLAN if key == item.scene]
         if not fitting:
             known = ", ".join(item.key for item in PLAN)
-            raise InputError(f"there is no part {key!r} of the comparison; there are {known}", item="only")
+            meant = did_you_mean(key, [item.key for item in PLAN])
+            raise InputError(f"there is no part {key!r} of the comparison{meant}; there are {known}", item="only")
         found |= {item.key: item for item in fitting}
     return [item for item in PLAN if item.key in found]

@@ -11,6 +11,8 @@ from kcons.steppers import State, Stepper, System
 from kcons.steppers.operations import Operation
 from kcons.steppers.stepper import Listed
 from kcons.thermostats.isokinetic.isokinetic import Isokinetic
+from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.pressure.barostat import WORK, Barostat
 from kcons.thermostats.pressure.cell_system import CellSystem
 
@@ -21,7 +23,7 @@ class ConstantPressure(Listed):
     Parameters
     ----------
     stepper : Langevin, NoseHooverChain or Isokinetic
-        Or any stepper that keeps a temperature and says so by its attribute `thermal_energy`.
+        Others keep no temperature, or remember energies and forces of the cell that was.
     barostat : Barostat
 
     Notes
@@ -63,11 +65,10 @@ class ConstantPressure(Listed):
         self.stepper.check(system)
         if not isinstance(system, CellSystem):
             raise UnsupportedError("a barostat needs a system whose cell can change: make a CellSystem")
-        isokinetic = isinstance(self.stepper, Isokinetic)
-        if not isokinetic and getattr(self.stepper, "thermal_energy", None) is None:
+        if not isinstance(self.stepper, Langevin | NoseHooverChain | Isokinetic):
             raise UnsupportedError(
-                f"{self.stepper!r} keeps no temperature, by which a barostat judges its trials; use Langevin, "
-                "NoseHooverChain or Isokinetic"
+                f"{self.stepper!r} keeps no temperature, by which a barostat judges its trials, or does not know that "
+                "the cell has changed; use Langevin, NoseHooverChain or Isokinetic"
             )
         if isinstance(self.stepper, Isokinetic) and self.stepper.atoms is not None:
             raise UnsupportedError("an isokinetic thermostat on some atoms gives the others no temperature; take all")

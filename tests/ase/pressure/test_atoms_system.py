@@ -13,8 +13,8 @@ from pressure_systems import correlation_time, p_value
 from scipy import stats
 
 from kcons.ase import (
-    ConstrainedDynamics,
     ConstrainedLangevin,
+    ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
     IsokineticDynamics,
     constrain,
@@ -224,9 +224,9 @@ def test_an_energy_that_is_nan():
 def test_what_has_no_temperature_or_no_cell():
     atoms, _ = gas()
     with pytest.raises(UnsupportedError, match="keeps no temperature"):
-        ConstrainedDynamics(atoms, FS, barostat=MonteCarloBarostat(0.0))
+        ConstrainedMonteCarlo(atoms, FS, TEMPERATURE, 3, barostat=MonteCarloBarostat(0.0))
     with pytest.raises(UnsupportedError, match="friction"):
-        ConstrainedDynamics(atoms, FS, barostat=MonteCarloBarostat(0.0), friction=0.1)
+        MADE["isokinetic"](atoms, barostat=MonteCarloBarostat(0.0), friction=0.1)
     atoms.pbc = [True, True, False]
     with pytest.raises(InputError, match=r"along z.*'lateral'"):
         MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))

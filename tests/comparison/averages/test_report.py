@@ -119,3 +119,19 @@ def test_every_thermostat_has_a_style():
 
     assert set(report.STYLES) == set(METHODS)
     assert len(set(report.STYLES.values())) == len(METHODS)
+
+
+def test_kinds_of_motion_and_step_zero():
+    """A column for each kind, and a line for step zero; a model that does not fit is marked."""
+    kinds = {"shift": (0.01, 0.001), "turn": (-0.02, 0.001)}
+    rows = [
+        measured(setting=dt, kinds=kinds, temperature_error=error, energy_standard_error=0.02)
+        for dt, error in ((0.04, 0.16), (0.02, 0.04), (0.01, 0.5))
+    ]
+    text = shown(comparison(*rows))
+    assert "T of shifts" in text and "T of turns" in text
+    assert line(text, " 0.04 ")[5:11] == ["+1.00", "±", "0.10", "-2.00", "±", "0.10"]
+    zero = line(text, "→ 0")
+    assert zero[2].startswith("+") and zero[4].endswith("?")
+    assert zero[5:11] == ["+1.00", "±", "0.08", "-2.00", "±", "0.08"]  # 0.1 (1/3 + 49/126)^(1/2)
+    assert "→ 0" not in shown(comparison(rows[0]))

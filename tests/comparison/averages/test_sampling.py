@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -144,3 +145,30 @@ def test_plain_data(result):
     assert len(data["measurements"]) == 8
     assert data["measurements"][0]["growth"][-1]["steps"] == 1600
     assert data["environment"]["cpu"]
+
+
+def test_shifts_and_turns_have_their_own_temperatures(dumbbells, result):
+    """Both make up the whole, and both see the convention that is hot."""
+    for m in result.measurements:
+        assert set(m.kinds) == {"shift", "turn"}
+        values = [m.kinds[name][0] for name in ("shift", "turn")]
+        assert min(values) <= m.temperature_error <= max(values)
+    for value, error in result.of("isokinetic-notes")[1].kinds.values():
+        assert abs(value - 1 / 3) <= 4 * error <= 0.6
+    atoms = sampling.compare(test_systems.build_fluid("thermostat", 8), methods=["langevin"], most=64)
+    assert all(set(m.kinds) == {"shift"} for m in atoms.of("langevin"))
+    assert atoms.of("langevin")[0].kinds["shift"][0] == pytest.approx(atoms.of("langevin")[0].temperature_error)
+
+
+def test_extrapolated_to_step_zero(result):
+    """By the weighted fit to both steps; the reference is one for both, and its error counts once."""
+    fine, coarse = result.of("langevin")[1], result.of("langevin")[0]
+    found = result.extrapolated("langevin")
+    assert set(found) == {"temperature", "energy", "shift", "turn"}
+    assert found["temperature"].value == pytest.approx((4 * fine.temperature_error - coarse.temperature_error) / 3)
+    known = result.reference["standard_error"]
+    own = [math.sqrt(m.energy_standard_error**2 - known**2) for m in (fine, coarse)]
+    assert found["energy"].error == pytest.approx(math.hypot(math.hypot(4 * own[0], own[1]) / 3, known))
+    assert result.to_dict()["extrapolated"]["langevin"]["turn"]["order"] == 2
+    one = dataclasses.replace(result, measurements=[fine])
+    assert one.extrapolated("langevin") == {} and one.to_dict()["extrapolated"] == {}

@@ -5,7 +5,6 @@ Bonds and angles are measured here from the molecules' own tables, apart from th
 
 from __future__ import annotations
 
-import time as clock
 from itertools import combinations
 
 import numpy as np
@@ -282,13 +281,19 @@ def tangled(seed: int) -> tuple[Motion, np.ndarray] | None:
     return motion, x + rng.uniform(0.01, 7.0) * rng.normal(size=x.shape)
 
 
-def test_tangled_starts_end_soon_and_never_silently_off() -> None:
-    """Solved or refused; the slowest takes seconds here, whatever the load of the machine, and not minutes."""
-    solved, slowest = 0, 0.0
+def test_tangled_starts_end_soon_and_never_silently_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Solved or refused, by thousands of looks at the constraints (2,300 at most here) and not by millions."""
+    looks, look = [0], ConstraintSet.value
+
+    def counted(held: ConstraintSet, x: np.ndarray, time: float = 0.0) -> np.ndarray:
+        looks[0] += 1
+        return look(held, x, time)
+
+    monkeypatch.setattr(ConstraintSet, "value", counted)
+    solved, most = 0, 0
     cases = [case for case in map(tangled, range(16)) if case is not None]
-    cases[0][0].restore_positions(cases[0][1])  # so that no kernel is compiled below
     for motion, start in cases:
-        kept_start, began = start.copy(), clock.process_time()
+        kept_start, looks[0] = start.copy(), 0
         try:
             x = motion.restore_positions(start)
         except KconsError:
@@ -296,9 +301,9 @@ def test_tangled_starts_end_soon_and_never_silently_off() -> None:
         else:
             fulfilled(motion, x)
             solved += 1
-        slowest = max(slowest, clock.process_time() - began)
+        most = max(most, looks[0])
     assert len(cases) > 12 and solved >= 0.7 * len(cases)
-    assert slowest < 5.0
+    assert 500 < most < 10_000
 
 
 # -- pieces and bonds -----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""README's table is that of the committed run of the command above it, without some of its methods."""
+"""The first table of the page on comparisons is that of the committed run of the command above it."""
 
 import json
 from dataclasses import replace
@@ -17,17 +17,17 @@ def committed():
     return Comparison.from_dict(data)
 
 
-def test_readme_shows_the_committed_run():
+def test_the_page_shows_the_committed_run():
     found = committed()
     found = replace(found, measurements=[m for m in found.measurements if m.method in SHOWN])
     notes = [line for line in report.explanation(found).splitlines() if line.startswith("[")]
     lines = [line.rstrip() for line in (*rendered(report.table(found)).splitlines(), *notes)]
     wanted = "\n".join(line for line in lines if line)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert wanted in readme, f"README.md has another table than\n\n{wanted}"
+    page = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    assert wanted in page, f"docs/compare.md has another table than\n\n{wanted}"
 
 
-def test_what_readme_says_of_it():
+def test_what_the_page_says_of_it():
     found = committed()
     best, finest = found.of("blanes-moan6")[0], found.of("rattle")[-1]
     assert (best.setting, finest.setting) == (12.0, 0.5)

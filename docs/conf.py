@@ -1,0 +1,74 @@
+"""The site: `python -m sphinx -W --keep-going -b html docs site`, with the optional extras `docs` and `all`."""
+
+from __future__ import annotations
+
+import os
+import re
+
+from docutils import nodes
+from docutils.parsers.rst import Directive
+
+from kcons import __version__
+from kcons.cli.main import commands
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+project = "kcons"
+author = "the kcons developers"
+copyright = "the kcons developers"
+version = release = __version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["results"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+suppress_warnings = ["myst.header", "config.cache", "ref.python"]
+# Of one name in several classes the nearest is linked. Docstrings write code between single backquotes.
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+copybutton_exclude = ".linenos, .gp, .go"
+
+html_theme = "furo"
+html_title = "kcons"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_show_sourcelink = False
+toc_object_entries_show_parents = "hide"
+
+
+class CommandHelp(Directive):
+    """What `kcons COMMAND --help` says, for every command."""
+
+    def run(self) -> list[nodes.Node]:
+        found: list[nodes.Node] = []
+        for name, parser in commands().items():
+            section = nodes.section(ids=[nodes.make_id(f"kcons-{name}")])
+            section += nodes.title(text=f"kcons {name}")
+            section += nodes.literal_block(text=parser.format_help(), language="text")
+            found.append(section)
+        return found
+
+
+def keep_bars(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """|v| is a norm in docstrings, and no substitution, but between backquotes."""
+    for k, line in enumerate(lines):
+        parts = re.split(r"(`+[^`]*`+)", line)
+        lines[k] = "".join(part if part.startswith("`") else part.replace("|", r"\|") for part in parts)
+
+
+def setup(app: object) -> None:
+    app.connect("autodoc-process-docstring", keep_bars, priority=900)  # type: ignore[attr-defined]
+    app.add_directive("command-help", CommandHelp)  # type: ignore[attr-defined]

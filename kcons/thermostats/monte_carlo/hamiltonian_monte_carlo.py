@@ -1,0 +1,369 @@
+"""Hamiltonian Monte Carlo on constraints: proposals by dynamics, accepted or rejected by the change of energy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import (
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    ReversibilityError,
+    SingularGeometryError,
+    UnsupportedError,
+)
+from kcons.steppers import Rattle, State, Stepper, System
+from kcons.steppers.executors.frame import Frame
+from kcons.steppers.stepper import stays
+from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
+from kcons.thermostats.monte_carlo.reversed_steps import ReversedSteps
+
+#: What `State.thermostat` holds, in this order; the last is what became of the last proposal, 0 before the first.
+POTENTIAL, ACCEPTED, ENERGY, IRREVERSIBLE, UNSOLVED, NOT_FINITE, CHANGE, SUM, SQUARES, LAST = range(10)
+SIZE = 10
+#: Uses of random numbers, told apart in the counter of the generator; 0 is Langevin's.
+PROPOSAL, EXCHANGE = 1, 2
+
+
+def stream(seed: int, number: int, use: int) -> np.random.Generator:
+    """Random numbers that are a function of the seed, of the number of the step and of what they are for."""
+    key: NDArray[np.uint64] = np.array([seed, 0], dtype=np.uint64)
+    counter: NDArray[np.uint64] = np.array([0, 0, number, use], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What became of the proposals of a run.
+
+    Attributes
+    ----------
+    accepted : int
+    energy : int
+        Rejected since the energy had changed too much.
+    irreversible : int
+        Rejected since a step, taken back, did not end where it began.
+    unsolved : int
+        Rejected since a projection had no solution.
+    not_finite : int
+        Rejected since a force or the energy was not finite.
+    change : float
+        Change of the energy over kT in the last proposal; NaN if it had none.
+    mean_square : float
+        Mean of the square of that change, over the proposals that had one.
+    """
+
+    accepted: int
+    energy: int
+    irreversible: int
+    unsolved: int
+    not_finite: int
+    change: float
+    mean_square: float
+
+    @property
+    def proposals(self) -> int:
+        return self.accepted + self.energy + self.irreversible + self.unsolved + self.not_finite
+
+    @property
+    def acceptance(self) -> float:
+        """Share of the proposals that were accepted; NaN before the first."""
+        return self.accepted / self.proposals if self.proposals else math.nan
+
+    @classmethod
+    def of(cls, state: State) -> Counts:
+        """Those of a state; all 0 before the first proposal."""
+        held = np.zeros(SIZE) if state.thermostat is None else state.thermostat
+        accepted, energy, irreversible, unsolved, not_finite = (
+            round(float(n)) for n in held[ACCEPTED : NOT_FINITE + 1]
+        )
+        told = accepted + energy
+        change = float(held[CHANGE]) if held[LAST] else math.nan
+        square = float(held[SQUARES]) / told if told else math.nan
+        return cls(accepted, energy, irreversible, unsolved, not_finite, change, square)
+
+
+class HamiltonianMonteCarlo:
+    """Canonical sampling on constraints without any error of the time step.
+
+    A step draws velocities in the tangent plane, makes a trajectory with a reversible stepper, and accepts its end
+    with probability min(1, exp(-dH/kT)); otherwise the state stays, with opposite velocities. The stationary density
+    is exp(-H/kT) on positions and velocities that fulfil the constraints: positions have the density exp(-U/kT) on the
+    surface of the constraints in the mass metric, as in exact constrained dynamics at this temperature.
+
+    Every step of a trajectory is taken back and compared with its start; without that, a projection that finds another
+    solution on the way back would spoil the average without any sign. The way back uses the forces of the way there,
+    and costs projections only. A proposal that cannot be taken back, or has no solution, is rejected and counted.
+
+    All of a step is a function of the state and the seed (and the number of the step), so that a run continued from
+    a saved state is the same to the last bit. The clock goes on by the length of the trajectory in every step.
+
+    Parameters
+    ----------
+    thermal_energy : float
+        k_B T in the units of energy in use.
+    steps : int or (int, int)
+        Time steps of a proposal; with two numbers drawn between them, both included, which keeps trajectories from
+        coming back to where they began.
+    seed : int
+    stepper : Stepper, optional
+        A reversible and symplectic one: `Rattle` by default, `Geodesic`, a `Composition`, `BlanesMoan4`, ...
+    keep : float
+        The part a of the velocities that is kept, v = a v + sqrt(1 - a^2) noise. 0: all are drawn anew. Near 1, with
+        few steps of a proposal: generalised Hamiltonian Monte Carlo, which is near to Langevin dynamics.
+    conserve_momentum : bool
+        Velocities are drawn relative to the centre of mass, in the directions in which no row knows a place in space;
+        so many degrees of freedom less take part.
+    tolerance : float
+        Largest difference of a step taken back, relative as for `kcons.steppers.ReversibilityCheck`.
+
+    Raises
+    ------
+    InputError
+        Temperature not positive, fewer than one step, `keep` not in [0, 1), a seed that is none.
+    UnsupportedError
+        A stepper that is not reversible and symplectic, such as a thermostat.
+
+    Notes
+    -----
+    `State.thermostat` holds the potential energy and the counts, which `Counts.of(state)` reads.
+
+    References
+    ----------
+    Duane, Kennedy, Pendleton and Roweth, Phys. Lett. B 195, 216 (1987); Horowitz, Phys. Lett. B 268, 247 (1991); on
+    constraints with the check of the way back: Zappa, Holmes-Cerfon and Goodman, Commun. Pure Appl. Math. 71, 2609
+    (2018); Lelievre, Rousset and Stoltz, Numer. Math. 143, 379 (2019).
+    """
+
+    reversible = False
+    symplectic = False
+
+    def __init__(
+        self,
+        thermal_energy: float,
+        steps: int | tuple[int, int],
+        seed: int,
+        *,
+        stepper: Stepper | None = None,
+        keep: float = 0.0,
+        conserve_momentum: bool = False,
+        tolerance: float = 1e-9,
+    ) -> None:
+        self.thermal_energy = positive(thermal_energy, "thermal_energy")
+        self.steps = step_range(steps)
+        self.seed = seed_number(seed)
+        self.keep = kept_part(keep)
+        self.stepper: Stepper = Rattle() if stepper is None else stepper
+        if not (getattr(self.stepper, "reversible", False) and getattr(self.stepper, "symplectic", False)):
+            raise UnsupportedError(
+                f"{self.stepper!r} is not reversible and symplectic, and its proposals could not be corrected; use "
+                "Rattle, Geodesic, a Composition or a RungeKuttaNystrom stepper"
+            )
+        self.conserve_momentum = bool(conserve_momentum)
+        self.tolerance = positive(tolerance, "tolerance")
+        self._known: tuple[System, ReversedSteps, FloatArray] | None = None
+
+    def __repr__(self) -> str:
+        few, most = self.steps
+        steps = few if few == most else self.steps
+        return f"HamiltonianMonteCarlo({self.thermal_energy!r}, {steps!r}, seed={self.seed}, stepper={self.stepper!r})"
+
+    @property
+    def order(self) -> int:
+        return self.stepper.order
+
+    @property
+    def force_evaluations(self) -> int:
+        """Of a proposal; the mean, where the number of its steps is drawn."""
+        return round(self.stepper.force_evaluations * sum(self.steps) / 2)
+
+    def check(self, system: System) -> None:
+        """Raise where there is no such density.
+
+        Raises
+        ------
+        InputError
+            Forces without a potential.
+        UnsupportedError
+            Rows that move with time, or hold velocities; forces that depend on velocities; friction.
+        """
+        refuse_friction(system)
+        if system.velocity_dependent:
+            raise UnsupportedError("forces that depend on the velocities have no energy to accept or reject by")
+        if system.motion.plan.driven:
+            raise UnsupportedError(
+                "rows that move with time, or hold velocities, leave no stationary density to sample: hold positions "
+                "that rest, or use Langevin"
+            )
+        if system.force is not None and system.potential is None:
+            raise InputError(
+                "this System has no potential; pass potential=..., by which proposals are accepted", item="potential"
+            )
+        self.stepper.check(system)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Make one proposal with time steps of `dt`, and accept or reject it.
+
+        Raises
+        ------
+        InputError
+            A time step that is not positive; the state carries variables of another thermostat; whatever is wrong with
+            the forces.
+        NonFiniteError
+            The energy of the state itself is not finite.
+        InputError, UnsupportedError
+            As `check`.
+        """
+        self.check(system)
+        still = stays(state, dt)
+        if still is not None:
+            return still
+        if dt < 0:
+            raise InputError(f"the time step is {dt}; noise cannot be taken back", item="dt")
+        held = state.thermostat if carried(state, SIZE, "HamiltonianMonteCarlo") else None
+        held = np.array([math.nan, *[0.0] * (SIZE - 1)]) if held is None else held.copy()
+        if math.isnan(held[POTENTIAL]):
+            held[POTENTIAL] = energy_at(system, state)
+            if not math.isfinite(held[POTENTIAL]):
+                raise NonFiniteError(
+                    f"the potential energy is {held[POTENTIAL]} before step {state.step + 1}",
+                    item="energy",
+                    step=state.step + 1,
+                )
+        random = stream(self.seed, state.step + 1, PROPOSAL)
+        count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
+        begin = replace(system.with_forces(state), velocities=self._refreshed(system, state, random))
+        length = count * dt
+        end, reason, change, potential = self._judged(system, begin, dt, count, threshold, held[POTENTIAL])
+        held[CHANGE] = change
+        held[LAST] = reason
+        held[reason] += 1
+        if reason in (ACCEPTED, ENERGY):
+            held[SQUARES] += change * change
+            held[SUM] += min(1.0, math.exp(-max(change, 0.0)))
+        if reason != ACCEPTED:
+            end = replace(begin, velocities=-begin.velocities)
+        else:
+            held[POTENTIAL] = potential
+        time, left_over = state.later(length)
+        return replace(end, time=time, time_remainder=left_over, step=state.step + 1, thermostat=held)
+
+    def trajectory(self, system: System, state: State, dt: float, count: int) -> State:
+        """The end of so many steps from `state`, each of which was taken back.
+
+        Raises
+        ------
+        ReversibilityError
+            One of them could not be.
+        KconsError
+            As the stepper.
+        """
+        steps = self._steps_of(system, state)
+        for _ in range(count):
+            state = steps.step(self.stepper, state, dt)
+        return state
+
+    # -- inner ----------------------------------------------------------------------------------
+
+    def _judged(
+        self, system: System, begin: State, dt: float, count: int, threshold: float, potential: float
+    ) -> tuple[State, int, float, float]:
+        """The end of a proposal, what became of it, the change of energy over kT, and the potential energy there."""
+        kinetic = system.kinetic_energy(begin.velocities)
+        try:
+            end = self.trajectory(system, begin, dt, count)
+        except ReversibilityError:
+            return begin, IRREVERSIBLE, math.nan, potential
+        except (ConvergenceError, SingularGeometryError):
+            return begin, UNSOLVED, math.nan, potential
+        except NonFiniteError:
+            return begin, NOT_FINITE, math.nan, potential
+        there = energy_at(system, end)
+        change = (system.kinetic_energy(end.velocities) - kinetic + (there - potential)) / self.thermal_energy
+        if not math.isfinite(change):
+            return begin, NOT_FINITE, math.nan, potential
+        return end, ACCEPTED if threshold < -change else ENERGY, change, there
+
+    def _refreshed(self, system: System, state: State, random: np.random.Generator) -> FloatArray:
+        """Velocities of which a part is kept and a part drawn, in the tangent plane."""
+        x, v = Frame(system, state, 0.0).x, state.velocities
+        noise = random.standard_normal(v.shape)
+        noise *= np.sqrt((1 - self.keep**2) * self.thermal_energy * system.inverse_masses)
+        kept = self.keep * v
+        if self.conserve_momentum:
+            directions = self._directions(system, state)
+            noise -= drift_velocity(noise, system.masses, directions)
+            kept += (1 - self.keep) * drift_velocity(v, system.masses, directions)
+        return system.motion.project_velocities(x, kept + noise, time=state.time)
+
+    def _steps_of(self, system: System, state: State) -> ReversedSteps:
+        if self._known is None or self._known[0] is not system:
+            steps = ReversedSteps(system, self.tolerance)
+            self._known = system, steps, np.zeros((0, 3))
+            if self.conserve_momentum:
+                self._known = system, steps, open_directions(system.motion, state.positions, state.time)
+        return self._known[1]
+
+    def _directions(self, system: System, state: State) -> FloatArray:
+        """Those in which no row knows a place in space."""
+        self._steps_of(system, state)
+        assert self._known is not None
+        return self._known[2]
+
+
+def energy_at(system: System, state: State) -> float:
+    """The potential energy; 0 without forces."""
+    if system.potential is None:
+        return 0.0
+    x = state.positions.view()
+    x.setflags(write=False)
+    return float(system.potential(x, state.time))
+
+
+def step_range(steps: int | tuple[int, int]) -> tuple[int, int]:
+    """Fewest and most steps of a proposal.
+
+    Raises
+    ------
+    InputError
+        Not whole numbers from 1 on, or in the wrong order.
+    """
+    given = np.asarray(steps)
+    both = np.broadcast_to(given, 2) if given.shape in ((), (2,)) else np.zeros(2)
+    if given.dtype.kind not in "iu" or not 1 <= both[0] <= both[1]:
+        raise InputError(
+            f"steps is {steps!r}; give a whole number, 1 or more, or the fewest and the most", item="steps"
+        )
+    return int(both[0]), int(both[1])
+
+
+def kept_part(keep: float) -> float:
+    """`keep` as a float.
+
+    Raises
+    ------
+    InputError
+        Not a number in [0, 1).
+    """
+    if np.ndim(keep) or not 0 <= keep < 1:
+        raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")
+    return float(keep)
+
+
+def seed_number(seed: int) -> int:
+    """`seed` as an int.
+
+    Raises
+    ------
+    InputError
+        Not a whole number from 0 to 2^64 - 1.
+    """
+    if int(seed) != seed or not 0 <= seed < 2**64:
+        raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
+    return int(seed)

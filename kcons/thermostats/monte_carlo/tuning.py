@@ -1,0 +1,169 @@
+"""The time step for a wanted share of accepted proposals, found before a run and kept in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kcons.errors import ConvergenceError, InputError
+from kcons.steppers import State, System
+from kcons.thermostats.freedom import positive
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
+    POTENTIAL,
+    SIZE,
+    SUM,
+    HamiltonianMonteCarlo,
+)
+
+#: Of dual averaging: how strongly proposals move the step, how many count as made already, how fast old ones are
+#: forgotten.
+PULL, BEFORE, FORGET = 0.2, 10, 0.75
+
+
+class DualAveraging:
+    """A time step that moves until as many proposals are accepted as wanted (Hoffman and Gelman, Algorithm 5).
+
+    Parameters
+    ----------
+    dt : float
+        To begin with.
+    wanted : float
+        Between 0 and 1.
+
+    Raises
+    ------
+    InputError
+        `dt` is not positive, or `wanted` not between 0 and 1.
+    """
+
+    def __init__(self, dt: float, wanted: float) -> None:
+        self.wanted = wanted_share(wanted)
+        self._centre = self._log = math.log(positive(dt, "dt"))
+        self._sum = self._mean = 0.0
+        self.made = 0
+
+    @property
+    def dt(self) -> float:
+        """For the next proposal."""
+        return math.exp(self._log)
+
+    @property
+    def result(self) -> float:
+        """The mean, later proposals counting more."""
+        return math.exp(self._mean) if self.made else self.dt
+
+    def learn(self, probability: float) -> None:
+        """A proposal with `dt` had this probability of being accepted."""
+        self.made += 1
+        self._sum += self.wanted - probability
+        self._log = self._centre - math.sqrt(self.made) / PULL * self._sum / (self.made + BEFORE)
+        share = self.made**-FORGET
+        self._mean += share * (self._log - self._mean)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What `tune` found.
+
+    Attributes
+    ----------
+    dt : float
+        The time step.
+    acceptance : float
+        Mean probability of the second half of the proposals, whose steps differed still.
+    state : State
+        To go on from, with counts that begin anew.
+    """
+
+    dt: float
+    acceptance: float
+    state: State
+
+
+def best_share(order: int) -> float:
+    """The share of accepted proposals that costs least, p/(p + 1) for order p.
+
+    For many degrees of freedom dH is normal, its deviation s is proportional to dt^p and its mean s^2/2, and
+    erfc(s/sqrt(8)) of the proposals are accepted. dt erfc(s/sqrt(8)) is largest for 0.651 at order 2, 0.796 at order 4
+    and 0.856 at order 6.
+    """
+    return order / (order + 1)
+
+
+def tune(
+    system: System,
+    state: State,
+    dt: float,
+    sampler: HamiltonianMonteCarlo,
+    *,
+    wanted: float | None = None,
+    proposals: int = 80,
+) -> Tuned:
+    """Find the time step for a share of accepted proposals, by proposals with steps that differ.
+
+    They bring the state towards equilibrium too, but are no sample: a step that looks at what it did has no stationary
+    density. Run with the step that was found, which stays.
+
+    Parameters
+    ----------
+    system : System
+    state : State
+    dt : float
+        To begin with.
+    sampler : HamiltonianMonteCarlo
+        Its number of steps stays, so that trajectories become longer or shorter with the step.
+    wanted : float, optional
+        Between 0 and 1; by default what costs least for the order of the stepper, see `best_share`.
+    proposals : int
+
+    Raises
+    ------
+    InputError
+        A step that is not positive, a share not between 0 and 1, fewer than 20 proposals.
+    ConvergenceError
+        No proposal of the second half could be made, however small the step became.
+    KconsError
+        As `HamiltonianMonteCarlo.step`.
+    """
+    search = DualAveraging(dt, best_share(sampler.order) if wanted is None else wanted)
+    check_proposals(proposals)
+    sampler.check(system)
+    late = 0.0
+    for k in range(proposals):
+        before = sum_of(state)
+        state = sampler.step(system, state, search.dt)
+        probability = sum_of(state) - before
+        search.learn(probability)
+        late += probability * (2 * k >= proposals)
+    if not late > 0:
+        raise ConvergenceError(f"no proposal succeeded with time steps down to {search.dt:.3g}; is the start sound?")
+    assert state.thermostat is not None
+    held = np.zeros(SIZE)
+    held[POTENTIAL] = state.thermostat[POTENTIAL]
+    return Tuned(search.result, late / (proposals - (proposals + 1) // 2), replace(state, thermostat=held))
+
+
+def sum_of(state: State) -> float:
+    """Probabilities of acceptance of all proposals so far, added up."""
+    return 0.0 if state.thermostat is None else float(state.thermostat[SUM])
+
+
+def wanted_share(wanted: float) -> float:
+    """`wanted` as a float.
+
+    Raises
+    ------
+    InputError
+        Not a number between 0 and 1.
+    """
+    if np.ndim(wanted) or not 0 < wanted < 1:
+        raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
+    return float(wanted)
+
+
+def check_proposals(proposals: int) -> None:
+    """Raise `InputError` for fewer than 20."""
+    if int(proposals) != proposals or proposals < 20:
+        raise InputError(f"proposals is {proposals}; give a whole number, 20 or more", item="proposals")

@@ -1,0 +1,147 @@
+"""Forces in groups that are asked for at steps of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kcons.constraints.arguments import numbers
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+
+ForceFunction = Callable[[FloatArray, float], ArrayLike]
+
+
+class ForceGroups:
+    """Applied forces as a sum of groups. It is the force function of a `System`: called, it gives the sum.
+
+    Parameters
+    ----------
+    groups : mapping of str to callable
+        Forces ``force(x, t)``, shape (n_atoms, 3), by name.
+
+    Attributes
+    ----------
+    evaluations : dict of str to int
+        How often each group was asked for.
+
+    Raises
+    ------
+    InputError
+        No groups; a name that is no text; one function in two groups, whose forces would count twice.
+    """
+
+    def __init__(self, groups: Mapping[str, ForceFunction]) -> None:
+        if not groups:
+            raise InputError("there are no groups of forces; give at least one", item="groups")
+        seen: dict[int, str] = {}
+        for name, force in groups.items():
+            if not isinstance(name, str) or not name:
+                raise InputError(f"a group of forces is called {name!r}; give it a name, a text", item="groups")
+            if not callable(force):
+                raise InputError(f"the forces of group {name!r} are {force!r}; give a function", item=name)
+            if id(force) in seen:
+                raise InputError(
+                    f"groups {seen[id(force)]!r} and {name!r} overlap: both are {force!r}, whose forces would count "
+                    "twice. Put it into one of them",
+                    item=name,
+                )
+            seen[id(force)] = name
+        self.groups: dict[str, ForceFunction] = dict(groups)
+        self.evaluations = dict.fromkeys(self.groups, 0)
+
+    @classmethod
+    def difference(
+        cls, cheap: ForceFunction, expensive: ForceFunction, *, fast: str = "fast", slow: str = "slow"
+    ) -> ForceGroups:
+        """`cheap` forces as the fast group, `expensive` less `cheap` ones as the slow group: `expensive` in all.
+
+        Parameters
+        ----------
+        cheap, expensive : callable
+            Of the same atoms.
+        fast, slow : str
+            Names of the groups.
+
+        Raises
+        ------
+        InputError
+            Both are the same function. While they run: their arrays differ in shape, so that they are of different
+            systems.
+        """
+        if cheap is expensive:
+            raise InputError("cheap and expensive forces are the same function; nothing is left to be slow", item=slow)
+        return cls({fast: cheap, slow: Difference(cheap, expensive)})
+
+    def __repr__(self) -> str:
+        return f"ForceGroups({', '.join(self.groups)})"
+
+    def __call__(self, x: FloatArray, time: float) -> FloatArray:
+        """The sum over all groups."""
+        total: FloatArray | None = None
+        for name in self.groups:
+            f = self.of(name, x, time)
+            if total is None:
+                total = np.array(f)
+            elif f.shape != total.shape:
+                raise InputError(
+                    f"group {name!r} gives forces of shape {f.shape}, the groups before it {total.shape}: they are of "
+                    "different systems",
+                    item=name,
+                )
+            else:
+                total += f
+        assert total is not None
+        return total
+
+    def of(self, name: str, x: FloatArray, time: float) -> FloatArray:
+        """Forces of one group."""
+        f = numbers(self.groups[name](x, time), f"forces of group {name!r}")
+        self.evaluations[name] += 1
+        return f
+
+
+class Difference:
+    """Expensive forces less cheap ones at the same place."""
+
+    def __init__(self, cheap: ForceFunction, expensive: ForceFunction) -> None:
+        self.cheap, self.expensive = cheap, expensive
+
+    def __call__(self, x: FloatArray, time: float) -> FloatArray:
+        # A function may use its array again, also where both share it.
+        less = np.array(numbers(self.cheap(x, time), "cheap forces"))
+        whole = numbers(self.expensive(x, time), "expensive forces")
+        if less.shape != whole.shape:
+            raise InputError(
+                f"cheap forces have shape {less.shape}, expensive ones {whole.shape}: they are of different systems, "
+                "and their difference is none",
+                item="forces",
+            )
+        return whole - less
+
+
+def group_names(force: object, names: tuple[str, ...]) -> None:
+    """Refuse forces whose groups are not those that a stepper has steps for.
+
+    Raises
+    ------
+    UnsupportedError
+        The forces are not in groups.
+    InputError
+        A group without a number of steps, or steps of a group that is not there.
+    """
+    if names == ("",):
+        return
+    if not isinstance(force, ForceGroups):
+        raise UnsupportedError(
+            f"the System has no groups of forces, and {', '.join(names)} were given steps; make it with "
+            "System(motion, ForceGroups({...}))"
+        )
+    for name in names:
+        if name not in force.groups:
+            raise InputError(f"there is no group {name!r} of forces; there are {', '.join(force.groups)}", item="steps")
+    for name in force.groups:
+        if name not in names:
+            raise InputError(f"group {name!r} of the forces has no number of steps; add it to steps", item="steps")

@@ -1,0 +1,99 @@
+"""The forces of each group on the way through a step, and in the state that it ends in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kcons.constraints.arguments import lent
+from kcons.constraints.target import FloatArray
+from kcons.steppers import State, System
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.thermostats.freedom import carried
+from kcons.thermostats.multistep.force_groups import ForceGroups
+
+
+@dataclass
+class GroupedForces:
+    """Forces by the names of their groups.
+
+    A state carries them, if there are two or more, behind the variables of its thermostat, so that a run that is
+    continued evaluates nothing anew.
+
+    Attributes
+    ----------
+    system : System
+    names : tuple of str
+        One empty name where forces come in no groups.
+    now : dict of str to ndarray, shape (n_atoms, 3)
+        Those last evaluated.
+    """
+
+    system: System
+    names: tuple[str, ...]
+    now: dict[str, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        state: State,
+        names: tuple[str, ...],
+        variables: int,
+        name: str,
+        *,
+        mark: float | None = None,
+    ) -> tuple[GroupedForces, FloatArray | None]:
+        """Forces at a state, evaluated where it has none, and the variables of its thermostat, which begin with `mark`.
+
+        Raises
+        ------
+        InputError
+            The state carries variables of another thermostat.
+        """
+        size = 3 * system.n_atoms
+        stored = len(names) * size if len(names) > 1 else 0
+        if mark is not None and state.thermostat is not None and state.thermostat.flat[0] != mark:
+            carried(state, -1, name)
+        known = carried(state, variables + stored, name)
+        x, _, forces = system.taken(state)
+        found = cls(system, names, {})
+        if forces is not None and not stored:
+            found.now[names[0]] = forces
+        elif forces is not None and known:
+            assert state.thermostat is not None
+            parts = state.thermostat[variables:].reshape(len(names), *x.shape)
+            found.now.update(zip(names, parts, strict=True))
+        else:
+            for group in names:
+                found.evaluate(group, x, state.time, state.step)
+        return found, None if state.thermostat is None else state.thermostat[:variables]
+
+    def evaluate(self, name: str, x: FloatArray, time: float, step: int) -> None:
+        """Forces of one group at positions as the force function sees them.
+
+        Raises
+        ------
+        NonFiniteError, InputError
+            With the number of the step.
+        """
+        system = self.system
+        force = system.force
+        if not name or not isinstance(force, ForceGroups):
+            self.now[name] = system.forces(x, x, time, step)
+            return
+        f = system.accepted(force.of(name, lent(x), time), step, True)
+        check_finite(f, "force", step)
+        self.now[name] = f
+
+    def total(self) -> FloatArray:
+        """Their sum."""
+        first, *others = (self.now[name] for name in self.names)
+        return first if not others else first + sum(others[1:], start=others[0])
+
+    def closed(self, variables: FloatArray) -> FloatArray:
+        """What a state carries: the variables of the thermostat, and forces."""
+        if len(self.names) == 1:
+            return variables
+        return np.concatenate([variables, *(self.now[name].ravel() for name in self.names)])

@@ -1,0 +1,134 @@
+"""The operations of a step with several time steps, one inside the other.
+
+The slowest group kicks at the ends of the step, and between its kicks the next one makes its steps, and so on
+(Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, by a symmetric
+scheme of order 2 or 4, with the heat bath in its middle.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+from kcons.errors import InputError
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
+from kcons.thermostats.isokinetic.isokinetic import SCHEMES
+
+
+@dataclass(frozen=True)
+class Level:
+    """A group of forces, and its steps in one step of the whole."""
+
+    group: str
+    steps: int
+
+
+def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
+    """Groups from the slowest to the fastest; None for all forces at once.
+
+    Raises
+    ------
+    InputError
+        Numbers of steps that are not whole, below 1, the same for two groups, or of which one does not divide the next;
+        the slowest group takes more than one.
+    """
+    if steps is None:
+        return (Level("", 1),)
+    if not isinstance(steps, Mapping) or not steps:
+        raise InputError("steps must name each group of forces, as {'slow': 1, 'fast': 4}", item="steps")
+    for name, count in steps.items():
+        if isinstance(count, bool) or count != count or int(count) != count or count < 1:
+            raise InputError(f"group {name!r} takes {count} steps; give a whole number, 1 or more", item="steps")
+    levels = sorted((Level(name, int(count)) for name, count in steps.items()), key=lambda level: level.steps)
+    if levels[0].steps != 1:
+        raise InputError(
+            f"group {levels[0].group!r}, the slowest, takes {levels[0].steps} steps; it takes 1, the step itself",
+            item="steps",
+        )
+    for outer, inner in pairwise(levels):
+        if outer.steps == inner.steps:
+            raise InputError(
+                f"groups {outer.group!r} and {inner.group!r} both take {inner.steps} steps; add their forces to one",
+                item="steps",
+            )
+        if inner.steps % outer.steps:
+            raise InputError(
+                f"the step of group {inner.group!r} does not divide that of {outer.group!r}: {inner.steps} steps are "
+                f"no multiple of {outer.steps}",
+                item="steps",
+            )
+    return tuple(levels)
+
+
+def nested(
+    levels: tuple[Level, ...], order: int, flight: tuple[float, ...], *, turns: bool = False, exact: bool = False
+) -> tuple[Operation, ...]:
+    """A step.
+
+    Parameters
+    ----------
+    levels : tuple of Level
+    order : {2, 4}
+        Of the innermost scheme.
+    flight : tuple of float
+        What each drift is made of, as fractions that add up to 1.
+    turns : bool
+        Kicks on spheres, before which velocities are put onto the constraints.
+    exact : bool
+        Fly along great circles.
+    """
+    kicks, drifts, _ = SCHEMES[order]
+    inner = levels[-1].steps
+    middle = len(drifts) % 2 == 1
+    halves = [d for k, d in enumerate(drifts) for d in ([d / 2] * 2 if middle and k == len(drifts) // 2 else [d])]
+    flights = iter(drifts_of([d / inner for _ in range(inner) for d in halves], flight, exact=exact))
+    done = list(_level(levels, 0, kicks, drifts, flights, turns))
+    if not turns:
+        done.append(Project())
+    return tuple(done)
+
+
+def evaluations(operations: tuple[Operation, ...]) -> dict[str, int]:
+    """How often a step evaluates each group."""
+    return dict(Counter(operation.group for operation in operations if isinstance(operation, Evaluate)))
+
+
+def _level(
+    levels: tuple[Level, ...],
+    at: int,
+    kicks: tuple[float, ...],
+    drifts: tuple[float, ...],
+    flights: Iterator[Fly],
+    turns: bool,
+) -> Iterator[Operation]:
+    """A step of one group, with those of the faster ones in it."""
+    push = Turn if turns else Kick
+    group, length = levels[at].group, 1.0 / levels[at].steps
+    if at + 1 < len(levels):
+        yield push(0.5 * length, group)
+        for _ in range(levels[at + 1].steps // levels[at].steps):
+            yield from _level(levels, at + 1, kicks, drifts, flights, turns)
+        yield Evaluate(group)
+        yield push(0.5 * length, group)
+        return
+    centre = len(drifts) // 2
+    odd = len(drifts) % 2 == 1
+    for k, fraction in enumerate(kicks):
+        if not odd and k == centre:
+            yield from (push(0.5 * fraction * length, group), Exchange(length), push(0.5 * fraction * length, group))
+        else:
+            yield push(fraction * length, group)
+        if k < len(drifts):
+            yield from _drift(next(flights), turns)
+            if odd and k == centre:
+                yield Exchange(length)
+                yield from _drift(next(flights), turns)
+            yield Evaluate(group)
+
+
+def _drift(flight: Fly, turns: bool) -> Iterator[Operation]:
+    yield flight
+    if turns:
+        yield Project()

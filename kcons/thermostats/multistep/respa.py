@@ -1,0 +1,143 @@
+"""Langevin dynamics on constraints with several time steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.steppers import State, System
+from kcons.steppers.compositions import SUZUKI_4
+from kcons.steppers.executors.piecewise import ArrayStep
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.thermostats.langevin import Langevin, LangevinStep
+from kcons.thermostats.multistep.force_groups import group_names
+from kcons.thermostats.multistep.grouped_forces import GroupedForces
+from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+
+
+def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
+    """What each drift of the innermost scheme is made of.
+
+    Raises
+    ------
+    InputError
+        An order that there is no scheme of.
+    """
+    if order not in (2, 4):
+        raise InputError(f"order is {order}; choose 2 or 4", item="order")
+    return (1.0 / substeps,) * substeps if order == 2 else SUZUKI_4
+
+
+class LangevinRespa(Langevin):
+    """Langevin dynamics on constraints with several time steps: kicks of slow forces about steps of fast ones.
+
+    Each group of forces kicks at the ends of its own step, and the fastest one moves the atoms by geodesic BAOAB, with
+    friction and noise in the middle of each of its steps. Slow forces in steps of half a period of the fastest motion,
+    or of its multiples, drive it (resonance): with bonds to hydrogen or whole molecules held, 8 to 16 fs are safe, and
+    more fail. `IsokineticSpheres` takes longer steps.
+
+    Parameters
+    ----------
+    thermal_energy : float
+        k_B T in the units of energy in use.
+    friction : float
+        gamma, in inverse units of time; 0 for constant energy.
+    seed : int
+    steps : mapping of str to int, optional
+        Steps of each group of forces in one step, ``{"slow": 1, "medium": 4, "fast": 12}``; each divides the next. The
+        System has the forces, as `ForceGroups`. Without it all forces are one group.
+    order : {2, 4}
+        Of the innermost scheme, with 1 or 6 evaluations of its forces a step. The whole is of order 2.
+    substeps : int
+        RATTLE substeps in each drift, for order 2.
+    conserve_momentum : bool
+        See `Langevin`.
+
+    Raises
+    ------
+    InputError
+        As for `Langevin`; numbers of steps that do not divide each other.
+
+    Notes
+    -----
+    `State.thermostat` holds the heat, as for `Langevin`, and the forces of the groups.
+
+    References
+    ----------
+    Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992); Leimkuhler and Matthews, Proc. R. Soc. A 472, 20160138
+    (2016).
+    """
+
+    def __init__(
+        self,
+        thermal_energy: float,
+        friction: float,
+        seed: int,
+        *,
+        steps: Mapping[str, int] | None = None,
+        order: int = 2,
+        substeps: int = 3,
+        conserve_momentum: bool = False,
+    ) -> None:
+        super().__init__(thermal_energy, friction, seed, substeps=substeps, conserve_momentum=conserve_momentum)
+        self.levels: tuple[Level, ...] = levels_of(steps)
+        flight = inner_flight(order, self.substeps)
+        self.inner_order = order
+        self._substeps = nested(self.levels, order, flight)
+        self._great_circles = nested(self.levels, order, (1.0,), exact=True)
+        self.force_evaluations = sum(evaluations(self._substeps).values())
+
+    def __repr__(self) -> str:
+        steps = {level.group: level.steps for level in self.levels}
+        given = "" if steps == {"": 1} else f", steps={steps}"
+        order = "" if self.inner_order == 2 else f", order={self.inner_order}"
+        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given}{order})"
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
+        super().check(system)
+        group_names(system.force, tuple(level.group for level in self.levels))
+
+    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
+        return RespaStep(system, state, dt, self)
+
+
+class RespaStep(LangevinStep):
+    """A step on its way."""
+
+    def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa) -> None:
+        names = tuple(level.group for level in thermostat.levels)
+        groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa")
+        super().__init__(system, start, dt, thermostat)
+        self.groups = groups
+        self.equal_flights = thermostat.inner_order == 2
+        #: Exchanges so far.
+        self.exchanges = 0
+
+    def kick(self, operation: Kick) -> None:
+        self.v = self.v + (operation.fraction * self.dt) * (
+            self.groups.now[operation.group] * self.system.inverse_masses
+        )
+
+    def pieces(self, operation: Fly) -> list[tuple[float, float]]:
+        return super().pieces(operation) if self.equal_flights else ArrayStep.pieces(self, operation)
+
+    def exchange(self, operation: Exchange) -> None:
+        super().exchange(operation)
+        self.exchanges += 1
+
+    def noise(self, shape: tuple[int, ...]) -> FloatArray:
+        return self.thermostat.drawn(self.number, shape, self.exchanges)
+
+    def evaluate(self, operation: Operation) -> None:
+        assert isinstance(operation, Evaluate)
+        check_finite(self.x, "position", self.number)
+        self.groups.evaluate(operation.group, self.frame.whole(self.x), self.now, self.number)
+
+    def end(self) -> State:
+        variables = self.groups.closed(np.array([self.heat]))
+        return self.frame.closed(self.x, self.v, self.groups.total(), variables)

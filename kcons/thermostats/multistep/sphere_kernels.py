@@ -1,0 +1,128 @@
+"""What happens on spheres, compiled.
+
+y = (u, w) of a sphere are its mass-weighted velocities and its auxiliary variables, |y| = R. Atoms enter by sums over
+clusters alone; velocities are changed in place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True)
+def centres(v, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """Velocity of the centre of mass of each cluster that has a sphere for it, else 0, shape (n_clusters, 3)."""
+    found = np.zeros((len(totals), 3))
+    for i in range(len(cluster)):
+        c = cluster[i]
+        if c >= 0 and spheres[c, 0] >= 0:
+            for k in range(3):
+                found[c, k] += masses[i] * v[i, k]
+    for c in range(len(totals)):
+        for k in range(3):
+            found[c, k] /= totals[c]
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def products(v, a, middle_v, middle_a, n_spheres, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """u.u', mass-weighted, on each sphere."""
+    found = np.zeros(n_spheres)
+    for c in range(len(totals)):
+        for k in range(3):
+            if spheres[c, k] >= 0:
+                found[spheres[c, k]] += totals[c] * middle_v[c, k] * middle_a[c, k]
+    for i in range(len(cluster)):
+        c = cluster[i]
+        if c >= 0 and spheres[c, 3] >= 0:
+            total = 0.0
+            for k in range(3):
+                total += (v[i, k] - middle_v[c, k]) * (a[i, k] - middle_a[c, k])
+            found[spheres[c, 3]] += masses[i] * total
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def combine(v, a, middle_v, middle_a, keep, push, cluster, spheres):  # type: ignore[no-untyped-def]
+    """u = keep u + push u' on each sphere; what has no sphere stays."""
+    for i in range(len(cluster)):
+        c = cluster[i]
+        if c < 0:
+            continue
+        rest = spheres[c, 3]
+        for k in range(3):
+            inner = v[i, k] - middle_v[c, k]
+            if rest >= 0:
+                inner = keep[rest] * inner + push[rest] * (a[i, k] - middle_a[c, k])
+            s = spheres[c, k]
+            if s >= 0:
+                inner += keep[s] * middle_v[c, k] + push[s] * middle_a[c, k]
+            v[i, k] = inner
+
+
+@numba.njit(cache=True, nogil=True)
+def rescale(v, w, squares, with_w, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """Bring y back onto its sphere: all of it, or u alone, with w as it is."""
+    n = len(squares)
+    middle = centres(v, cluster, spheres, masses, totals)
+    has = products(v, v, middle, middle, n, cluster, spheres, masses, totals)
+    keep, push = np.ones(n), np.zeros(n)
+    for s in range(n):
+        own = 0.0
+        for k in range(w.shape[1]):
+            own += w[s, k] * w[s, k]
+        if with_w:
+            if has[s] + own > 0:
+                keep[s] = math.sqrt(squares[s] / (has[s] + own))
+            for k in range(w.shape[1]):
+                w[s, k] *= keep[s]
+        elif has[s] > 0:
+            keep[s] = math.sqrt(max(squares[s] - own, 0.0) / has[s])
+    combine(v, v, middle, middle, keep, push, cluster, spheres)
+
+
+@numba.njit(cache=True, nogil=True)
+def turn(v, w, a, t, squares, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """The kick: y' = (1 - y y^T/R^2)(F, 0) over a time t, in closed form, with the accelerations a on the constraints.
+
+    With e = F/|F|, c = u.e/R and z = |F| t/R, divided by e^z so that nothing overflows:
+
+        y(t) = (y e^-z + e R [(1 - e^-2z) + c (1 - e^-z)^2]/2)/d,    d = [(1 + c) + (1 - c) e^-2z]/2.
+    """
+    n = len(squares)
+    middle_v = centres(v, cluster, spheres, masses, totals)
+    middle_a = centres(a, cluster, spheres, masses, totals)
+    along = products(v, a, middle_v, middle_a, n, cluster, spheres, masses, totals)
+    strength = products(a, a, middle_a, middle_a, n, cluster, spheres, masses, totals)
+    keep, push = np.ones(n), np.zeros(n)
+    for s in range(n):
+        if not strength[s] > 0:
+            continue
+        force, radius = math.copysign(math.sqrt(strength[s]), t), math.sqrt(squares[s])
+        cosine = min(max(along[s] / (force * radius), -1.0), 1.0)
+        z = force * t / radius
+        once, twice = math.expm1(-z), math.expm1(-2 * z)
+        scale = 1.0 + 0.5 * (1.0 - cosine) * twice
+        if not scale > 0:  # exactly against the force, for longer than any rounding
+            continue
+        keep[s] = (1.0 + once) / scale
+        push[s] = 0.5 * radius / force * (cosine * once * once - twice) / scale
+        for k in range(w.shape[1]):
+            w[s, k] *= keep[s]
+    combine(v, a, middle_v, middle_a, keep, push, cluster, spheres)
+    rescale(v, w, squares, True, cluster, spheres, masses, totals)
+
+
+@numba.njit(cache=True, nogil=True)
+def stir(v, w, noise, own_noise, keep, spread, squares, cluster, spheres, masses, totals):  # type: ignore[no-untyped-def]
+    """y = R (keep y + spread xi)/|keep y + spread xi|, with noise that is on the constraints."""
+    for i in range(len(cluster)):
+        for k in range(3):
+            v[i, k] = keep * v[i, k] + spread * noise[i, k]
+    for s in range(w.shape[0]):
+        for k in range(w.shape[1]):
+            w[s, k] = keep * w[s, k] + spread * own_noise[s, k]
+    rescale(v, w, squares, True, cluster, spheres, masses, totals)

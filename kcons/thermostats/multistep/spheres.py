@@ -1,0 +1,232 @@
+"""Stochastic isokinetic baths: velocities of each cluster stay on spheres, together with auxiliary variables.
+
+y = (u, w), the mass-weighted velocities of g degrees of freedom and L auxiliary variables, keeps |y|^2 = R^2 =
+(g + L - 1) k_B T. Kicks turn y, free flight keeps |u|, and the bath moves y on the sphere without changing the uniform
+distribution there. Configurations are then canonical, and no degree of freedom can take up more energy than its sphere
+has, so that resonances of slow kicks stay bounded.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.steppers import State, System
+from kcons.steppers.executors.piecewise import ArrayStep
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Operation, Project, Turn
+from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.thermostats.isokinetic.step import paced
+from kcons.thermostats.langevin import SeededBath
+from kcons.thermostats.multistep import sphere_kernels as kernels
+from kcons.thermostats.multistep.force_groups import group_names
+from kcons.thermostats.multistep.grouped_forces import GroupedForces
+from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+from kcons.thermostats.multistep.respa import inner_flight
+from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
+
+logger = logging.getLogger("kcons.thermostats")
+
+#: Part of a step whose noise is drawn for the auxiliary variables at the start of a run.
+_BEGIN = 2**63
+
+
+class IsokineticSpheres(SeededBath):
+    """Canonical configurations at long steps: a stochastic isokinetic bath on spheres, with several time steps.
+
+    Dynamics are lost: diffusion, relaxation times and spectra mean nothing. Beside several time steps it needs a
+    smaller step than Langevin for the same bias; without them prefer `Langevin`.
+
+    Parameters
+    ----------
+    thermal_energy : float
+        k_B T in the units of energy in use.
+    friction : float
+        gamma, in inverse units of time, above 0: the rate at which the bath forgets.
+    seed : int
+    steps : mapping of str to int, optional
+        As for `LangevinRespa`.
+    spheres : {'split', 'axes', 'cluster', 'global'}
+        Atoms that constraints tie together are a cluster, a free atom is its own. 'split': one sphere for the centre of
+        mass of each cluster and one for the motion about it; 'axes': one for each of x, y and z of the centre of mass;
+        'cluster': one for each cluster; 'global': one for everything. A cluster that a row ties to a place in space
+        has one sphere in the first three.
+    auxiliary : int
+        L, auxiliary variables on each sphere; many of them are Langevin dynamics.
+    order : {2, 4}
+        Of the innermost scheme.
+    substeps : int
+        RATTLE substeps in each drift, for order 2.
+
+    Raises
+    ------
+    InputError
+        Temperature or friction not positive; numbers of steps that do not divide each other; unknown spheres; spheres
+        of radius 0 (g + L - 1 = 0), at the start of a run.
+
+    Notes
+    -----
+    `State.thermostat` holds a mark, the auxiliary variables, sphere by sphere, and the forces of the groups. Velocities
+    of the start are scaled to their spheres. Kinetic energies average g (G - 1)/G k_B T/2 on a sphere of G = g + L
+    (`kinetic_energy`), and say nothing of the temperature.
+
+    References
+    ----------
+    Minary, Tuckerman and Martyna, Phys. Rev. Lett. 93, 150201 (2004); Leimkuhler, Margul and Tuckerman, Mol. Phys. 111,
+    3579 (2013).
+    """
+
+    def __init__(
+        self,
+        thermal_energy: float,
+        friction: float,
+        seed: int,
+        *,
+        steps: Mapping[str, int] | None = None,
+        spheres: Spheres = "split",
+        auxiliary: int = 1,
+        order: int = 2,
+        substeps: int = 3,
+    ) -> None:
+        super().__init__(thermal_energy, friction, seed, substeps)
+        if not self.friction > 0:
+            raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
+        if spheres not in KINDS:
+            raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(KINDS)}", item="spheres")
+        if isinstance(auxiliary, bool) or int(auxiliary) != auxiliary or auxiliary < 0:
+            raise InputError(f"auxiliary is {auxiliary}; give a whole number, 0 or more", item="auxiliary")
+        self.levels: tuple[Level, ...] = levels_of(steps)
+        self.spheres: Spheres = spheres
+        self.auxiliary = int(auxiliary)
+        self.inner_order = order
+        flight = inner_flight(order, self.substeps)
+        self._in_flights = nested(self.levels, order, flight, turns=True)
+        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True)
+        self.force_evaluations = sum(evaluations(self._in_flights).values())
+        self._known: tuple[System, SphereLayout, FloatArray] | None = None
+        self._told = False
+
+    def __repr__(self) -> str:
+        steps = {level.group: level.steps for level in self.levels}
+        given = "" if steps == {"": 1} else f", steps={steps}"
+        given += f", spheres={self.spheres!r}, auxiliary={self.auxiliary}"
+        given += "" if self.inner_order == 2 else f", order={self.inner_order}"
+        return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        exact = system is not None and system.great_circles is not None
+        return self._great_circles if exact else self._in_flights
+
+    def check(self, system: System) -> None:
+        """Raise where there can be no spheres, or where the groups of forces are not those that have steps.
+
+        Raises
+        ------
+        UnsupportedError
+            Velocity-dependent forces, friction of the system, targets that move, rows that hold velocities.
+        InputError
+            Groups of forces.
+        """
+        super().check(system)
+        if self._known is None or self._known[0] is not system:
+            refuse_driven(system)
+            group_names(system.force, tuple(level.group for level in self.levels))
+
+    def layout(self, system: System, positions: FloatArray) -> SphereLayout:
+        """The spheres of a system."""
+        return self._spheres(system, positions)[0]
+
+    def kinetic_energy(self, system: System, positions: FloatArray) -> float:
+        """What the kinetic energy is on average, (k_B T/2) times the sum of g (G - 1)/G over the spheres."""
+        g = self._spheres(system, positions)[0].freedom
+        whole = g + self.auxiliary
+        return 0.5 * self.thermal_energy * float((g * (whole - 1) / whole).sum())
+
+    def begun(self, system: System, state: State, dt: float) -> ArrayStep:
+        layout, squares = self._spheres(system, state.positions)
+        if not self._told:
+            self._told = True
+            logger.warning("isokinetic spheres sample configurations only: no transport, relaxation times or spectra")
+        return SphereStep(system, state, dt, self, layout, squares)
+
+    def _spheres(self, system: System, positions: FloatArray) -> tuple[SphereLayout, FloatArray]:
+        if self._known is None or self._known[0] is not system:
+            layout = SphereLayout.of(system, positions, self.spheres)
+            self._known = (system, layout, layout.squares(self.thermal_energy, self.auxiliary))
+        return self._known[1:]
+
+
+class SphereStep(ArrayStep):
+    """A step on its way; velocities are on the constraints and on their spheres but between a drift and `project`."""
+
+    def __init__(
+        self,
+        system: System,
+        start: State,
+        dt: float,
+        bath: IsokineticSpheres,
+        layout: SphereLayout,
+        squares: FloatArray,
+    ) -> None:
+        n, auxiliary = len(squares), bath.auxiliary
+        names = tuple(level.group for level in bath.levels)
+        #: What the variables begin with, since those of another thermostat may be as many.
+        self.mark = -1.0 - n * auxiliary
+        self.groups, known = GroupedForces.of(
+            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark
+        )
+        super().__init__(system, start, dt)
+        self.bath, self.squares = bath, squares
+        self.tables = layout.cluster, layout.spheres, layout.masses, layout.totals
+        self.v = self.v.copy()
+        if known is not None:
+            known = known[1:]
+        else:
+            known = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (n * auxiliary,), _BEGIN)
+            self.v = system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        self.w: FloatArray = known.reshape(n, auxiliary).copy()
+        kernels.rescale(self.v, self.w, squares, True, *self.tables)
+        #: Accelerations along the constraints, by groups, where they are known.
+        self.paces: dict[str, FloatArray] = {}
+        self.exchanges = 0
+
+    def turn(self, operation: Turn) -> None:
+        group = operation.group
+        if group not in self.paces:
+            self.paces[group] = paced(self.system, self.x, self.groups.now[group], self.now)
+        kernels.turn(self.v, self.w, self.paces[group], operation.fraction * self.dt, self.squares, *self.tables)
+
+    def fly(self, operation: Fly) -> None:
+        super().fly(operation)
+        check_finite(self.x, "position", self.number)
+        self.paces.clear()
+
+    def project(self, operation: Project) -> None:
+        """Velocities onto the constraints, with the length they had before the drift."""
+        self.v = self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        kernels.rescale(self.v, self.w, self.squares, False, *self.tables)
+
+    def exchange(self, operation: Exchange) -> None:
+        """Friction and noise on the spheres."""
+        system, bath = self.system, self.bath
+        n = self.v.size
+        drawn = bath.drawn(self.number, (n + self.w.size,), self.exchanges)
+        self.exchanges += 1
+        noise = drawn[:n].reshape(self.v.shape) * np.sqrt(system.inverse_masses)
+        noise = system.motion.project_velocities(self.x, noise, time=self.now, out=noise)
+        decay = bath.friction * operation.fraction * self.dt
+        keep, spread = math.exp(-decay), math.sqrt(-math.expm1(-2 * decay) * bath.thermal_energy)
+        own = drawn[n:].reshape(self.w.shape)
+        kernels.stir(self.v, self.w, noise, own, keep, spread, self.squares, *self.tables)
+
+    def evaluate(self, operation: Operation) -> None:
+        assert isinstance(operation, Evaluate)
+        self.groups.evaluate(operation.group, self.frame.whole(self.x), self.now, self.number)
+
+    def end(self) -> State:
+        check_finite(self.v, "velocity", self.number)
+        return self.frame.closed(self.x, self.v, self.groups.total(), self.groups.closed(np.append(self.mark, self.w)))

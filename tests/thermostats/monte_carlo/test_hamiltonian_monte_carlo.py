@@ -1,0 +1,263 @@
+"""Hamiltonian Monte Carlo: an involution, its energies, its flips, averages, restarts, bad input."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from monte_carlo_systems import KT, no_energy, no_force, trap, trap_potential, trimer
+from scipy.stats import kstest
+from thermostat_systems import dumbbells, system, waves, waves_potential
+
+from kcons.constraints import Distance, FixedAtoms, Formula, MovingTarget, Plane
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import BlanesMoan4, BlanesMoan6, Geodesic, Rattle, ReversibilityCheck, State, Suzuki4, System, run
+from kcons.thermostats import Counts, HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL, PROPOSAL, stream
+
+
+def started(n=2):
+    held, x = dumbbells(n)
+    return held, held.initial_state(x, thermal_velocities(held, x, 0.5, 4))
+
+
+@pytest.mark.parametrize("stepper", [Rattle(), Geodesic(3), Suzuki4(), BlanesMoan4(), BlanesMoan6()], ids=repr)
+def test_a_proposal_is_an_involution(stepper):
+    """There, turned round, there again, turned round: the start, to rounding."""
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 1, 3, stepper=stepper)
+    end = sampler.trajectory(held, state, 0.1, 8)
+    again = sampler.trajectory(held, end.reversed(), 0.1, 8).reversed()
+    assert np.abs(end.positions - state.positions).max() > 0.3
+    np.testing.assert_allclose(again.positions, state.positions, atol=1e-13)
+    np.testing.assert_allclose(again.velocities, state.velocities, atol=1e-13)
+
+
+def refreshed(held, state, kt, keep, random):
+    """As documented, with the projector of the constraint set itself."""
+    noise = random.standard_normal(state.velocities.shape) * np.sqrt(kt * (1 - keep**2) / held.masses[:, None])
+    v = (keep * state.velocities + noise).ravel()
+    rows = held.motion.constraint_set.jacobian(state.positions).toarray()
+    w = 1 / np.repeat(held.masses, 3)
+    return (v - w * (rows.T @ np.linalg.solve((rows * w) @ rows.T, rows @ v))).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.7])
+def test_every_decision_follows_from_the_energies(keep):
+    """Each step made again with its own random numbers, a plain run and plain energies."""
+    held, state = started()
+    held = System(held.motion, lambda x, t: 10 * waves(x), potential=lambda x, t: 10 * waves_potential(x))
+    dt, kt = 0.2, 0.5
+    sampler = HamiltonianMonteCarlo(kt, (2, 4), 12, keep=keep)
+    outcomes = set()
+    for number in range(1, 31):
+        after = sampler.step(held, state, dt)
+        random = stream(12, number, PROPOSAL)
+        count = int(random.integers(2, 5))
+        threshold = random.random()
+        begin = replace(state, velocities=refreshed(held, state, kt, keep, random))
+        end = run(held, begin, dt, count, check_every=0)
+        change = (held.total_energy(end) - held.total_energy(begin)) / kt
+        assert Counts.of(after).change == pytest.approx(change, abs=1e-11)
+        accepted = math.log1p(-threshold) < -change
+        outcomes.add(accepted)
+        expected, v = (end.positions, end.velocities) if accepted else (state.positions, -begin.velocities)
+        np.testing.assert_allclose(after.positions, expected, atol=1e-12)
+        np.testing.assert_allclose(after.velocities, v, atol=1e-12)
+        assert after.time == pytest.approx(state.time + count * dt) and after.step == number
+        assert after.thermostat[POTENTIAL] == pytest.approx(held.potential(after.positions, 0.0), abs=1e-12)
+        state = after
+    assert outcomes == {True, False}
+    counts = Counts.of(state)
+    assert counts.proposals == 30 and counts.accepted + counts.energy == 30
+    assert counts.acceptance == counts.accepted / 30 and counts.mean_square > 0
+
+
+def cosines(states):
+    x = np.array([s.positions for s in states])
+    return np.einsum("ni,ni->n", x[:, 0] - x[:, 1], x[:, 2] - x[:, 1])
+
+
+def test_a_free_angle_has_the_average_of_its_metric():
+    """Masses 10, 1, 10, two bonds held: P(c) of the cosine is sqrt(1 - (b c)^2), b = 10/11; 1/3 without the metric."""
+    held, state = trimer(masses=(10.0, 1.0, 10.0))
+    sampler = HamiltonianMonteCarlo(1.0, (3, 8), 21, conserve_momentum=True)
+    found = run(held, state, 0.15, 1500, stepper=sampler, record=1, check_every=0)
+    counts = Counts.of(found.last)
+    assert counts.energy > 5 and counts.unsolved > 5
+    squares = cosines(found.frames[1:]) ** 2
+    error = squares.reshape(30, -1).mean(axis=1).std(ddof=1) / math.sqrt(30)
+    assert error < 0.01
+    assert abs(squares.mean() - 0.276334992061) < 3 * error < abs(squares.mean() - 1 / 3)
+    assert np.abs(held.masses @ found.last.velocities).max() < 1e-12
+
+
+def test_velocities_are_those_of_the_temperature():
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 1, 5, stepper=BlanesMoan4(), keep=0.5)
+    found = run(held, state, 0.5, 1500, stepper=sampler, record=3, check_every=0)
+    kinetic = np.array([held.kinetic_energy(s.velocities) for s in found.frames[20:]])
+    assert kstest(kinetic, "gamma", args=(5.0, 0.0, 0.5)).pvalue > 0.01  # 2 x 5 degrees of freedom
+    assert kstest(kinetic, "gamma", args=(6.0, 0.0, 0.5)).pvalue < 1e-6
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_run_goes_on_to_the_last_bit(saved):
+    held, state = started()
+    half = run(held, state, 0.4, 12, stepper=HamiltonianMonteCarlo(0.5, (1, 4), 3, keep=0.3))
+    whole = run(held, half, 0.4, 12, stepper=HamiltonianMonteCarlo(0.5, (1, 4), 3, keep=0.3))
+    if saved:
+        file = io.BytesIO()
+        half.save(file)
+        file.seek(0)
+        half = State.load(file)
+    again = run(held, half, 0.4, 12, stepper=HamiltonianMonteCarlo(0.5, (1, 4), 3, keep=0.3))
+    for name in ("positions", "velocities", "forces", "thermostat", "time"):
+        assert np.array_equal(getattr(whole, name), getattr(again, name)), name
+    other = run(held, half, 0.4, 12, stepper=HamiltonianMonteCarlo(0.5, (1, 4), 4, keep=0.3))
+    assert np.abs(other.positions - whole.positions).max() > 1e-3
+    assert 0 < Counts.of(whole).accepted < 24 == Counts.of(whole).proposals
+
+
+def test_what_has_no_solution_or_no_way_back_is_rejected_and_counted():
+    """On a torus large steps land on the far side, from where the way back leads elsewhere."""
+    x = np.array([[1.4, 0, 0]])
+    torus = Formula("(x1**2 + y1**2 + z1**2 + 0.84)**2 - 4*(x1**2 + y1**2)", [0], target=0.0)
+    held = system([torus], x, [1.0], no_force, no_energy)
+    state = held.initial_state(x)
+    sampler = HamiltonianMonteCarlo(1.0, 1, 3)
+    for _ in range(60):
+        after = sampler.step(held, state, 0.6)
+        if Counts.of(after).accepted == Counts.of(state).accepted:
+            assert np.array_equal(after.positions, state.positions) and np.isfinite(after.velocities).all()
+        state = after
+    counts = Counts.of(state)
+    assert counts.irreversible > 0 and counts.unsolved > 0 and counts.accepted > 10
+    assert counts.proposals == 60
+    assert np.abs(held.motion.constraint_set.value(state.positions)).max() < 1e-12
+
+
+def test_a_proposal_that_explodes_is_rejected():
+    held, state = started()
+    steep = System(held.motion, lambda x, t: -1e200 * x**5, potential=lambda x, t: float(1e200 * (x**6).sum() / 6))
+    end = HamiltonianMonteCarlo(0.5, 5, 8).step(steep, state, 0.1)
+    counts = Counts.of(end)
+    assert counts.not_finite + counts.unsolved == 1 and np.isnan(counts.change)
+    assert np.array_equal(end.positions, state.positions)
+
+
+def test_atoms_at_rest_stay_and_planes_keep_their_momentum():
+    x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
+    held = system([Plane(range(5), [0, 0, 1.0])], x, np.arange(1.0, 6), waves, waves_potential)
+    v = np.tile([0.3, 0, 0], (5, 1))
+    sampler = HamiltonianMonteCarlo(0.5, 2, 3, conserve_momentum=True, keep=0.3)
+    after = sampler.step(held, State(x, v), 1e-9)
+    np.testing.assert_allclose(held.masses @ after.velocities, held.masses @ v, atol=1e-6)
+    fixed = system([FixedAtoms([0])], x, np.ones(5), waves, waves_potential)
+    after = run(fixed, State(x, np.zeros((5, 3))), 0.1, 5, stepper=HamiltonianMonteCarlo(0.5, 2, 3))
+    assert np.array_equal(after.positions[0], x[0]) and not after.velocities[0].any()
+    with pytest.raises(UnsupportedError, match="total momentum is not conserved"):
+        HamiltonianMonteCarlo(0.5, 2, 3, conserve_momentum=True).step(fixed, State(x, np.zeros((5, 3))), 0.1)
+
+
+def test_far_from_the_origin_nothing_changes():
+    near, state = trimer(trap, trap_potential)
+    far = 1e6
+    moved = system(
+        [Distance([[0, 1], [1, 2]])],
+        state.positions + far,
+        np.ones(3),
+        lambda x, t: trap(x - far),
+        lambda x, t: trap_potential(x - far),
+    )
+    sampler = HamiltonianMonteCarlo(KT, 3, 8)
+    a = run(near, state, 0.3, 5, stepper=sampler)
+    b = run(moved, moved.initial_state(state.positions + far), 0.3, 5, stepper=sampler)
+    assert Counts.of(a).accepted == Counts.of(b).accepted == 5
+    np.testing.assert_allclose(b.positions - far, a.positions, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"thermal_energy": 0.0}, "thermal_energy is 0.0; give a positive number"),
+        ({"steps": 0}, "steps is 0"),
+        ({"steps": 2.5}, "steps is 2.5"),
+        ({"steps": (4, 2)}, r"steps is \(4, 2\)"),
+        ({"seed": -1}, "seed is -1"),
+        ({"keep": 1.0}, "keep is 1.0; give a number from 0"),
+        ({"keep": -0.1}, "keep is -0.1"),
+        ({"keep": math.nan}, "keep is nan"),
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+    ],
+)
+def test_numbers_that_make_no_sense(options, words):
+    given = {"thermal_energy": 0.5, "steps": 3, "seed": 1} | options
+    with pytest.raises(InputError, match=words):
+        HamiltonianMonteCarlo(**given)
+
+
+@pytest.mark.parametrize("stepper", [Langevin(0.5, 1.0, 1), Isokinetic(0.5), NoseHooverChain(0.5, 1.0)], ids=repr)
+def test_steppers_that_are_not_reversible_and_symplectic(stepper):
+    with pytest.raises(UnsupportedError, match="is not reversible and symplectic"):
+        HamiltonianMonteCarlo(0.5, 3, 1, stepper=stepper)
+
+
+def test_a_checked_stepper_is_one():
+    held, state = started()
+    a, b = (HamiltonianMonteCarlo(0.5, 3, 1, stepper=s) for s in (Rattle(), ReversibilityCheck(Rattle())))
+    assert np.array_equal(a.step(held, state, 0.1).positions, b.step(held, state, 0.1).positions)
+
+
+def test_systems_that_have_no_stationary_density():
+    held, state = started()
+    sampler = HamiltonianMonteCarlo(0.5, 3, 1)
+    x = state.positions
+    driven = system([Distance([[0, 1]], MovingTarget(lambda t: 1 + t, lambda t: 1.0, lambda t: 0.0))], x, np.ones(4))
+    for wrong, kind, words in (
+        (System(held.motion, waves), InputError, "has no potential"),
+        (System(held.motion, waves, potential=waves_potential, friction=0.1), UnsupportedError, "friction"),
+        (
+            System(held.motion, lambda x, v, t: -v, velocity_dependent=True),
+            UnsupportedError,
+            "depend on the velocities",
+        ),
+        (driven, UnsupportedError, "move with time"),
+    ):
+        with pytest.raises(kind, match=words):
+            sampler.step(wrong, state, 0.1)
+    with pytest.raises(InputError, match="noise cannot be taken back"):
+        sampler.step(held, state, -0.1)
+    with pytest.raises(InputError, match="variables of another thermostat"):
+        sampler.step(held, replace(state, thermostat=np.zeros(1)), 0.1)
+    bad = System(held.motion, waves, potential=lambda x, t: math.nan)
+    with pytest.raises(NonFiniteError, match="potential energy is nan before step 1"):
+        sampler.step(bad, state, 0.1)
+
+
+def test_errors_of_the_force_function_pass_through():
+    held, state = started()
+
+    def broken(x, t):
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        HamiltonianMonteCarlo(0.5, 3, 1).step(System(held.motion, broken, potential=waves_potential), state, 0.1)
+
+
+def test_a_step_of_zero_stands_still():
+    held, state = started()
+    after = HamiltonianMonteCarlo(0.5, 3, 1).step(held, state, 0.0)
+    assert np.array_equal(after.positions, state.positions) and after.step == 1
+
+
+def test_it_says_what_it_is():
+    assert repr(HamiltonianMonteCarlo(0.5, (2, 4), 7)) == (
+        "HamiltonianMonteCarlo(0.5, (2, 4), seed=7, stepper=Rattle())"
+    )
+    assert HamiltonianMonteCarlo(0.5, 10, 7, stepper=BlanesMoan4()).force_evaluations == 60
+    empty = Counts.of(State(np.zeros((1, 3)), np.zeros((1, 3))))
+    assert empty.proposals == 0 and np.isnan(empty.acceptance) and np.isnan(empty.mean_square)

@@ -1,0 +1,75 @@
+"""The step for a wanted acceptance: on a known law, on a system, bad input."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from monte_carlo_systems import KT, trap, trap_potential, trimer
+from thermostat_systems import dumbbells
+
+from kcons.errors import ConvergenceError, InputError
+from kcons.steppers import Rattle, System, run
+from kcons.thermostats import Counts, HamiltonianMonteCarlo, best_share, tune
+from kcons.thermostats.monte_carlo.tuning import DualAveraging
+
+
+@pytest.mark.parametrize("start", [0.1, 0.5, 2.5])
+@pytest.mark.parametrize("order", [2, 4, 6])
+def test_a_known_law_is_found(order, start):
+    """dH normal with deviation dt^p and mean half its square."""
+    rng = np.random.default_rng(1)
+    wanted = best_share(order)
+    found = []
+    for _ in range(40):
+        search = DualAveraging(start, wanted)
+        for _ in range(80):
+            spread = search.dt**order
+            change = rng.normal(spread**2 / 2, spread) if search.dt < 2 else math.inf
+            search.learn(min(1.0, math.exp(-max(change, 0.0))))
+        found.append(math.erfc(search.result**order / math.sqrt(8)))
+    assert abs(np.mean(found) - wanted) < 0.09
+    assert np.std(found) < 0.06
+
+
+@pytest.mark.parametrize("order", [2, 4, 6, 8])
+def test_the_best_share_costs_least(order):
+    dt = np.linspace(0.2, 1.5, 10_000)
+    shares = np.array([math.erfc(s**order / math.sqrt(8)) for s in dt])
+    assert shares[np.argmax(dt * shares)] == pytest.approx(best_share(order), abs=0.017)
+
+
+def test_a_step_is_found_and_stays():
+    held, state = trimer(trap, trap_potential)
+    sampler = HamiltonianMonteCarlo(KT, 6, 3)
+    found = tune(held, state, 0.02, sampler, wanted=0.8, proposals=100)
+    assert Counts.of(found.state).proposals == 0 and found.state.step == 100
+    assert 0.1 < found.dt < 1.0 and 0.6 < found.acceptance < 1.0
+    after = run(held, found.state, found.dt, 150, stepper=sampler, check_every=0)
+    assert abs(Counts.of(after).acceptance - 0.8) < 0.13
+    again = tune(held, state, 0.02, sampler, wanted=0.8, proposals=100)
+    assert again.dt == found.dt
+
+
+def test_bad_input():
+    held, state = trimer(trap, trap_potential)
+    sampler = HamiltonianMonteCarlo(KT, 2, 3)
+    for options, words in (
+        ({"wanted": 0.0}, "wanted is 0.0; give a share between 0 and 1"),
+        ({"wanted": 1.0}, "wanted is 1.0"),
+        ({"proposals": 10}, "proposals is 10"),
+    ):
+        with pytest.raises(InputError, match=words):
+            tune(held, state, 0.1, sampler, **options)
+    with pytest.raises(InputError, match="dt is 0"):
+        tune(held, state, 0.0, sampler)
+
+
+def test_where_nothing_succeeds():
+    held, x = dumbbells(2)
+    state = held.initial_state(x)
+    worse = iter(range(10**9))
+    uphill = System(held.motion, held.force, potential=lambda x, t: 1e6 * next(worse))
+    with pytest.raises(ConvergenceError, match="no proposal succeeded"):
+        tune(uphill, state, 0.1, HamiltonianMonteCarlo(0.5, 1, 3, stepper=Rattle()), proposals=20)

@@ -1,0 +1,58 @@
+"""Forces of groups that travel with the state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from thermostat_systems import quartic, springs, system
+
+from kcons.errors import InputError, NonFiniteError
+from kcons.steppers import State, System
+from kcons.thermostats import ForceGroups
+from kcons.thermostats.multistep.grouped_forces import GroupedForces
+
+X = np.random.default_rng(0).normal(size=(4, 3))
+NAMES = ("slow", "fast")
+
+
+def made(**more):
+    groups = ForceGroups({"fast": springs, "slow": quartic, **more})
+    return System(system([], X, np.ones(4)).motion, groups), groups
+
+
+def test_what_a_state_carries_is_not_evaluated_anew():
+    held, groups = made()
+    found, variables = GroupedForces.of(held, State(X, 0 * X), NAMES, 2, "X")
+    assert variables is None and groups.evaluations == {"fast": 1, "slow": 1}
+    np.testing.assert_array_equal(found.total(), quartic(X) + springs(X, 0))
+    state = State(X, 0 * X, forces=found.total(), thermostat=found.closed(np.array([1.0, 2.0])))
+    again, variables = GroupedForces.of(held, state, NAMES, 2, "X")
+    assert groups.evaluations == {"fast": 1, "slow": 1}
+    assert variables.tolist() == [1.0, 2.0]
+    for name in NAMES:
+        np.testing.assert_array_equal(again.now[name], found.now[name])
+    # Where somebody moved the atoms, a state has no forces.
+    GroupedForces.of(held, replace(state, forces=None), NAMES, 2, "X")
+    assert groups.evaluations == {"fast": 2, "slow": 2}
+
+
+def test_one_group_is_the_forces_of_the_state():
+    held = System(made()[0].motion, springs)
+    found, variables = GroupedForces.of(held, State(X, 0 * X, forces=2 * X), ("",), 1, "X")
+    np.testing.assert_array_equal(found.total(), 2 * X)
+    assert found.closed(np.array([3.0])).tolist() == [3.0] and variables is None
+    named = System(held.motion, ForceGroups({"a": springs}))
+    np.testing.assert_array_equal(GroupedForces.of(named, State(X, 0 * X), ("a",), 1, "X")[0].total(), springs(X, 0))
+
+
+def test_variables_of_another_thermostat():
+    with pytest.raises(InputError, match="variables of another thermostat, not of X"):
+        GroupedForces.of(made()[0], State(X, 0 * X, thermostat=np.zeros(5)), NAMES, 2, "X")
+
+
+def test_forces_that_are_not_finite():
+    held, _ = made(slow=lambda x, t: x / 0.0)
+    with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="non-finite force at step 7"):
+        GroupedForces.of(held, State(X, 0 * X, step=7), NAMES, 0, "X")

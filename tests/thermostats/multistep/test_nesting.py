@@ -1,0 +1,91 @@
+"""A step with several time steps, as a list of operations."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+
+from kcons.errors import InputError
+from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn, drifts_of
+from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+
+THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
+
+
+def shares(operations, kind):
+    found = Counter()
+    for operation in operations:
+        if isinstance(operation, kind):
+            found[getattr(operation, "group", "")] += operation.fraction
+    return found
+
+
+def test_levels_from_slow_to_fast():
+    assert [*THREE] == [Level("slow", 1), Level("medium", 4), Level("fast", 12)]
+    assert levels_of(None) == (Level("", 1),)
+
+
+def test_two_levels_in_full():
+    flights = drifts_of((0.25,) * 4)
+    middle = [
+        (Kick(0.25, "f"), a, Exchange(0.5), b, Evaluate("f"), Kick(0.25, "f")) for a, b in (flights[:2], flights[2:])
+    ]
+    assert nested(levels_of({"s": 1, "f": 2}), 2, (1.0,)) == (
+        Kick(0.5, "s"),
+        *middle[0],
+        *middle[1],
+        Evaluate("s"),
+        Kick(0.5, "s"),
+        Project(),
+    )
+
+
+@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize("turns", [False, True])
+def test_every_group_kicks_and_every_drift_flies_for_the_whole_step(order, turns):
+    done = nested(THREE, order, (0.5, 0.5), turns=turns)
+    push = Turn if turns else Kick
+    assert shares(done, push) == pytest.approx({"slow": 1, "medium": 1, "fast": 1}, rel=1e-14)
+    assert shares(done, Fly)[""] == pytest.approx(1, rel=1e-14)
+    assert shares(done, Exchange)[""] == pytest.approx(1, rel=1e-14)
+    assert evaluations(done) == {"slow": 1, "medium": 4, "fast": 12 * (1 if order == 2 else 6)}
+    ends = [o.ends[-1] for o in done if isinstance(o, Fly)]
+    assert ends[-1] == 1.0 and math.fsum(o.fraction for o in done if isinstance(o, Fly)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_a_step_is_its_own_mirror_image(order):
+    """But for evaluations, which go before the kicks that use them."""
+    kept = [(type(o), o.fraction, getattr(o, "group", "")) for o in nested(THREE, order, (1.0,), turns=True)]
+    kept = [item for item in kept if item[0] in (Turn, Fly, Exchange)]
+    for (a, share, group), (b, other, name) in zip(kept, reversed(kept), strict=True):
+        assert (a, group) == (b, name) and share == pytest.approx(other, rel=1e-13)
+
+
+def test_on_spheres_velocities_are_projected_after_each_drift():
+    done = nested(THREE, 2, (1.0,), turns=True)
+    assert all(isinstance(b, Project) for a, b in pairwise(done) if isinstance(a, Fly))
+    assert not any(isinstance(o, Kick) for o in done)
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        ({}, "steps must name each group"),
+        (4, "steps must name each group"),
+        ({"slow": 1, "fast": 0}, "'fast' takes 0 steps"),
+        ({"slow": 1, "fast": -2}, "'fast' takes -2 steps"),
+        ({"slow": 1, "fast": 2.5}, "'fast' takes 2.5 steps"),
+        ({"slow": 1, "fast": math.nan}, "'fast' takes nan steps"),
+        ({"slow": 1, "fast": True}, "'fast' takes True steps"),
+        ({"slow": 2, "fast": 4}, "'slow', the slowest, takes 2 steps"),
+        ({"slow": 1, "fast": 1}, "both take 1 steps"),
+        ({"slow": 1, "medium": 4, "fast": 6}, "the step of group 'fast' does not divide that of 'medium'"),
+    ],
+)
+def test_steps_that_cannot_be(steps, words):
+    with pytest.raises(InputError, match=words):
+        levels_of(steps)

@@ -1,0 +1,162 @@
+"""Langevin dynamics with several time steps: against the plain scheme, order, nesting, restarts, bad input."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+from thermostat_systems import dumbbells, molecules, quartic, springs, waves
+
+from kcons.constraints import Distance, FixedAtoms, MovingTarget
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import State, System, run
+from kcons.thermostats import ForceGroups, IsokineticSpheres, Langevin, LangevinRespa
+from kcons.thermostats.multistep.respa import inner_flight
+
+TWO = {"slow": 1, "fast": 4}
+
+
+def gentle(x, t):
+    return 0.3 * waves(x)
+
+
+def stiff(x, t):
+    return -np.linspace(2.0, 4.0, len(x))[:, None] * x
+
+
+def grouped(motion, **groups):
+    return System(motion, ForceGroups(groups))
+
+
+def test_one_group_is_geodesic_langevin_to_the_last_bit():
+    held, state = molecules("bent", 3, ions=1)
+    one = run(held, state, 0.05, 15, stepper=Langevin(0.5, 1.0, 3))
+    two = run(held, state, 0.05, 15, stepper=LangevinRespa(0.5, 1.0, 3))
+    for name in ("positions", "velocities", "forces", "thermostat"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_slow_forces_of_zero_change_nothing():
+    """But for the rounding of velocities, which plain steps project once more often."""
+    held, state = molecules("bent", 3, ions=1)
+    split = grouped(held.motion, fast=springs, slow=lambda x, t: 0 * x)
+    one = run(held, state, 0.02, 40, stepper=Langevin(0.5, 0.0, 3))
+    two = run(split, state, 0.08, 10, stepper=LangevinRespa(0.5, 0.0, 3, steps=TWO))
+    np.testing.assert_allclose(one.positions, two.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=1e-13)
+    assert split.force.evaluations == {"fast": 41, "slow": 11}
+
+
+def test_everything_stays_on_the_constraints():
+    held, state = molecules("triangles", 4, ions=1)
+    split = grouped(held.motion, fast=springs, slow=gentle)
+    end = run(split, state, 0.2, 50, stepper=LangevinRespa(0.5, 1.0, 3, steps=TWO))
+    rows = held.motion.constraint_set
+    assert np.abs(rows.value(end.positions)).max() <= 1e-13
+    assert np.abs(rows.jacobian(end.positions) @ end.velocities.ravel()).max() <= 1e-13
+
+
+@pytest.mark.parametrize(("steps", "order"), [(TWO, 2), ({"slow": 1, "medium": 2, "fast": 6}, 2), (TWO, 4)])
+def test_it_is_of_order_two(steps, order):
+    held, x = dumbbells(2)
+    groups = {"fast": stiff, "slow": gentle} | ({"medium": lambda x, t: 0.1 * quartic(x)} if len(steps) == 3 else {})
+    split = grouped(held.motion, **groups)
+    state = held.initial_state(x, 0.3 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    stepper = LangevinRespa(0.5, 0.0, 3, steps=steps, order=order)
+    known = run(split, state, 1 / 512, 512, stepper=Langevin(0.5, 0.0, 3))
+    errors = [
+        np.abs(run(split, state, 1 / n, n, stepper=stepper).positions - known.positions).max() for n in (8, 16, 32)
+    ]
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert slopes == pytest.approx([2, 2], abs=0.25)
+
+
+def test_an_inner_scheme_of_order_four():
+    """Without slow forces the whole is of order 4."""
+    held, x = dumbbells(2)
+    split = grouped(held.motion, fast=waves, slow=lambda x, t: 0 * x)
+    state = held.initial_state(x, 0.3 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    stepper = LangevinRespa(0.5, 0.0, 3, steps={"slow": 1, "fast": 2}, order=4)
+    known = run(split, state, 1 / 32, 32, stepper=stepper)
+    errors = [np.abs(run(split, state, 1 / n, n, stepper=stepper).positions - known.positions).max() for n in (2, 4, 8)]
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert slopes == pytest.approx([4, 4], abs=0.5)
+
+
+@pytest.mark.parametrize("kind", [LangevinRespa, IsokineticSpheres])
+def test_a_run_goes_on_to_the_last_bit(kind):
+    """Also where forces at the same place differ in their last digits from one evaluation to the next."""
+    held, state = molecules("bent", 3, ions=1)
+    file = io.BytesIO()
+
+    def unsteady():
+        calls = []
+
+        def force(x, t):
+            calls.append(t)
+            return springs(x, t) * (1 + 1e-9 * math.sin(len(calls)))
+
+        return grouped(held.motion, fast=force, slow=gentle), calls
+
+    (whole, calls), (first, _), (second, again) = unsteady(), unsteady(), unsteady()
+    made = lambda: kind(0.5, 1.0, 3, steps=TWO)  # noqa: E731
+    end = run(whole, state, 0.1, 20, stepper=made())
+    half = run(first, state, 0.1, 10, stepper=made())
+    half.save(file)
+    file.seek(0)
+    again += calls[:41]  # as many as there have been
+    other = run(second, State.load(file), 0.1, 10, stepper=made())
+    for name in ("positions", "velocities", "forces", "thermostat"):
+        np.testing.assert_array_equal(getattr(end, name), getattr(other, name))
+
+
+def test_targets_that_move_are_met_in_each_inner_step():
+    x = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    length = MovingTarget(lambda t: 1 + 0.3 * math.sin(4 * t), lambda t: 1.2 * math.cos(4 * t))
+    rows = [FixedAtoms([0]), Distance([0, 1], length)]
+    held, _ = dumbbells(1)
+    motion = type(held.motion)(type(held.motion.constraint_set)(rows, x, np.ones(2)), x)
+    split = grouped(motion, fast=lambda x, t: 0 * x, slow=lambda x, t: 0 * x + 0.0)
+    state = split.initial_state(x, [[0, 0, 0], [1.2, 0.9, 0.0]])
+    end = run(split, state, 0.24, 5, stepper=LangevinRespa(0.5, 0.0, 3, steps=TWO, substeps=1))
+    known = run(split, state, 0.03, 40)
+    np.testing.assert_allclose(end.positions, known.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(end.velocities, known.velocities, rtol=0, atol=1e-12)
+
+
+def test_words():
+    stepper = LangevinRespa(0.5, 1.0, 3, steps=TWO, order=4)
+    assert repr(stepper) == "LangevinRespa(0.5, 1.0, seed=3, steps={'slow': 1, 'fast': 4}, order=4)"
+    lines = LangevinRespa(0.5, 1.0, 3, steps=TWO).listing().splitlines()
+    assert lines[1].endswith("change velocities by forces: slow")
+    assert [line.endswith("forces at the new positions: fast") for line in lines].count(True) == 4
+    assert repr(LangevinRespa(0.5, 1.0, 3)) == "LangevinRespa(0.5, 1.0, seed=3)"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"order": 3}, "order is 3; choose 2 or 4"),
+        ({"friction": -1.0}, "friction is -1.0"),
+        ({"steps": {"slow": 1, "fast": 0}}, "takes 0 steps"),
+    ],
+)
+def test_bad_input(options, words):
+    with pytest.raises(InputError, match=words):
+        LangevinRespa(**{"thermal_energy": 0.5, "friction": 1.0, "seed": 3, **options})
+
+
+def test_what_has_no_place_in_it():
+    held, state = molecules("bent", 2)
+    moving = System(held.motion, lambda x, v, t: -v, velocity_dependent=True)
+    with pytest.raises(UnsupportedError, match="depend on the velocities"):
+        LangevinRespa(0.5, 1.0, 3).step(moving, state, 0.1)
+    with pytest.raises(InputError, match="noise cannot be taken back"):
+        LangevinRespa(0.5, 1.0, 3).step(held, state, -0.1)
+
+
+def test_flights():
+    assert inner_flight(2, 4) == (0.25,) * 4
+    assert sum(inner_flight(4, 4)) == pytest.approx(1)

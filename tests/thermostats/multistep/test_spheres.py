@@ -1,0 +1,209 @@
+"""Stochastic isokinetic baths: what stays, order, limits, starts, refusals."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+from thermostat_systems import dumbbells, molecules, quartic, springs, system, waves
+
+from kcons.constraints import Distance, Plane, Sphere
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.steppers import State, System, run
+from kcons.thermostats import ForceGroups, Isokinetic, IsokineticSpheres, thermal_velocities
+from kcons.thermostats.multistep import sphere_kernels as kernels
+
+TWO = {"slow": 1, "fast": 4}
+KINDS = ["split", "axes", "cluster", "global"]
+
+
+def gentle(x, t):
+    return 0.3 * waves(x)
+
+
+def grouped(motion):
+    return System(motion, ForceGroups({"fast": springs, "slow": gentle}))
+
+
+def lengths(stepper, held, state):
+    """|y|^2 of each sphere."""
+    layout = stepper.layout(held, state.positions)
+    tables = layout.cluster, layout.spheres, layout.masses, layout.totals
+    middle = kernels.centres(state.velocities, *tables)
+    n = len(layout.freedom)
+    has = kernels.products(state.velocities, state.velocities, middle, middle, n, *tables)
+    w = state.thermostat[1 : 1 + n * stepper.auxiliary].reshape(n, -1)
+    return has + (w * w).sum(axis=1), layout.squares(stepper.thermal_energy, stepper.auxiliary)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", [2, 4])
+def test_spheres_and_constraints_are_kept(kind, order):
+    held, state = molecules("triangles", 4, ions=1)
+    split = grouped(held.motion)
+    stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres=kind, order=order, auxiliary=2)
+    end = run(split, state, 0.2, 25, stepper=stepper)
+    has, wanted = lengths(stepper, split, end)
+    np.testing.assert_allclose(has, wanted, rtol=1e-13)
+    rows = held.motion.constraint_set
+    assert np.abs(rows.value(end.positions)).max() <= 1e-13
+    assert np.abs(rows.jacobian(end.positions) @ end.velocities.ravel()).max() <= 1e-13
+
+
+def test_slow_forces_of_zero_change_nothing():
+    """One step of four inner ones is four steps, but for the noise, which a friction of nearly 0 leaves out."""
+    held, state = molecules("bent", 3, ions=1)
+    split = System(held.motion, ForceGroups({"fast": springs, "slow": lambda x, t: 0 * x}))
+    options = {"spheres": "split", "auxiliary": 2}
+    one = IsokineticSpheres(0.5, 1e-32, 3, **options)
+    two = IsokineticSpheres(0.5, 1e-32, 3, steps=TWO, **options)
+    a = run(held, state, 0.02, 20, stepper=one)
+    b = run(split, state, 0.08, 5, stepper=two)
+    np.testing.assert_allclose(a.positions, b.positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(a.velocities, b.velocities, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_noise_it_is_of_order_two(kind):
+    held, x = dumbbells(2)
+    split = grouped(held.motion)
+    state = held.initial_state(x, 0.7 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    made = lambda: IsokineticSpheres(0.5, 1e-32, 3, steps=TWO, spheres=kind)  # noqa: E731
+    known = run(split, state, 1 / 256, 256, stepper=made())
+    errors = [
+        np.abs(run(split, state, 1 / n, n, stepper=made()).positions - known.positions).max() for n in (8, 16, 32)
+    ]
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert slopes == pytest.approx([2, 2], abs=0.3)
+
+
+def test_an_inner_scheme_of_order_four_errs_less():
+    held, x = dumbbells(2)
+    state = held.initial_state(x, 0.7 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    made = lambda order: IsokineticSpheres(0.5, 1e-32, 3, spheres="global", order=order)  # noqa: E731
+    known = run(held, state, 1 / 64, 64, stepper=made(4))
+    errors = [
+        [np.abs(run(held, state, 1 / n, n, stepper=made(order)).positions - known.positions).max() for n in (4, 8)]
+        for order in (2, 4)
+    ]
+    assert errors[1][0] <= 0.02 * errors[0][0] and errors[1][1] <= 0.005 * errors[0][1]
+
+
+def test_many_auxiliary_variables_are_langevin_dynamics():
+    """Kinetic energy is then that of Maxwell and Boltzmann, and no energy is bounded."""
+    held, x = dumbbells(40, force=None)
+    state = State(x, thermal_velocities(held, x, 0.5, 4))
+    values = {}
+    for auxiliary in (1, 400):
+        stepper = IsokineticSpheres(0.5, 3.0, 3, spheres="cluster", auxiliary=auxiliary)
+        kinetic = []
+        see = lambda s, k=kinetic: k.append(held.kinetic_energy(s.velocities))  # noqa: E731
+        run(held, state, 0.3, 60, stepper=stepper, observers=[see])
+        values[auxiliary] = np.mean(kinetic[10:])
+        assert values[auxiliary] == pytest.approx(stepper.kinetic_energy(held, x), rel=0.03)
+    assert values[400] == pytest.approx(0.5 * 0.5 * 5 * 40, rel=0.03)
+    assert values[1] == pytest.approx(values[400] * 5 / 6, rel=0.03)
+
+
+def test_great_circles_are_flown_exactly():
+    x = np.array([[1.0, 0, 0], [0, 0, 2.0], [3.0, 1, 1]])
+    held = system([Sphere([0], [0, 0, 0], 1.0), Sphere([1], [0, 0, 0], 2.0)], x, [1.0, 2.0, 3.0], waves)
+    stepper = IsokineticSpheres(0.5, 1.0, 3)
+    end = run(held, held.initial_state(x), 0.3, 20, stepper=stepper)
+    assert np.abs(held.motion.constraint_set.value(end.positions)).max() <= 1e-14
+    assert "along great circles" in stepper.listing(held)
+    has, wanted = lengths(stepper, held, end)
+    np.testing.assert_allclose(has, wanted, rtol=1e-13)
+
+
+@pytest.mark.parametrize("auxiliary", [0, 1])
+def test_from_rest(auxiliary):
+    held, x = dumbbells(3)
+    stepper = IsokineticSpheres(0.5, 1.0, 3, auxiliary=auxiliary)
+    end = run(held, State(x, np.zeros_like(x)), 0.05, 2, stepper=stepper)
+    has, wanted = lengths(stepper, held, end)
+    np.testing.assert_allclose(has, wanted, rtol=1e-13)
+
+
+def test_noise_is_a_function_of_seed_step_and_part():
+    held, state = molecules("bent", 2)
+    split = grouped(held.motion)
+    ends = [run(split, state, 0.1, 5, stepper=IsokineticSpheres(0.5, 2.0, seed, steps=TWO)) for seed in (3, 3, 4)]
+    assert np.array_equal(ends[0].positions, ends[1].positions)
+    assert np.abs(ends[0].positions - ends[2].positions).max() > 1e-3
+    stepper = IsokineticSpheres(0.5, 2.0, 3)
+    assert not np.array_equal(stepper.drawn(7, (9,)), stepper.drawn(7, (9,), 1))
+
+
+def test_it_says_once_that_dynamics_are_lost(caplog):
+    held, state = molecules("bent", 2)
+    stepper = IsokineticSpheres(0.5, 2.0, 3)
+    with caplog.at_level(logging.WARNING, logger="kcons.thermostats"):
+        run(held, state, 0.05, 3, stepper=stepper)
+    assert [record.message for record in caplog.records if "transport" in record.message] == [
+        "isokinetic spheres sample configurations only: no transport, relaxation times or spectra"
+    ]
+
+
+def test_words():
+    stepper = IsokineticSpheres(0.5, 1.0, 3, steps=TWO, spheres="axes", order=4)
+    assert repr(stepper) == (
+        "IsokineticSpheres(0.5, 1.0, seed=3, steps={'slow': 1, 'fast': 4}, spheres='axes', auxiliary=1, order=4)"
+    )
+    assert "at constant kinetic energy: slow" in stepper.listing()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"friction": 0.0}, "friction is 0.0; spheres need a bath"),
+        ({"friction": -1.0}, "friction is -1.0"),
+        ({"friction": math.nan}, "friction is nan"),
+        ({"thermal_energy": 0.0}, "thermal_energy is 0.0"),
+        ({"spheres": "ball"}, "spheres is 'ball'; choose one of split, axes, cluster, global"),
+        ({"auxiliary": -1}, "auxiliary is -1"),
+        ({"auxiliary": 1.5}, "auxiliary is 1.5"),
+        ({"order": 6}, "order is 6"),
+        ({"substeps": 0}, "substeps is 0"),
+        ({"steps": {"slow": 1, "fast": -4}}, "takes -4 steps"),
+    ],
+)
+def test_bad_input(options, words):
+    with pytest.raises(InputError, match=words):
+        IsokineticSpheres(**{"thermal_energy": 0.5, "friction": 1.0, "seed": 3, **options})
+
+
+def test_spheres_of_radius_zero():
+    held, state = molecules("bent", 2)
+    with pytest.raises(InputError, match="have the radius 0"):
+        IsokineticSpheres(0.5, 1.0, 3, spheres="axes", auxiliary=0).step(held, state, 0.1)
+
+
+def test_what_has_no_spheres():
+    held, state = molecules("bent", 2)
+    stepper = IsokineticSpheres(0.5, 1.0, 3)
+    with pytest.raises(InputError, match="variables of another thermostat, not of IsokineticSpheres"):
+        stepper.step(held, Isokinetic(0.5).start(held, state), 0.1)
+    with pytest.raises(UnsupportedError, match="depend on the velocities"):
+        stepper.check(System(held.motion, lambda x, v, t: -v, velocity_dependent=True))
+    with pytest.raises(UnsupportedError, match="System with friction"):
+        stepper.check(System(held.motion, springs, friction=1.0))
+    x = state.positions
+    moving = system([Distance([[0, 1]], lambda t: 1 + 0.1 * t)], x, held.masses, springs)
+    with pytest.raises(UnsupportedError, match="Distance has a target that moves"):
+        stepper.check(moving)
+    with pytest.raises(InputError, match="noise cannot be taken back"):
+        stepper.step(held, state, -0.1)
+    with pytest.raises(NonFiniteError, match="non-finite force at step 1"):
+        stepper.step(System(held.motion, lambda x, t: x * (1.0 if t == 0 else np.nan)), state, 0.1)
+
+
+def test_a_cluster_on_a_plane():
+    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 2.0, 1.0]])
+    held = system([Plane([0], [0, 0, 1.0]), Distance([[0, 1]])], x, [1.0, 2.0, 3.0], quartic)
+    stepper = IsokineticSpheres(0.5, 1.0, 3)
+    end = run(held, held.initial_state(x), 0.05, 30, stepper=stepper)
+    assert np.abs(held.motion.constraint_set.value(end.positions)).max() <= 1e-14
+    assert stepper.layout(held, x).freedom.tolist() == [4, 3]
