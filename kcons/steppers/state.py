@@ -449,6 +449,11 @@ class System:
     # -- inner ----------------------------------------------------------------------------------
 
     @cached_property
+    def root_weights(self) -> FloatArray:
+        """1/sqrt(m) for each coordinate, shape (n_atoms, 3); 0 for fixed atoms."""
+        return np.sqrt(self.weights)
+
+    @cached_property
     def drift(self) -> Drift:
         """Constrained flight by one RATTLE step."""
         return rattle_drift(self.motion, self.inverse_masses)

@@ -20,7 +20,6 @@ from kcons.steppers import State, System
 from kcons.steppers.executors.piecewise import ArrayStep
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Operation, Project, Turn
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
@@ -140,6 +139,10 @@ class IsokineticSpheres(SeededBath):
         """The spheres of a system."""
         return self._spheres(system, positions)[0]
 
+    def radii(self, system: System, positions: FloatArray) -> FloatArray:
+        """R^2 of each sphere, (g + L - 1) k_B T."""
+        return self._spheres(system, positions)[1]
+
     def kinetic_energy(self, system: System, positions: FloatArray) -> float:
         """What the kinetic energy is on average, (k_B T/2) times the sum of g (G - 1)/G over the spheres."""
         g = self._spheres(system, positions)[0].freedom
@@ -187,7 +190,7 @@ class SphereStep(ArrayStep):
             known = known[1:]
         else:
             known = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (n * auxiliary,), _BEGIN)
-            self.v = system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+            self.v = self.along(self.v)
         self.w: FloatArray = known.reshape(n, auxiliary).copy()
         kernels.rescale(self.v, self.w, squares, True, *self.tables)
         #: Accelerations along the constraints, by groups, where they are known.
@@ -197,7 +200,7 @@ class SphereStep(ArrayStep):
     def turn(self, operation: Turn) -> None:
         group = operation.group
         if group not in self.paces:
-            self.paces[group] = paced(self.system, self.x, self.groups.now[group], self.now)
+            self.paces[group] = self.along(self.groups.now[group] * self.system.weights)
         kernels.turn(self.v, self.w, self.paces[group], operation.fraction * self.dt, self.squares, *self.tables)
 
     def fly(self, operation: Fly) -> None:
@@ -207,7 +210,7 @@ class SphereStep(ArrayStep):
 
     def project(self, operation: Project) -> None:
         """Velocities onto the constraints, with the length they had before the drift."""
-        self.v = self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        self.v = self.along(self.v)
         kernels.rescale(self.v, self.w, self.squares, False, *self.tables)
 
     def exchange(self, operation: Exchange) -> None:
@@ -216,8 +219,7 @@ class SphereStep(ArrayStep):
         n = self.v.size
         drawn = bath.drawn(self.number, (n + self.w.size,), self.exchanges)
         self.exchanges += 1
-        noise = drawn[:n].reshape(self.v.shape) * np.sqrt(system.inverse_masses)
-        noise = system.motion.project_velocities(self.x, noise, time=self.now, out=noise)
+        noise = self.along(drawn[:n].reshape(self.v.shape) * system.root_weights)
         decay = bath.friction * operation.fraction * self.dt
         keep, spread = math.exp(-decay), math.sqrt(-math.expm1(-2 * decay) * bath.thermal_energy)
         own = drawn[n:].reshape(self.w.shape)
