@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, lent, numbers
+from kcons.constraints.arguments import as_array, finite_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
@@ -314,9 +314,9 @@ class System:
         """
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
-        x = _finite_array(positions, self.n_atoms, "positions")
+        x = finite_array(positions, self.n_atoms, "positions")
         given = velocities is not None
-        v = _finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
+        v = finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
             return State(x, v, time)
@@ -487,17 +487,6 @@ class System:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""
         atoms = self._free_of_origin
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
-
-
-def _finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
-    array: FloatArray = np.array(numbers(values, item), order="C")
-    if array.shape != (n_atoms, 3):
-        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
-        atom = int(np.argmax(bad))
-        raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
-    return array
 
 
 def _fixed_atoms(motion: Motion) -> IntArray:
