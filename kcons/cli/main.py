@@ -126,11 +126,7 @@ def _parser() -> Parser:
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
-    slow = "expensive and cheap forces: how long may the step be? For fluids how far molecules reach (--fast 6), for "
-    slow += "files forces as in --forces (--slow gfn2 --fast amber14-all,amber14/tip3p)"
-    layers = compare.add_argument_group(slow)
-    layers.add_argument("--slow", metavar="FORCES", help="the expensive ones (default for fluids: half the box)")
-    layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
+    studies.add_steps(compare)
     compare.add_argument(
         "--criterion",
         choices=("error", "drift", "temperature"),

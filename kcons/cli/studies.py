@@ -38,6 +38,16 @@ def add(commands: Any) -> None:
     stability.set_defaults(run=_stability)
 
 
+def add_steps(compare: argparse.ArgumentParser) -> None:
+    """Options of `kcons compare` for expensive and cheap forces."""
+    layers = compare.add_argument_group(
+        "expensive and cheap forces: how long may the step be? For fluids how far molecules reach (--fast 6), for "
+        "files forces as in --forces (--slow gfn2 --fast amber14-all,amber14/tip3p)"
+    )
+    layers.add_argument("--slow", metavar="FORCES", help="the expensive ones (default for fluids: half the box)")
+    layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
+
+
 def _hard_cases(chosen: argparse.Namespace) -> int:
     from kcons.cli.progress import Bars
     from kcons.comparison import hard_cases
