@@ -125,7 +125,7 @@ def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> in
 def _layers(chosen: argparse.Namespace) -> Any:
     """The system with both forces."""
     from kcons.comparison import test_systems
-    from kcons.comparison.averages import long_steps
+    from kcons.comparison.averages import layers
 
     if chosen.scene in test_systems.FLUIDS:
         try:
@@ -136,7 +136,7 @@ def _layers(chosen: argparse.Namespace) -> Any:
                 item="fast",
             ) from None
         fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
-        return long_steps.of_fluid(fluid, fast, slow, sweeps=2000 if chosen.quick else 20_000, seed=chosen.seed)
+        return layers.of_fluid(fluid, fast, slow, sweeps=2000 if chosen.quick else 20_000, seed=chosen.seed)
     if chosen.scene is None or not Path(chosen.scene).is_file():
         known = ", ".join(test_systems.FLUIDS)
         raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")
@@ -147,6 +147,6 @@ def _layers(chosen: argparse.Namespace) -> Any:
     }
     given = {name: value for name, value in given.items() if value is not None}
     expensive = test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.slow, **given)
-    return long_steps.of_test_systems(
+    return layers.of_test_systems(
         expensive, test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.fast, **given)
     )

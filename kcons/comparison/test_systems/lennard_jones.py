@@ -130,21 +130,8 @@ class LennardJones:
         """
         y = np.array(x, dtype=np.float64)
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
-        accepted = _metropolis(
-            y,
-            self.first,
-            self.sites,
-            self.box,
-            self.cutoff,
-            thermal_energy,
-            every,
-            rng,
-            shift,
-            turn,
-            energies,
-            _one,
-            np.zeros(2),
-        )
+        common = self.first, self.sites, self.box, np.array([self.cutoff]), thermal_energy, every, rng
+        accepted = _metropolis(y, *common, (shift, turn), energies, _one)
         return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
 
 
@@ -259,8 +246,9 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def _one(y, a, b, x, first, sites, box, cutoff, switch):  # type: ignore[no-untyped-def]
+def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     """Energy of atoms a..b at y with all others at x."""
+    cutoff = reach[0]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
     for i in range(a, b):
         for j in range(x.shape[0]):
@@ -277,11 +265,11 @@ def _one(y, a, b, x, first, sites, box, cutoff, switch):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def _metropolis(x, first, sites, box, cutoff, kt, every, rng, shift, turn, energies, one, switch):  # type: ignore[no-untyped-def]
+def _metropolis(x, first, sites, box, reach, kt, every, rng, moves, energies, one):  # type: ignore[no-untyped-def]
     molecules = len(first) - 1
     energy = 0.0
     for k in range(molecules):
-        energy += 0.5 * one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, cutoff, switch)
+        energy += 0.5 * one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, reach)
     accepted = 0
     for record in range(len(energies)):
         for _ in range(every * molecules):
@@ -293,14 +281,14 @@ def _metropolis(x, first, sites, box, cutoff, kt, every, rng, shift, turn, energ
                 centre += y[i] / (b - a)
             axis = rng.normal(0.0, 1.0, 3)
             axis /= np.sqrt((axis * axis).sum())
-            angle = turn * (2.0 * rng.random() - 1.0)
+            angle = moves[1] * (2.0 * rng.random() - 1.0)
             sine, cosine = np.sin(angle), np.cos(angle)
-            move = shift * (2.0 * rng.random(3) - 1.0)
+            move = moves[0] * (2.0 * rng.random(3) - 1.0)
             for i in range(b - a):
                 p = y[i] - centre
                 y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
-            change = one(y, a, b, x, first, sites, box, cutoff, switch)
-            change -= one(x[a:b], a, b, x, first, sites, box, cutoff, switch)
+            change = one(y, a, b, x, first, sites, box, reach)
+            change -= one(x[a:b], a, b, x, first, sites, box, reach)
             if change <= 0.0 or rng.random() < np.exp(-change / kt):
                 x[a:b] = y
                 energy += change

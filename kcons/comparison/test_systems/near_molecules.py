@@ -63,9 +63,9 @@ class NearMolecules:
         """As `LennardJones.metropolis`."""
         y, of = np.array(x, dtype=np.float64), self.forces
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
-        switch = np.array([BEGIN * self.reach, self.reach])
-        common = of.first, of.sites, of.box, of.cutoff, thermal_energy, every, rng, shift, turn, energies
-        accepted = _metropolis(y, *common, _one_molecule, switch)
+        reach = np.array([of.cutoff, BEGIN * self.reach, self.reach])
+        common = of.first, of.sites, of.box, reach, thermal_energy, every, rng
+        accepted = _metropolis(y, *common, (shift, turn), energies, _one_molecule)
         return energies, y, accepted / (every * len(energies) * (len(of.first) - 1))
 
 
@@ -114,8 +114,9 @@ def _near(x, first, sites, box, cutoff, begin, end, f):  # type: ignore[no-untyp
 
 
 @numba.njit(cache=True, nogil=True)
-def _one_molecule(y, a, b, x, first, sites, box, cutoff, switch):  # type: ignore[no-untyped-def]
+def _one_molecule(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     """Energy of the molecule of atoms a..b at y with all others at x."""
+    cutoff, begin, end = reach[0], reach[1], reach[2]
     total, inverse = 0.0, 1.0 / box
     for m in range(len(first) - 1):
         q = first[m]
@@ -124,9 +125,9 @@ def _one_molecule(y, a, b, x, first, sites, box, cutoff, switch):  # type: ignor
         ox, oy, oz = y[0, 0] - x[q, 0], y[0, 1] - x[q, 1], y[0, 2] - x[q, 2]
         sx, sy, sz = _image(ox, box, inverse), _image(oy, box, inverse), _image(oz, box, inverse)
         o2 = (ox + sx) ** 2 + (oy + sy) ** 2 + (oz + sz) ** 2
-        if o2 >= switch[1] * switch[1]:
+        if o2 >= end * end:
             continue
-        share, _ = _share(np.sqrt(o2), switch[0], switch[1])
+        share, _ = _share(np.sqrt(o2), begin, end)
         energy = 0.0
         for i in range(a, b):
             for j in range(q, first[m + 1]):

@@ -8,8 +8,9 @@ import math
 import pytest
 from ase import units
 
-from kcons.comparison import fluid, long_steps, test_systems
-from kcons.comparison.averages.long_steps import METHODS, Stepped, best, compare, measure, of_fluid, of_test_systems
+from kcons.comparison import fluid, long_steps
+from kcons.comparison.averages.layers import of_fluid
+from kcons.comparison.averages.long_steps import METHODS, Stepped, best, compare, measure
 from kcons.errors import InputError
 
 FS = units.fs
@@ -24,15 +25,6 @@ def layers():
 def runs(layers):
     steps = {"langevin": 2, "langevin-respa": 4, "spheres": 4, "hmc": 4}
     return {name: measure(layers, METHODS[name], dt * FS, 0.01 / FS, length=4000 * FS) for name, dt in steps.items()}
-
-
-def test_cheap_and_expensive_forces(layers):
-    """The same where molecules are near, and different where they are far."""
-    x = layers.positions
-    cheap, expensive = layers.fast.watched(x), layers.slow.watched(x)
-    assert 0 < abs(cheap[0] - expensive[0]) < abs(expensive[0])
-    assert layers.molecules == 27 and layers.reference.error < 0.3
-    assert [layers.inner_steps(dt * FS) for dt in (1, 2, 4, 6.1)] == [1, 1, 2, 4]
 
 
 def test_every_method_is_right_at_a_fine_step(layers, runs):
@@ -101,15 +93,6 @@ def test_comparison(layers):
     assert data["reference"][0] == pytest.approx(layers.reference.value / 27)
 
 
-def test_two_test_systems():
-    """Molecules with expensive and with cheap forces, which have to be of the same atoms and rows."""
-    one = test_systems.build("butane")
-    both = of_test_systems(one, one)
-    assert both.thermal_energy == pytest.approx(300 * units.kB) and both.reference is None
-    with pytest.raises(InputError, match="different atoms"):
-        of_test_systems(one, test_systems.build("rotor"))
-
-
 def test_bad_input(layers):
     with pytest.raises(InputError, match="there is no method 'rattle'; there are langevin"):
         compare(layers, methods=["rattle"])
@@ -126,7 +109,3 @@ def test_bad_input(layers):
             measure(layers, METHODS["spheres"], step, friction, **given)
     with pytest.raises(InputError, match="give a positive number of seconds"):
         compare(layers, budget=0)
-    with pytest.raises(InputError, match=r"cheap forces reach 1\.5; give less than 1\.5"):
-        of_fluid(fluid.dumbbells(8), 1.5, 1.5)
-    with pytest.raises(InputError, match=r"molecules touch up to 2\.3 apart: take more of them"):
-        of_fluid(fluid.dumbbells(8), 1.0)
