@@ -10,6 +10,7 @@ from ase import Atoms, units
 from ase.calculators.mixing import SumCalculator
 
 from kcons.ase.binding import FORCES_ONLY
+from kcons.ase.dynamics import name_step
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
 from kcons.constraints.arguments import numbers
 from kcons.constraints.target import FloatArray
@@ -190,7 +191,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
                 self.atoms.get_potential_energy(apply_constraint=False)
                 self.atoms.get_forces(apply_constraint=False)
             except Exception as error:
-                self._name_step(error, self.nsteps)
+                name_step(error, self.nsteps)
                 raise
 
 
