@@ -6,9 +6,9 @@ the object with ASE, which makes files that contain it readable.
 
 - `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `virial`: the stress of the constraint forces
+- `pressure`: the stress of the constraint forces, cells that change
 - `calculator`, `named_calculators`: forces along the constraints, for optimisers; calculators by name
-- `dynamics`, `thermostat_dynamics`, `multiple_time_steps`: dynamics with any stepper
+- `dynamics`, `thermostat_dynamics`, `multiple_time_steps`, `monte_carlo`: dynamics with any stepper
 """
 
 from kcons.errors import with_extra
@@ -17,6 +17,7 @@ try:
     from kcons.ase.calculator import ConstrainedCalculator
     from kcons.ase.constraints_object import Constraints, constrain
     from kcons.ase.dynamics import ConstrainedDynamics
+    from kcons.ase.monte_carlo import ConstrainedMonteCarlo
     from kcons.ase.multiple_time_steps import MultipleTimeSteps
     from kcons.ase.rigid_water import rigid_water
     from kcons.ase.thermostat_dynamics import (
@@ -34,6 +35,7 @@ __all__ = [
     "ConstrainedCalculator",
     "ConstrainedDynamics",
     "ConstrainedLangevin",
+    "ConstrainedMonteCarlo",
     "ConstrainedNoseHoover",
     "Constraints",
     "IsokineticDynamics",

@@ -126,6 +126,12 @@ def _parser() -> Parser:
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
+    compare.add_argument(
+        "--criterion",
+        choices=("error", "drift", "temperature"),
+        help="what methods are ranked by: error of the trajectory (default), drift of the energy; for thermostats the "
+        "temperature of the configurations",
+    )
     report = compare.add_argument_group("the whole comparison")
     report.add_argument(
         "--all",
@@ -179,10 +185,22 @@ def _compare(chosen: argparse.Namespace) -> int:
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")
+        if chosen.criterion not in (None, "temperature"):
+            raise InputError(
+                f"--criterion {chosen.criterion} is for trajectories; thermostats are ranked by temperature",
+                item="criterion",
+            )
         return _compare_averages(chosen, budget, folder, asked)
+    if chosen.criterion == "temperature":
+        raise InputError(
+            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}; here error and drift are known",
+            item="criterion",
+        )
+    if chosen.criterion == "drift" and target is not None:
+        raise InputError("--target-error is an error of trajectories; leave --criterion drift out", item="criterion")
     from kcons.cli.progress import Bars
     from kcons.comparison.methods import methods
-    from kcons.comparison.work_precision import measure, recommendation, report
+    from kcons.comparison.work_precision import answer, measure, recommendation, report
     from kcons.comparison.work_precision.timing_rounds import QUICK_ROUNDS, ROUNDS
 
     methods.chosen(chosen.methods)  # complain before any work
@@ -204,8 +222,9 @@ def _compare(chosen: argparse.Namespace) -> int:
             settings=asked,
             reference=reference,
             rounds=rounds,
+            partial=True,
         )
-        if target is not None and reference is not None:
+        if target is not None and reference is not None and "interrupted" not in result.settings:
             result = recommendation.recommend(
                 test_system,
                 result,
@@ -218,11 +237,14 @@ def _compare(chosen: argparse.Namespace) -> int:
             )
     terminal = console()
     explained = report.explanation(result)
-    if target is not None:
-        explained += "\n\n" + recommendation.sentences(result)
+    ranked = answer.answer(result, chosen.criterion or "error", target)
+    first = [recommendation.sentences(result)] if result.recommendation is not None else []
+    first += [] if ranked is None else [answer.text(ranked)]
+    for words in first:
+        terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
     show(report.table(result, narrow=not report.fits(result, terminal.width)), explained, terminal)
-    say_written(report.write(result, folder, tables=[rendered(report.table(result)), explained]))
-    return 0
+    say_written(report.write(result, folder, tables=[*first, rendered(report.table(result)), explained]))
+    return 130 if "interrupted" in result.settings else 0
 
 
 def _expression(chosen: argparse.Namespace) -> str:
@@ -273,6 +295,7 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
     from kcons.cli.progress import Bars
     from kcons.comparison.averages import report as sampling_report
     from kcons.comparison.averages import sampling
+    from kcons.comparison.work_precision import answer
 
     sampling.chosen(chosen.methods)  # complain before any work
     _check_name(chosen)
@@ -290,8 +313,13 @@ def _compare_averages(chosen: argparse.Namespace, budget: float, folder: Path, a
             fluid, methods=chosen.methods, budget=budget, seed=chosen.seed, watcher=watcher, settings=asked
         )
     table, explained = sampling_report.table(result), sampling_report.explanation(result)
-    show(table, explained, console())
-    say_written(sampling_report.write(result, folder, tables=[rendered(table), explained]))
+    ranked = answer.answer_of_averages(result)
+    first = [] if ranked is None else [answer.text(ranked)]
+    terminal = console()
+    for words in first:
+        terminal.print(words + "\n", highlight=False, markup=False, soft_wrap=True)
+    show(table, explained, terminal)
+    say_written(sampling_report.write(result, folder, tables=[*first, rendered(table), explained]))
     return 0
 
 

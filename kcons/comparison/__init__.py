@@ -20,7 +20,7 @@ _MODULES = {
     "test_systems": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),
-    "work_precision": ("fronts", "measure", "recommendation", "report"),
+    "work_precision": ("answer", "fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
     "averages.step_zero": ("extrapolate",),

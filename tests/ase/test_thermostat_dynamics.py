@@ -9,7 +9,7 @@ import pytest
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
-from ase.constraints import FixAtoms
+from ase.constraints import FixAtoms, Hookean
 from ase.io import read
 
 from kcons.ase import (
@@ -483,3 +483,13 @@ def test_what_a_trajectory_says_of_the_run(tmp_path):
     moving = made("langevin", waters())
     assert "seed=5" in moving.todict()["stepper"]
     assert moving.todict()["md-type"] == "ConstrainedLangevin"
+
+
+def test_springs_of_ase_count_in_the_conserved_energy():
+    atoms = waters(2)
+    atoms.set_constraint([*atoms.constraints, Hookean(0, 3, 5.0, rt=0.5)])
+    dyn = ConstrainedLangevin(atoms, 0.5 * FS, 300, 0.0, rng=1)
+    before = dyn.get_conserved_energy()
+    dyn.run(20)
+    assert dyn.get_conserved_energy() == pytest.approx(before, abs=0.02)
+    assert before > 10

@@ -25,6 +25,10 @@ def test_compare_writes_table_plot_and_json(tmp_path, capsys):
     printed = capsys.readouterr()
     assert "chain of 4 rigid bonds" in printed.out
     assert "kcons RATTLE" in printed.out
+    lines = printed.out.splitlines()
+    assert lines[0].startswith("Use kcons RATTLE at ") and "for an error of at most" in lines[0]
+    assert lines[2].split() == ["method", "at", "error", "cost", "times"]
+    assert printed.out.index("Use kcons") < printed.out.index("chain of 4 rigid bonds")
     assert "error: root-mean-square distance" in printed.out
     assert f"wrote {out / 'compare.json'}" in printed.out
     assert "reference solution" in printed.err  # progress goes to the other stream
@@ -57,6 +61,7 @@ def test_compare_samples_fluids(tmp_path, capsys):
     assert run("compare", "thermostat", *options) == 0
     printed = capsys.readouterr()
     assert "8 Lennard-Jones atoms" in printed.out
+    assert "deviation of the temperature of the configurations" in printed.out.splitlines()[0]
     assert "kT off by: temperature of the configurations" in printed.out
     assert "Metropolis sampling\n" in printed.err
     data = json.loads((out / "compare.json").read_text(encoding="utf-8"))
@@ -218,3 +223,46 @@ def test_what_is_wrong_with_molecules(tmp_path, monkeypatch, capsys, arguments, 
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == 2
     assert text in capsys.readouterr().err
+
+
+def test_ctrl_c_writes_what_is_done(tmp_path, monkeypatch, capsys):
+    from kcons.comparison.work_precision.measure import Bench
+
+    whole = Bench.all_settings
+
+    def stopped(self, method):
+        if method.name == "verlet":
+            raise KeyboardInterrupt
+        return whole(self, method)
+
+    monkeypatch.setattr(Bench, "all_settings", stopped)
+    words = ["compare", "chain", "--size", 4, "--methods", "rattle,verlet", "--dt", "10,5", "--out", tmp_path]
+    assert run(*words) == 130
+    assert "interrupted: 1 of 2 methods were measured" in capsys.readouterr().out
+    data = json.loads((tmp_path / "compare.json").read_text())
+    assert [m["method"] for m in data["measurements"]] == ["rattle", "rattle"]
+
+
+def test_ctrl_c_before_anything_is_done(tmp_path, monkeypatch, capsys):
+    from kcons.comparison.work_precision.measure import Bench
+
+    def stopped(self, method):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bench, "all_settings", stopped)
+    assert run("compare", "chain", "--size", 4, "--methods", "rattle", "--dt", "10", "--out", tmp_path) == 130
+    assert not (tmp_path / "compare.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["chain", "--criterion", "temperature"], "is for thermostat"),
+        (["thermostat", "--criterion", "drift"], "is for trajectories"),
+        (["chain", "--criterion", "drift", "--target-error", "1e-3"], "leave --criterion drift out"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_criteria_that_do_not_fit(words, said, capsys):
+    assert run("compare", *words) == 2
+    assert said in capsys.readouterr().err

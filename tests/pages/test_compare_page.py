@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from kcons.cli.terminal import rendered
-from kcons.comparison.work_precision import report
+from kcons.comparison.work_precision import answer, report
 from kcons.comparison.work_precision.measurement import Comparison
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +25,13 @@ def test_the_page_shows_the_committed_run():
     wanted = "\n".join(line for line in lines if line)
     page = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
     assert wanted in page, f"docs/compare.md has another table than\n\n{wanted}"
+
+
+def test_the_page_shows_the_answer():
+    found = committed()
+    found = replace(found, measurements=[m for m in found.measurements if m.method in SHOWN])
+    page = (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    assert answer.text(answer.answer(found)) in page
 
 
 def test_what_the_page_says_of_it():

@@ -5,6 +5,7 @@
 - `measure`: a test system run through methods
 - `fronts`: the Pareto front
 - `recommendation`: which method and step for a wanted error
+- `answer`: which method and step, in one sentence
 - `report`: table, plot and file of one comparison
 - `parts_of_the_whole`, `whole`, `whole_page`: all test systems at once
 """

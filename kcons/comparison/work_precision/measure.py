@@ -50,6 +50,7 @@ def compare(
     settings: Mapping[str, Any] | None = None,
     rounds: Rounds | None = None,
     reference: Reference | None = None,
+    partial: bool = False,
 ) -> Comparison:
     """Run `test_system` through `methods`.
 
@@ -69,6 +70,8 @@ def compare(
         Runs that are short enough are timed again in rounds, after all others; how well times repeat is then known.
     reference : Reference, optional
         If it is known.
+    partial : bool
+        Whether Ctrl-C ends the comparison with what has been measured, which `settings["interrupted"]` then says.
 
     Raises
     ------
@@ -90,7 +93,17 @@ def compare(
         reference = reference_of(test_system, watching)
 
     bench = Bench(test_system, reference, budget, watching, rounds)
-    measurements, margin = bench.timed_again([m for method in picked for m in bench.all_settings(method)])
+    measurements: list[Measurement] = []
+    margin, interrupted = None, {}
+    try:
+        for method in picked:
+            measurements += bench.all_settings(method)
+        measurements, margin = bench.timed_again(measurements)
+    except KeyboardInterrupt:
+        if not (partial and measurements):
+            raise
+        done = len({m.method for m in measurements})
+        interrupted = {"interrupted": f"interrupted: {done} of {len(picked)} methods were measured"}
     unit = test_system.units.time_unit
     return Comparison(
         scene={
@@ -111,8 +124,8 @@ def compare(
             **({"error": "energy above the optimum"} if test_system.shortfall is not None else {}),
         },
         reference={"how": reference.how, "error": reference.error},
-        settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {})},
-        remarks=list(dict.fromkeys(m.remark for m in picked if m.remark)),
+        settings={"methods": [m.name for m in picked], "budget_seconds": budget, **(settings or {}), **interrupted},
+        remarks=[*interrupted.values(), *dict.fromkeys(m.remark for m in picked if m.remark)],
         environment=environment(),
         measurements=measurements,
         timing={

@@ -136,7 +136,7 @@ def test_solution_stays_on_the_constraints(name):
 @pytest.mark.parametrize(
     ("name", "size", "options", "text"),
     [
-        ("waters", None, {}, "there is no test system 'waters'; there are water"),
+        ("waters", None, {}, "there is no test system 'waters' .did you mean 'water'.*; there are water"),
         ("water", 3, {}, "too small"),
         ("water", 8, {"forces": "x"}, "no forces 'x' for water"),
         ("chain", 0, {}, "at least one bond"),

@@ -214,7 +214,7 @@ def test_runaway_trajectory_is_a_failure(monkeypatch, chain):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"methods": ["shake"]}, "there is no method 'shake'; there are rattle"),
+        ({"methods": ["shake"]}, "there is no method 'shake' .did you mean 'shake-1e-[0-9]*'.*; there are rattle"),
         ({"budget": 0}, "positive number of seconds"),
         ({"budget": float("nan")}, "positive number of seconds"),
     ],

@@ -153,7 +153,7 @@ def test_atoms_at_rest_stay_and_planes_keep_their_momentum():
     x = np.random.default_rng(0).standard_normal((5, 3)) * [1, 1, 0]
     held = system([Plane(range(5), [0, 0, 1.0])], x, np.arange(1.0, 6), waves, waves_potential)
     v = np.tile([0.3, 0, 0], (5, 1))
-    sampler = HamiltonianMonteCarlo(0.5, 2, 3, conserve_momentum=True, keep=0.5)
+    sampler = HamiltonianMonteCarlo(0.5, 2, 3, conserve_momentum=True, keep=0.3)
     after = sampler.step(held, State(x, v), 1e-9)
     np.testing.assert_allclose(held.masses @ after.velocities, held.masses @ v, atol=1e-6)
     fixed = system([FixedAtoms([0])], x, np.ones(5), waves, waves_potential)

@@ -1,0 +1,255 @@
+"""Which method and which step, in one sentence, and the ranking behind it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+from kcons.comparison.study.tables import Table, duration, plain_text
+from kcons.comparison.work_precision.fronts import COSTS, SAME_ERROR, SAME_EVALUATIONS, cost_of, verdict
+from kcons.comparison.work_precision.measurement import Comparison, Measurement
+
+if TYPE_CHECKING:
+    from kcons.comparison.averages.sampling import SamplingComparison
+
+Criterion = Literal["error", "drift", "temperature"]
+CRITERIA: tuple[Criterion, ...] = ("error", "drift", "temperature")
+
+#: Methods whose error is what is usually accepted, and the step of it where time is in fs.
+USUAL_METHODS = ("rattle", "openmm-kcons-rattle", "ase-kcons", "openmm-rattle", "openmm-verlet")
+USUAL_STEP = 2.0
+#: Of a temperature that is right enough, as a fraction.
+USUAL_TEMPERATURE = 0.01
+#: Columns of a terminal that the ranking fits into, and of these the most that a title takes.
+WIDTH, TITLE = 80, 33
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method at one setting: what it is judged by, and what it costs.
+
+    Attributes
+    ----------
+    method, title : str
+    setting : str
+        Step or tolerance, as it is shown.
+    value : float
+        Error, drift, or deviation of a temperature.
+    cost : float
+    """
+
+    method: str
+    title: str
+    setting: str
+    value: float
+    cost: float
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A point with its place. Points within the margin of the first of a place share it."""
+
+    place: int
+    point: Point
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The cheapest point of each method that is good enough, cheapest first.
+
+    Attributes
+    ----------
+    what : str
+        What points are judged by, in words.
+    unit : str
+    limit : float
+        The largest value that is good enough.
+    limit_is : str
+        Where it comes from.
+    cost : str
+        What is spent, in words.
+    seconds : bool
+        Whether that is a time.
+    margin : float
+        Costs that differ by this fraction are the same.
+    ranked : list of Ranked
+    beyond : list of Point
+        The best point of each method that is not good enough.
+    """
+
+    what: str
+    unit: str
+    limit: float
+    limit_is: str
+    cost: str
+    seconds: bool
+    margin: float
+    ranked: Sequence[Ranked]
+    beyond: Sequence[Point]
+
+
+def answer(comparison: Comparison, criterion: Criterion = "error", limit: float | None = None) -> Answer | None:
+    """Rank the methods of a comparison of trajectories; None where nothing can be ranked.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    criterion : {'error', 'drift'}
+        The error of the trajectory, or the drift of its energy: its slope and twice the standard error of it.
+    limit : float, optional
+        The largest value that is good enough; by default what the usual method makes at its usual step.
+    """
+    judged = verdict(comparison)
+    units = comparison.scene["units"]
+    pairs = []
+    for m in comparison.measurements:
+        value = _value(m, criterion)
+        if m.status == "ok" and value is not None and math.isfinite(value) and cost_of(m, judged.decides) > 0:
+            setting = f"rtol {m.setting:.0e}" if m.adaptive else f"{m.setting:.4g} {units['time']}"
+            pairs.append((m, Point(m.method, m.title, setting, value, cost_of(m, judged.decides))))
+    if not pairs:
+        return None
+    limit_is = "asked for"
+    if limit is None:
+        limit, limit_is = _usual(pairs, units["time"])
+    by_time = judged.decides == "wall"
+    found = _ranked([point for _, point in pairs], limit, judged.margin if by_time else SAME_EVALUATIONS)
+    drift = criterion == "drift"
+    return replace(
+        found,
+        what="a drift of the energy" if drift else "an error",
+        unit=f"{units['energy']}/{units['long_time']} a degree of freedom" if drift else units["length"],
+        limit_is=limit_is,
+        cost=f"{COSTS[judged.decides][1]} a {units['long_time']}",
+        seconds=by_time,
+    )
+
+
+def answer_of_averages(comparison: SamplingComparison, limit: float | None = None) -> Answer | None:
+    """Rank thermostats: who is soonest at a known temperature, where the configurations have the right one.
+
+    Parameters
+    ----------
+    comparison : SamplingComparison
+    limit : float, optional
+        The largest deviation of the temperature of the configurations that is good enough, as a fraction.
+    """
+    unit = comparison.scene["units"]["time"]
+    pointed = [
+        Point(m.method, m.title, f"{m.setting:.4g} {unit}", abs(m.temperature_error), m.seconds_to_goal)
+        for m in comparison.measurements
+        if m.status == "ok" and m.temperature_error is not None and m.seconds_to_goal
+    ]
+    if not pointed:
+        return None
+    is_usual = "usual" if limit is None else "asked for"
+    # Times to a goal follow from correlation times, which are known to a third.
+    found = _ranked(pointed, USUAL_TEMPERATURE if limit is None else limit, 1 / 3)
+    return replace(
+        found,
+        what="a deviation of the temperature of the configurations",
+        unit="of it",
+        limit_is=is_usual,
+        cost="wall time until that temperature is known to 1 %",
+        seconds=True,
+    )
+
+
+def _value(m: Measurement, criterion: Criterion) -> float | None:
+    if criterion == "error":
+        return m.error
+    if m.energy_slope is None:
+        return None
+    return abs(m.energy_slope) + 2 * (m.energy_slope_error or 0.0)
+
+
+def _usual(pairs: Sequence[tuple[Measurement, Point]], time: str) -> tuple[float, str]:
+    """What is usually accepted: that of the plainest method that ran, at 2 fs or at its second longest step."""
+    for name in USUAL_METHODS:
+        curve = sorted((pair for pair in pairs if pair[0].method == name), key=lambda pair: -pair[0].setting)
+        if curve:
+            usual = curve[min(1, len(curve) - 1)][1]
+            if time == "fs":
+                usual = min(curve, key=lambda pair: abs(math.log(pair[0].setting / USUAL_STEP)))[1]
+            return usual.value, f"what {usual.title} makes at {usual.setting}"
+    values = sorted(point.value for _, point in pairs)
+    return values[len(values) // 2], "what half of the points make"
+
+
+def _ranked(points: Sequence[Point], limit: float, margin: float) -> Answer:
+    good: dict[str, Point] = {}
+    other: dict[str, Point] = {}
+    for point in points:
+        if point.value <= limit * (1 + SAME_ERROR):
+            if point.method not in good or point.cost < good[point.method].cost:
+                good[point.method] = point
+        elif point.method not in other or point.value < other[point.method].value:
+            other[point.method] = point
+    margin = max(margin, SAME_EVALUATIONS)
+    ranked: list[Ranked] = []
+    leader = 0.0
+    for number, point in enumerate(sorted(good.values(), key=lambda p: p.cost), 1):
+        tied = bool(ranked) and point.cost <= leader * (1 + margin)
+        leader = leader if tied else point.cost
+        place = ranked[-1].place if tied else number
+        ranked.append(Ranked(place, point, point.cost / (ranked[0].point.cost if ranked else point.cost)))
+    beyond = sorted((point for name, point in other.items() if name not in good), key=lambda p: p.value)
+    return Answer("", "", limit, "", "", True, margin, ranked, beyond)
+
+
+# -- in words ---------------------------------------------------------------------------------------
+
+
+def sentence(found: Answer) -> str:
+    """The answer in one sentence."""
+    limit = f"{found.what} of at most {found.limit:.2g} {found.unit} ({found.limit_is})"
+    if not found.ranked:
+        best = found.beyond[0]
+        return f"No method makes {limit}; the least is {best.value:.2g}, by {best.title} at {best.setting}."
+    first = found.ranked[0].point
+    text = f"Use {first.title} at {first.setting}: the least {found.cost}, {_spent(first.cost, found)}, for {limit}"
+    ties = [r.point for r in found.ranked[1:] if r.place == 1]
+    if ties:
+        near = ", ".join(f"{point.title} at {point.setting}" for point in ties[:3])
+        more = f" and {len(ties) - 3} more" if len(ties) > 3 else ""
+        text += f"; as good within the margin of {100 * found.margin:.0f} %: {near}{more}"
+    return f"{text}."
+
+
+def ranking(found: Answer) -> Table:
+    """The methods in their order, at most 80 columns wide; ties share their place."""
+    tied = {r.place for r, after in zip(found.ranked, found.ranked[1:], strict=False) if r.place == after.place}
+    rows = [
+        [
+            f"{r.place}{'=' if r.place in tied else ''}",
+            _short(r.point.title),
+            r.point.setting,
+            f"{r.point.value:.1e}",
+            _spent(r.point.cost, found),
+            f"{r.ratio:.2f}" if r.ratio < 10 else f"{r.ratio:,.0f}",
+        ]
+        for r in found.ranked
+    ]
+    return Table(["", "method", "at", found.what.split()[1], "cost", "times"], rows, words=(0, 1))
+
+
+def text(found: Answer) -> str:
+    """Sentence, ranking, and who is not in it."""
+    lines = [sentence(found), ""]
+    if found.ranked:
+        lines += [plain_text(ranking(found)), ""]
+        lines += [f"cost: {found.cost}; =: equal within {100 * found.margin:.0f} %, which is how well costs repeat."]
+    if found.beyond:
+        lines += [f"Above {found.limit:.2g}: " + ", ".join(f"{p.title} {p.value:.1e}" for p in found.beyond) + "."]
+    return "\n".join(lines)
+
+
+def _short(title: str) -> str:
+    return title if len(title) <= TITLE else f"{title[: TITLE - 1]}…"
+
+
+def _spent(cost: float, found: Answer) -> str:
+    return duration(cost) if found.seconds else f"{cost:,.0f}" if cost >= 100 else f"{cost:.3g}"
