@@ -25,7 +25,7 @@ Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
 #: What the sides of a window and the directions of a pull are called.
 SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
-#: Steps of a structure that is brought to a window where nothing can be turned, and what bonds may change by on the way.
+#: Steps of a structure on its way to a window where nothing can be turned, and what bonds may change by.
 _WALK, _STRETCHED = 20, 0.1
 
 
@@ -216,7 +216,7 @@ class Held:
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
         """The engine of a window, and the initial structure with groups turned and moved so that it is there.
 
-        Within a ring nothing turns without bending angles. There the structure goes to the nearest point by small steps.
+        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps.
 
         Raises
         ------
