@@ -21,7 +21,9 @@ try:
     from kcons.openmm.collective.row_forces import Row, each_term
     from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
+    from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+    from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
     from kcons.openmm.integrator.guard import positions_of, velocities_of
     from kcons.openmm.integrator.precision import Precision
     from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -39,6 +41,7 @@ __all__ = [
     "CarriedConstraints",
     "CollectiveRows",
     "ExpressionSurface",
+    "HamiltonianMonteCarlo",
     "Isokinetic",
     "Langevin",
     "NoseHoover",
@@ -48,6 +51,7 @@ __all__ = [
     "RattleIntegrator",
     "Row",
     "SurfaceIntegrator",
+    "WaysBackIntegrator",
     "constraints_of",
     "each_term",
     "hold",

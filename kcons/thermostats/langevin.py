@@ -204,12 +204,12 @@ class LangevinStep(ArrayStep):
         """Friction and noise in the tangent plane, and the heat they bring."""
         system, motion, thermostat = self.system, self.system.motion, self.thermostat
         x, time, dt = self.x, self.now, operation.fraction * self.dt
-        v = motion.project_velocities(x, self.v, time=time, out=self.v)
+        v = self.along(self.v)
         before = system.kinetic_energy(v)
         keep = math.exp(-thermostat.friction * dt)
         spread = math.sqrt(-math.expm1(-2 * thermostat.friction * dt) * thermostat.thermal_energy)
         noise = self.noise(v.shape)
-        noise *= spread * np.sqrt(system.inverse_masses)
+        noise *= spread * system.root_weights
         # What friction does not act on: velocities that the targets demand, and of the centre of mass.
         kept = motion.project_velocities(x, np.zeros_like(v), time=time) if motion.plan.driven else None
         if thermostat.conserve_momentum:
@@ -218,7 +218,7 @@ class LangevinStep(ArrayStep):
             drift = drift_velocity(v if kept is None else v - kept, system.masses, directions)
             kept = np.broadcast_to(drift, v.shape) if kept is None else kept + drift
         noise += keep * v if kept is None else kept + keep * (v - kept)
-        self.v = motion.project_velocities(x, noise, time=time, out=noise)
+        self.v = self.along(noise)
         self.heat += system.kinetic_energy(self.v) - before
 
     def noise(self, shape: tuple[int, ...]) -> FloatArray:
@@ -231,7 +231,7 @@ class LangevinStep(ArrayStep):
 
     def project(self, operation: Operation) -> None:
         check_finite(self.v, "velocity", self.number)
-        self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        self.along(self.v)
 
     def end(self) -> State:
         return self.frame.closed(self.x, self.v, self.forces, np.array([self.heat]))

@@ -4,4 +4,5 @@
 - `langevin_ensemble`: Langevin dynamics
 - `isokinetic_ensemble`: constant kinetic energy
 - `nose_hoover_ensemble`: Nosé-Hoover chains
+- `ways_back`, `monte_carlo_sampler`: Monte Carlo without any error of the time step
 """

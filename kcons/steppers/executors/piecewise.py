@@ -7,12 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
 from kcons.solvers.fused_distances import Packed
 from kcons.steppers.executors.frame import Frame
 from kcons.steppers.operations import Damp, Fly, Kick, Operation, Settle
 from kcons.steppers.stages.compensated_steps import NO_WORK, Point, check_finite
 from kcons.steppers.stages.drifts import Drift
+from kcons.steppers.stages.fused_stages import END
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import explained
 
@@ -73,14 +75,31 @@ class ArrayStep:
         """The drift, from velocities on the constraints; they are then those along its end."""
         system = self.system
         circles = system.great_circles if operation.exact else None
-        flight = system.drift if circles is None else circles
         x, now = self.x, self.now
         point = Point(x, self.v, system.weights, exact=len(operation.flights) > 1 or circles is not None)
-        for h, end in self.pieces(operation):
-            flight.move(point, np.empty(x.shape), now, end, h)
-            now = end
+        flights = None if operation.exact else system.flights
+        if flights is not None:
+            now, fractions, dt = self.frame.at(operation.ends[-1]), operation.lengths, self.dt
+            if len(fractions) == 1:
+                fractions, dt = _WHOLE, fractions[0] * dt
+            flights.move(point, fractions, dt, np.empty(x.shape), now, self.number, flights.tables())
+        else:
+            flight = system.drift if circles is None else circles
+            for h, end in self.pieces(operation):
+                flight.move(point, np.empty(x.shape), now, end, h)
+                now = end
         point.land()
         self.x, self.v, self.now = point.x, point.v, now
+
+    def along(self, v: FloatArray) -> FloatArray:
+        """v itself, made tangent to the constraints where the step is now."""
+        system, flights, x = self.system, self.system.flights, self.x
+        if flights is None:
+            return system.motion.project_velocities(x, v, time=self.now, out=v)
+        found = flights.one(END, 0.0, x, v, v, 0.0, 0.0, system.weights, x, *flights.tables())
+        if found:
+            flights.ended(found, x, v, system.weights, self.now, self.number, flights.tables())
+        return v
 
     def evaluate(self, operation: Operation) -> None:
         """Forces where the step is now."""

@@ -20,12 +20,11 @@ from kcons.steppers import State, System
 from kcons.steppers.executors.piecewise import ArrayStep
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Operation, Project, Turn
 from kcons.steppers.stages.compensated_steps import check_finite
-from kcons.thermostats.isokinetic.step import paced
 from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
 from kcons.thermostats.multistep.respa import inner_flight
 from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
 
@@ -61,6 +60,10 @@ class IsokineticSpheres(SeededBath):
         Of the innermost scheme.
     substeps : int
         RATTLE substeps in each drift, for order 2.
+    slow_kicks : {'ends', 'middle'}
+        Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
+        slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
+        each energy that is read costs an evaluation, and the other groups are evaluated once more a step.
 
     Raises
     ------
@@ -91,6 +94,7 @@ class IsokineticSpheres(SeededBath):
         auxiliary: int = 1,
         order: int = 2,
         substeps: int = 3,
+        slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, seed, substeps)
         if not self.friction > 0:
@@ -104,8 +108,9 @@ class IsokineticSpheres(SeededBath):
         self.auxiliary = int(auxiliary)
         self.inner_order = order
         flight = inner_flight(order, self.substeps)
-        self._in_flights = nested(self.levels, order, flight, turns=True)
-        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True)
+        self.middle = middle_of(self.levels, slow_kicks)
+        self._in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
+        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
         self.force_evaluations = sum(evaluations(self._in_flights).values())
         self._known: tuple[System, SphereLayout, FloatArray] | None = None
         self._told = False
@@ -115,6 +120,7 @@ class IsokineticSpheres(SeededBath):
         given = "" if steps == {"": 1} else f", steps={steps}"
         given += f", spheres={self.spheres!r}, auxiliary={self.auxiliary}"
         given += "" if self.inner_order == 2 else f", order={self.inner_order}"
+        given += ", slow_kicks='middle'" if self.middle else ""
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
@@ -139,6 +145,10 @@ class IsokineticSpheres(SeededBath):
     def layout(self, system: System, positions: FloatArray) -> SphereLayout:
         """The spheres of a system."""
         return self._spheres(system, positions)[0]
+
+    def radii(self, system: System, positions: FloatArray) -> FloatArray:
+        """R^2 of each sphere, (g + L - 1) k_B T."""
+        return self._spheres(system, positions)[1]
 
     def kinetic_energy(self, system: System, positions: FloatArray) -> float:
         """What the kinetic energy is on average, (k_B T/2) times the sum of g (G - 1)/G over the spheres."""
@@ -177,7 +187,7 @@ class SphereStep(ArrayStep):
         #: What the variables begin with, since those of another thermostat may be as many.
         self.mark = -1.0 - n * auxiliary
         self.groups, known = GroupedForces.of(
-            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark
+            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark, middle=bath.middle
         )
         super().__init__(system, start, dt)
         self.bath, self.squares = bath, squares
@@ -187,7 +197,7 @@ class SphereStep(ArrayStep):
             known = known[1:]
         else:
             known = math.sqrt(bath.thermal_energy) * bath.drawn(start.step, (n * auxiliary,), _BEGIN)
-            self.v = system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+            self.v = self.along(self.v)
         self.w: FloatArray = known.reshape(n, auxiliary).copy()
         kernels.rescale(self.v, self.w, squares, True, *self.tables)
         #: Accelerations along the constraints, by groups, where they are known.
@@ -197,7 +207,7 @@ class SphereStep(ArrayStep):
     def turn(self, operation: Turn) -> None:
         group = operation.group
         if group not in self.paces:
-            self.paces[group] = paced(self.system, self.x, self.groups.now[group], self.now)
+            self.paces[group] = self.along(self.groups.now[group] * self.system.weights)
         kernels.turn(self.v, self.w, self.paces[group], operation.fraction * self.dt, self.squares, *self.tables)
 
     def fly(self, operation: Fly) -> None:
@@ -207,7 +217,7 @@ class SphereStep(ArrayStep):
 
     def project(self, operation: Project) -> None:
         """Velocities onto the constraints, with the length they had before the drift."""
-        self.v = self.system.motion.project_velocities(self.x, self.v, time=self.now, out=self.v)
+        self.v = self.along(self.v)
         kernels.rescale(self.v, self.w, self.squares, False, *self.tables)
 
     def exchange(self, operation: Exchange) -> None:
@@ -216,8 +226,7 @@ class SphereStep(ArrayStep):
         n = self.v.size
         drawn = bath.drawn(self.number, (n + self.w.size,), self.exchanges)
         self.exchanges += 1
-        noise = drawn[:n].reshape(self.v.shape) * np.sqrt(system.inverse_masses)
-        noise = system.motion.project_velocities(self.x, noise, time=self.now, out=noise)
+        noise = self.along(drawn[:n].reshape(self.v.shape) * system.root_weights)
         decay = bath.friction * operation.fraction * self.dt
         keep, spread = math.exp(-decay), math.sqrt(-math.expm1(-2 * decay) * bath.thermal_energy)
         own = drawn[n:].reshape(self.w.shape)

@@ -1,0 +1,382 @@
+"""Hamiltonian Monte Carlo in OpenMM: the steps of an integrator, accepted or rejected by the change of energy."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import openmm
+from openmm import app, unit
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import (
+    CertificateError,
+    ConvergenceError,
+    InputError,
+    NonFiniteError,
+    ReversibilityError,
+    UnsupportedError,
+)
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
+from kcons.openmm.integrator.ensemble import ConstantEnergy
+from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.projected import ProjectedIntegrator
+from kcons.openmm.integrator.system_checks import forces_of
+from kcons.openmm.quantities import masses_of
+from kcons.steppers import State
+from kcons.thermostats import Counts, best_share
+from kcons.thermostats.freedom import positive
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
+    ACCEPTED,
+    CHANGE,
+    ENERGY,
+    IRREVERSIBLE,
+    LAST,
+    NOT_FINITE,
+    POTENTIAL,
+    PROPOSAL,
+    SIZE,
+    SQUARES,
+    SUM,
+    UNSOLVED,
+    kept_part,
+    seed_number,
+    step_range,
+    stream,
+)
+from kcons.thermostats.monte_carlo.tuning import DualAveraging, check_proposals
+
+#: What acts on a state between steps and knows no way back.
+OTHERS = ("Barostat", "AndersenThermostat", "CMMotionRemover")
+
+
+class HamiltonianMonteCarlo:
+    """Canonical sampling on the constraints without any error of the time step.
+
+    A proposal draws velocities on the constraints, makes `steps` steps of the integrator, and is accepted by the change
+    of energy over kT; otherwise positions stay, and velocities turn round. The states after the proposals are samples
+    of exp(-H/kT) on the constraints, for the energy that the platform computes.
+
+    With a `WaysBackIntegrator` every drift is taken back within the step, which costs no force. With a plain
+    `ProjectedIntegrator`, also one that holds parts, the whole trajectory is taken back, which takes as many forces
+    again. What cannot be taken back is rejected and counted.
+
+    Parameters
+    ----------
+    simulation : openmm.app.Simulation or openmm.Context
+        With a ProjectedIntegrator at constant energy. The reporters of a Simulation are called as in its own runs; a
+        step is a proposal for them.
+    temperature : Quantity or float
+        In K if a float.
+    steps : int or (int, int)
+        Time steps of a proposal; with two numbers drawn between them, both included.
+    seed : int
+        Random numbers are a function of it and of the number of the proposal.
+    keep : float
+        The part of the velocities that a proposal keeps, from 0 to less than 1.
+    conserve_momentum : bool
+        Velocities are drawn relative to the centre of mass.
+    tolerance : float
+        Distance in nm by which a way back may miss its start; other solutions are off by a part of a bond.
+    restart : path, optional
+        Go on from what `save` wrote.
+
+    Raises
+    ------
+    InputError
+        Temperature not positive, fewer than one step, `keep` out of range; a file of other particles.
+    UnsupportedError
+        Another integrator, one with an ensemble, or the leapfrog; parts that move; barostats, AndersenThermostat or
+        CMMotionRemover in the System.
+
+    Notes
+    -----
+    Energies decide, so they have to be good to a part of kT: in single precision those of large systems are not.
+    """
+
+    def __init__(
+        self,
+        simulation: app.Simulation | openmm.Context,
+        temperature: unit.Quantity | float,
+        steps: int | tuple[int, int],
+        seed: int,
+        *,
+        keep: float = 0.0,
+        conserve_momentum: bool = False,
+        tolerance: float = 1e-4,
+        restart: str | PathLike[str] | None = None,
+    ) -> None:
+        self.simulation = simulation if isinstance(simulation, app.Simulation) else None
+        self.context: openmm.Context = getattr(simulation, "context", simulation)
+        self.setTemperature(temperature)
+        self.steps = step_range(steps)
+        self.seed = seed_number(seed)
+        self.keep = kept_part(keep)
+        self.conserve_momentum = bool(conserve_momentum)
+        self.tolerance = positive(tolerance, "tolerance")
+        self.integrator = _integrator_of(self.context)
+        self._masses = masses_of(self.context.getSystem())[:, None]
+        with np.errstate(divide="ignore"):
+            self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
+        self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
+        self._expected: tuple[FloatArray, Any, dict[str, float]] | None = None
+        #: Proposals so far.
+        self.number = 0
+        if restart is not None:
+            self.take(State.load(restart))
+
+    # -- what a person asks for -----------------------------------------------------------------
+
+    def setTemperature(self, temperature: unit.Quantity | float) -> None:
+        """Use another temperature (K) from now on."""
+        if isinstance(temperature, unit.Quantity):
+            temperature = temperature.value_in_unit(unit.kelvin)
+        self.thermal_energy = GAS_CONSTANT * positive(temperature, "temperature")
+
+    @property
+    def counts(self) -> Counts:
+        """What became of the proposals."""
+        return Counts.of(self.state)
+
+    @property
+    def state(self) -> State:
+        """Positions (nm), velocities (nm/ps), time (ps), number of proposals, and the variables of the sampler.
+
+        All that the next proposal depends on; for `take`, also of another temperature (see
+        `kcons.thermostats.exchange`).
+        """
+        context = self.context
+        time = context.getTime().value_in_unit(unit.picosecond)
+        x, v = positions_of(context), velocities_of(context)
+        return State(x, v, time, None, self.number, thermostat=self._held.copy())
+
+    def take(self, state: State) -> None:
+        """Go on from a state.
+
+        Raises
+        ------
+        InputError
+            It has other particles, or is none of a HamiltonianMonteCarlo.
+        """
+        if state.positions.shape != (len(self._masses), 3):
+            raise InputError(f"the state has {len(state.positions)} particles, not {len(self._masses)}", item="state")
+        if state.thermostat is None or state.thermostat.shape != (SIZE,):
+            raise InputError("the state is none of a HamiltonianMonteCarlo", item="state")
+        self._held, self.number = state.thermostat.copy(), int(state.step)
+        self._put(state.positions, state.velocities, state.time)
+
+    def save(self, file: str | PathLike[str]) -> None:
+        """Write the state; `restart=file` goes on, to the last bit where the platform is reproducible."""
+        self.state.save(file)
+
+    def step(self, proposals: int) -> None:
+        """Make so many proposals.
+
+        Raises
+        ------
+        NonFiniteError
+            The energy of the state itself is not finite.
+        InputError, UnsupportedError
+            As for the first step of the integrator.
+        """
+        for _ in range(proposals):
+            due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
+            self._propose()
+            for reporter in due:
+                asked = _asked(reporter.describeNextReport(self.simulation))
+                found = self.context.getState(
+                    positions=True, velocities=True, forces=True, energy=True, enforcePeriodicBox=asked
+                )
+                reporter.report(self.simulation, found)
+
+    def tune(self, wanted: float | None = None, proposals: int = 80) -> float:
+        """Find the time step for a wanted share of accepted proposals, and use it from now on; returns it in ps.
+
+        The proposals that it takes are no sample, and are not counted; see `kcons.thermostats.tune`.
+
+        Raises
+        ------
+        InputError
+            A share that is not between 0 and 1, fewer than 20 proposals.
+        """
+        integrator = self.integrator
+        assert integrator.scheme is not None
+        search = DualAveraging(
+            integrator.getStepSize().value_in_unit(unit.picosecond),
+            best_share(integrator.scheme.order) if wanted is None else wanted,
+        )
+        check_proposals(proposals)
+        begun = integrator.getStepSize()
+        try:
+            for _ in range(proposals):
+                integrator.setStepSize(search.dt)
+                before = self._held[SUM]
+                self._propose()
+                search.learn(float(self._held[SUM] - before))
+        except BaseException:
+            integrator.setStepSize(begun)
+            raise
+        self._held[ACCEPTED:] = 0.0
+        integrator.setStepSize(search.result)
+        return search.result
+
+    # -- a proposal -----------------------------------------------------------------------------
+
+    def _propose(self) -> None:
+        held, context = self._held, self.context
+        number = self.number + 1
+        x, time = positions_of(context), context.getTime()
+        if math.isnan(held[POTENTIAL]) or self._others_acted(x):
+            held[POTENTIAL] = self._potential()
+            if not math.isfinite(held[POTENTIAL]):
+                raise NonFiniteError(f"the potential energy is {held[POTENTIAL]} at proposal {number}", item="energy")
+        random = stream(self.seed, number, PROPOSAL)
+        count, threshold = int(random.integers(self.steps[0], self.steps[1] + 1)), math.log1p(-random.random())
+        v0 = velocities_of(context)
+        try:
+            v = self._refreshed(v0, random)
+        except BaseException:
+            context.setVelocities(v0)
+            raise
+        potential, change, reason = float(held[POTENTIAL]), math.nan, ACCEPTED
+        try:
+            potential, change = self._trajectory(x, v, count)
+            reason = ACCEPTED if threshold < -change else ENERGY
+        except ReversibilityError:
+            reason = IRREVERSIBLE
+        except (CertificateError, ConvergenceError):
+            reason = UNSOLVED
+        except NonFiniteError:
+            reason = NOT_FINITE
+        except BaseException:
+            self._put(x, v0, time)
+            raise
+        held[CHANGE], held[LAST] = change, reason
+        held[reason] += 1
+        if reason in (ACCEPTED, ENERGY):
+            held[SQUARES] += change * change
+            held[SUM] += min(1.0, math.exp(-max(change, 0.0)))
+        self.number = number
+        if reason == ACCEPTED:
+            held[POTENTIAL] = potential
+            context.setStepCount(number)
+            self._note()
+        else:
+            # Velocities of the way there, turned round.
+            self._put(x, -v, time + count * self.integrator.getStepSize())
+
+    def _refreshed(self, v: FloatArray, random: np.random.Generator) -> FloatArray:
+        """Velocities of which a part is kept and a part drawn, on all constraints; the Context has them."""
+        noise = random.standard_normal(v.shape) * np.sqrt((1 - self.keep**2) * self.thermal_energy * self._weights)
+        kept = self.keep * v
+        if self.conserve_momentum:
+            total = self._masses.sum()
+            noise -= (self._masses * noise).sum(axis=0) / total * (self._weights > 0)
+            kept += (1 - self.keep) * (self._masses * v).sum(axis=0) / total * (self._weights > 0)
+        self.context.setVelocities(kept + noise)
+        self.integrator.applyVelocityConstraints(self.context)
+        return velocities_of(self.context)
+
+    def _trajectory(self, x: FloatArray, v: FloatArray, count: int) -> tuple[float, float]:
+        """Make the steps from (x, v), where the Context is; potential energy at the end, and change of H over kT.
+
+        Raises
+        ------
+        ReversibilityError, ConvergenceError, NonFiniteError
+            There is no such trajectory, or no way back.
+        """
+        integrator, context = self.integrator, self.context
+        if isinstance(integrator, WaysBackIntegrator):
+            integrator.forget_ways()
+        integrator.step(count)
+        integrator.check(context)
+        end = velocities_of(context)
+        potential = self._potential()
+        change = self._kinetic(end) - self._kinetic(v) + (potential - float(self._held[POTENTIAL]))
+        if not math.isfinite(change):
+            raise NonFiniteError("the energy is not finite", item="energy")
+        if isinstance(integrator, WaysBackIntegrator):
+            missed = integrator.missed()
+        else:
+            there, time = positions_of(context), context.getTime()
+            context.setVelocities(-end)
+            try:
+                integrator.step(count)
+            except (CertificateError, ConvergenceError) as error:
+                raise ReversibilityError("the trajectory has no way back") from error
+            missed = float(np.sqrt(((positions_of(context) - x) ** 2).sum()))
+            self._put(there, end, time)
+        if not missed <= self.tolerance:
+            raise ReversibilityError(f"a way back misses its start by {missed:.3g} nm", residual=missed)
+        return potential, change / self.thermal_energy
+
+    def _potential(self) -> float:
+        groups = self.integrator.getIntegrationForceGroups()
+        state = self.context.getState(energy=True, groups=groups)
+        return float(state.getPotentialEnergy().value_in_unit(unit.kilojoule_per_mole))
+
+    def _kinetic(self, v: FloatArray) -> float:
+        return 0.5 * float((self._masses * v * v).sum())
+
+    # -- the Context ----------------------------------------------------------------------------
+
+    def _put(self, x: FloatArray, v: FloatArray, time: Any) -> None:
+        context = self.context
+        context.setPositions(x)
+        context.setVelocities(v)
+        context.setTime(time)
+        context.setStepCount(self.number)
+        self._note()
+
+    def _note(self) -> None:
+        context = self.context
+        self._expected = positions_of(context), _box(context), dict(context.getParameters())
+
+    def _others_acted(self, x: FloatArray) -> bool:
+        """Whether positions, box or parameters are not what this object left."""
+        known = self._expected
+        if known is None:
+            return False
+        return not np.array_equal(x, known[0]) or (_box(self.context), dict(self.context.getParameters())) != known[1:]
+
+    def _next(self, reporter: Any) -> int:
+        told = reporter.describeNextReport(self.simulation)
+        return int(told["steps"] if isinstance(told, dict) else told[0])
+
+
+def _asked(told: Any) -> bool:
+    """Whether a reporter wants molecules in the box."""
+    periodic = told.get("periodic") if isinstance(told, dict) else (told[5] if len(told) > 5 else None)
+    return bool(periodic)
+
+
+def _box(context: openmm.Context) -> Any:
+    return context.getState().getPeriodicBoxVectors()._value
+
+
+def _integrator_of(context: openmm.Context) -> ProjectedIntegrator:
+    integrator = context.getIntegrator()
+    integrator = getattr(context, "_integrator", integrator)
+    if not isinstance(integrator, ProjectedIntegrator):
+        raise UnsupportedError(
+            f"{type(integrator).__name__} is no ProjectedIntegrator: make the Context or Simulation with "
+            "WaysBackIntegrator(0.009, 'blanes-moan4')"
+        )
+    if integrator.scheme is None or not (integrator.scheme.reversible and integrator.scheme.symplectic):
+        raise UnsupportedError(f"{integrator!r} makes no reversible steps; use 'rattle' or 'blanes-moan4'")
+    if type(integrator.ensemble) is not ConstantEnergy:
+        raise UnsupportedError(f"{integrator.ensemble!r} has no energy to accept or reject by; leave out ensemble")
+    moving = [part for part in integrator.parts if part.driven]
+    if moving:
+        raise UnsupportedError(f"{moving[0]!r} moves with time: there is no stationary density to sample")
+    for force in forces_of(context.getSystem()):
+        name = type(force).__name__
+        if any(other in name for other in OTHERS):
+            raise UnsupportedError(
+                f"{name} changes the state between steps, with no way back; take it out of the System"
+                + (" (createSystem(removeCMMotion=False))" if name == "CMMotionRemover" else "")
+            )
+    return integrator

@@ -1,0 +1,278 @@
+"""Monte Carlo in OpenMM: every decision from plain energies, restarts, reporters, averages, bad input."""
+
+from __future__ import annotations
+
+import io
+import math
+from functools import cache
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import twice_kinetic
+from openmm import app, unit
+from openmm_systems import GPUS, context_of, loose_alanine, potential_energy, state_of, water_box
+
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.openmm import HamiltonianMonteCarlo, Langevin, ProjectedIntegrator, WaysBackIntegrator, hold
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.thermostats import exchange
+from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import POTENTIAL, PROPOSAL, stream
+
+
+@cache
+def relaxed(n):
+    system, x = water_box(n)
+    integrator = ProjectedIntegrator(0.001)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.minimizeEnergy(context, maxIterations=5)
+    return state_of(context)[0]
+
+
+def waters(dt=0.004, scheme="rattle", kind=WaysBackIntegrator, platform="Reference", n=8, steps=(2, 5), **options):
+    system, _ = water_box(n)
+    integrator = kind(dt, scheme)
+    context = context_of(system, integrator, platform)
+    context.setPositions(relaxed(n))
+    return system, HamiltonianMonteCarlo(context, 300, steps, 3, **{"keep": 0.4} | options)
+
+
+def test_every_decision_follows_from_the_energies():
+    """Each proposal made again by a plain integrator in a Context of its own."""
+    system, sampler = waters(0.005)
+    plain = ProjectedIntegrator(0.005)
+    other = context_of(system, plain)
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])[:, None]
+    kt, outcomes = GAS_CONSTANT * 300, set()
+    for number in range(1, 21):
+        x, v = state_of(sampler.context)
+        random = stream(3, number, PROPOSAL)
+        count, threshold = int(random.integers(2, 6)), random.random()
+        noise = random.standard_normal(x.shape) * np.sqrt(kt * (1 - 0.4**2) / masses)
+        other.setPositions(x)
+        other.setVelocities(0.4 * v + noise)
+        plain.applyVelocityConstraints(other)
+        begin = state_of(other)[1]
+        before = potential_energy(other) + twice_kinetic(system, begin) / 2
+        plain.step(count)
+        there = state_of(other)
+        change = (potential_energy(other) + twice_kinetic(system, there[1]) / 2 - before) / kt
+        sampler.step(1)
+        assert sampler.counts.change == pytest.approx(change, abs=1e-6)
+        accepted = math.log1p(-threshold) < -change
+        outcomes.add(accepted)
+        expected = there if accepted else (x, -begin)
+        for found, wanted in zip(state_of(sampler.context), expected, strict=True):
+            np.testing.assert_allclose(found, wanted, atol=1e-7)
+        assert potential_energy(sampler.context) == pytest.approx(sampler.state.thermostat[POTENTIAL], abs=1e-6)
+        if not accepted:
+            assert np.array_equal(state_of(sampler.context)[0], x)
+    assert outcomes == {True, False} and sampler.counts.proposals == 20
+
+
+@pytest.mark.parametrize(
+    ("platform", "kind", "near"),
+    [
+        ("Reference", ProjectedIntegrator, 1e-6),
+        ("CPU", WaysBackIntegrator, 0.05),
+        *(pytest.param(*p.values, WaysBackIntegrator, 1e-3, id=p.id, marks=p.marks) for p in GPUS[-1:]),
+    ],
+)
+def test_platforms_and_ways_back_make_one_chain(platform, kind, near):
+    """Drift by drift or at once; the last of the others is in double precision."""
+    a = waters(0.003, steps=2)[1]
+    b = waters(0.003, kind=kind, platform=platform, steps=2)[1]
+    for sampler in (a, b):
+        sampler.step(3)
+    assert b.counts.proposals == 3 and a.counts.accepted == b.counts.accepted > 0
+    assert b.counts.change == pytest.approx(a.counts.change, abs=near)
+    np.testing.assert_allclose(state_of(b.context)[0], state_of(a.context)[0], atol=0.01 * near)
+
+
+@pytest.mark.parametrize("kind", [WaysBackIntegrator, ProjectedIntegrator])
+def test_what_cannot_be_taken_back_is_rejected(kind):
+    _, sampler = waters(0.03, kind=kind, steps=1)
+    start = state_of(sampler.context)[0]
+    sampler.step(5)
+    counts = sampler.counts
+    assert counts.accepted + counts.energy == 0 and counts.proposals == 5
+    assert np.array_equal(state_of(sampler.context)[0], start)
+    sampler.integrator.setStepSize(0.002)
+    sampler.step(3)
+    assert sampler.counts.accepted > 0
+
+
+def test_restarts_go_on_to_the_last_bit():
+    _, whole = waters(0.005)
+    whole.step(4)
+    file = io.BytesIO()
+    whole.save(file)
+    whole.step(5)
+    _, again = waters(0.005, steps=(2, 5))
+    file.seek(0)
+    again = HamiltonianMonteCarlo(again.context, 300, (2, 5), 3, keep=0.4, restart=file)
+    again.step(5)
+    a, b = whole.state, again.state
+    for name in ("positions", "velocities", "thermostat", "time", "step"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    assert a.step == 9 and 0 < whole.counts.accepted < 9
+
+
+def test_reporters_of_a_simulation_see_every_proposal():
+    system, x = water_box(8)
+    topology = app.Topology()
+    chain = topology.addChain()
+    for _ in range(8):
+        residue = topology.addResidue("HOH", chain)
+        for name in ("O", "H", "H"):
+            topology.addAtom(name, app.Element.getBySymbol(name), residue)
+    simulation = app.Simulation(
+        topology, system, WaysBackIntegrator(0.005), openmm.Platform.getPlatformByName("Reference")
+    )
+    simulation.context.setPositions(x)
+    sampler = HamiltonianMonteCarlo(simulation, 300 * unit.kelvin, 3, 5)
+    told = io.StringIO()
+    simulation.reporters.append(app.StateDataReporter(told, 2, step=True, potentialEnergy=True, time=True))
+    energies = []
+    for _ in range(6):
+        sampler.step(1)
+        energies.append(sampler.state.thermostat[POTENTIAL])
+    lines = [line.split(",") for line in told.getvalue().splitlines()[1:]]
+    assert [int(step) for step, _, _ in lines] == [2, 4, 6]
+    assert [float(u) for _, _, u in lines] == pytest.approx(energies[1::2], abs=1e-6)
+    assert float(lines[-1][1]) == pytest.approx(6 * 3 * 0.005)
+
+
+def trimer(steps=(3, 8), dt=0.15, spring=0.0, **options):
+    """Masses 10, 1, 10, two bonds held, each in a well if there is a spring; kT = 1."""
+    system = openmm.System()
+    for mass in (10.0, 1.0, 10.0):
+        system.addParticle(mass)
+    system.addConstraint(0, 1, 1.0)
+    system.addConstraint(1, 2, 1.0)
+    if spring:
+        force = openmm.CustomExternalForce(f"{spring}*(x^2+2*y^2+3*z^2)/2")
+        for k in range(3):
+            force.addParticle(k)
+        system.addForce(force)
+    integrator = WaysBackIntegrator(dt)
+    context = context_of(system, integrator)
+    context.setPositions(np.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]))
+    return HamiltonianMonteCarlo(context, 1 / GAS_CONSTANT, steps, 21, **options)
+
+
+def test_a_free_angle_has_the_average_of_its_metric():
+    """P(c) of the cosine is sqrt(1 - (b c)^2), b = 10/11; 1/3 would be the average without the metric."""
+    sampler = trimer(conserve_momentum=True)
+    squares = []
+    for _ in range(600):
+        sampler.step(1)
+        x = state_of(sampler.context)[0]
+        squares.append(float((x[0] - x[1]) @ (x[2] - x[1])) ** 2)
+    error = np.reshape(squares, (20, -1)).mean(axis=1).std(ddof=1) / math.sqrt(20)
+    assert abs(np.mean(squares) - 0.276334992061) < 3 * error < abs(np.mean(squares) - 1 / 3)
+    momentum = np.array([10.0, 1.0, 10.0]) @ state_of(sampler.context)[1]
+    assert np.abs(momentum).max() < 1e-10
+    assert sampler.counts.accepted < 600
+
+
+def test_other_constraints_are_held_and_taken_back():
+    system, x, _ = loose_alanine()
+    integrator = ProjectedIntegrator(2e-3, parts=[hold(system, [], positions=x, take="all")])
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    sampler = HamiltonianMonteCarlo(context, 300, 3, 5)
+    sampler.step(3)
+    assert sampler.counts.proposals == 3 and sampler.counts.accepted > 0
+    integrator.check(context)
+
+
+def test_a_step_is_found():
+    sampler = trimer(steps=4, dt=0.005, spring=30.0)
+    found = sampler.tune(0.8, proposals=50)
+    assert sampler.integrator.getStepSize()._value == found > 0.02
+    assert sampler.counts.proposals == 0
+    sampler.step(60)
+    assert 0.6 < sampler.counts.acceptance < 0.97
+
+
+def test_configurations_are_exchanged():
+    temperatures = (300.0, 330.0)
+    samplers = [waters(0.003, keep=0.0)[1] for _ in temperatures]
+    for sampler, temperature in zip(samplers, temperatures, strict=True):
+        sampler.setTemperature(temperature)
+        sampler.step(2)
+    places = [s.state.positions for s in samplers]
+    after, made = exchange([s.state for s in samplers], [s.thermal_energy for s in samplers], 1, 0)
+    for sampler, state in zip(samplers, after, strict=True):
+        sampler.take(state)
+        assert potential_energy(sampler.context) == pytest.approx(state.thermostat[POTENTIAL], abs=1e-9)
+    assert np.array_equal(state_of(samplers[0].context)[0], places[1 if made[0] else 0])
+    samplers[0].step(1)
+    assert samplers[0].counts.proposals == 3
+
+
+def test_who_moves_particles_moves_the_energy():
+    _, sampler = waters(0.001)
+    sampler.step(1)
+    x, v = state_of(sampler.context)
+    sampler.context.setPositions(x + np.array([0.01, 0, 0]))
+    box = sampler.context.getState().getPeriodicBoxVectors(asNumpy=True)._value
+    sampler.context.setPeriodicBoxVectors(*(1.05 * box))
+    energy = potential_energy(sampler.context)
+    sampler.context.setVelocities(v)
+    before = sampler.counts.accepted
+    sampler.step(1)
+    assert abs(sampler.counts.change) < 1
+    assert sampler.counts.accepted > before or sampler.state.thermostat[POTENTIAL] == pytest.approx(energy)
+
+
+def test_bad_input_changes_nothing():
+    system, x = water_box(8)
+
+    def sampler(integrator, others=(), **options):
+        with_others = openmm.XmlSerializer.clone(system)
+        for force in others:
+            with_others.addForce(force)
+        context = context_of(with_others, integrator)
+        context.setPositions(x)
+        return HamiltonianMonteCarlo(context, **{"temperature": 300.0, "steps": 3, "seed": 1} | options)
+
+    for options, words in (
+        ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"steps": 0}, "steps is 0"),
+        ({"keep": 1.0}, "keep is 1.0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            sampler(WaysBackIntegrator(1e-3), **options)
+    for integrator, others, words in (
+        (openmm.VerletIntegrator(1e-3), (), "is no ProjectedIntegrator"),
+        (ProjectedIntegrator(1e-3, "leapfrog"), (), "makes no reversible steps"),
+        (ProjectedIntegrator(1e-3, ensemble=Langevin(300.0, 1.0)), (), "leave out ensemble"),
+        (WaysBackIntegrator(1e-3), (openmm.CMMotionRemover(),), "removeCMMotion=False"),
+        (WaysBackIntegrator(1e-3), (openmm.AndersenThermostat(300, 1),), "AndersenThermostat"),
+    ):
+        with pytest.raises(UnsupportedError, match=words):
+            sampler(integrator, others)
+    good = sampler(WaysBackIntegrator(1e-3))
+    for wanted, proposals, words in ((1.5, 20, "wanted is 1.5"), (0.8, 3, "proposals is 3")):
+        with pytest.raises(InputError, match=words):
+            good.tune(wanted, proposals)
+    with pytest.raises(InputError, match="3 particles, not 24"):
+        good.take(trimer().state)
+    assert np.array_equal(state_of(good.context)[0], x)
+
+
+def test_an_energy_that_is_not_finite_is_an_error():
+    sampler = trimer()
+    force = openmm.CustomExternalForce("log(x-10)")
+    force.addParticle(0)
+    system = openmm.XmlSerializer.clone(sampler.context.getSystem())
+    system.addForce(force)
+    context = context_of(system, WaysBackIntegrator(0.01))
+    context.setPositions(state_of(sampler.context)[0])
+    with pytest.raises(NonFiniteError, match="potential energy is nan"):
+        HamiltonianMonteCarlo(context, 300, 2, 1).step(1)
