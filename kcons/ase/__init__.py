@@ -6,7 +6,7 @@ the object with ASE, which makes files that contain it readable.
 
 - `topology`, `rigid_water`, `translation`: constraints by name, rigid water, ASE's own constraints taken over
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
-- `virial`: the stress of the constraint forces
+- `pressure`: the stress of the constraint forces, cells that change
 - `calculator`, `named_calculators`: forces along the constraints, for optimisers; calculators by name
 - `dynamics`, `thermostat_dynamics`, `multiple_time_steps`, `monte_carlo`: dynamics with any stepper
 """

@@ -11,7 +11,7 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.virial import VOIGT, constraint_virial
+from kcons.ase.pressure.virial import VOIGT, constraint_virial
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError

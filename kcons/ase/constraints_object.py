@@ -13,10 +13,10 @@ from ase.constraints.constraint import FixConstraint
 
 import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
+from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
 from kcons.ase.respect import Watch, require_on_surface
 from kcons.ase.topology import bonds_of
-from kcons.ase.virial import VOIGT, virial_of
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray

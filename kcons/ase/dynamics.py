@@ -27,9 +27,10 @@ from kcons.motion.certificate import checked_every
 from kcons.motion.motion import Motion
 from kcons.steppers import Rattle, State, Stepper, System
 from kcons.steppers.stepper import Listed
+from kcons.thermostats.pressure.constant_pressure import in_cell
 
 #: See `System`: nearer than this, the positions of a trajectory are the whole state.
-_FAR = 128.0
+FAR = 128.0
 
 _FLOAT = np.dtype(np.float64)
 
@@ -166,7 +167,13 @@ class ConstrainedDynamics(MolecularDynamics):
     def listing(self) -> str:
         """What a step consists of, a line for each operation; the name alone for steppers that have no list."""
         system = self._systems()
-        return self.stepper.listing(system) if isinstance(self.stepper, Listed) else repr(self.stepper)
+        mover = self._mover
+        return mover.listing(system) if isinstance(mover, Listed) else repr(mover)
+
+    @property
+    def _mover(self) -> Stepper:
+        """What makes the steps."""
+        return self.stepper
 
     # -- steps ----------------------------------------------------------------------------------
 
@@ -183,24 +190,20 @@ class ConstrainedDynamics(MolecularDynamics):
         system = self._systems()
         state = self._start(system)
         try:
-            after = self.stepper.step(system, state, self.dt)
+            after = self._mover.step(system, state, self.dt)
             if self._check_every and self.dt and getattr(self.stepper, "holds", True):
                 system.schedule.made(1, self._check_every, after, self.dt, spare=self._spare)
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
-            self._name_step(error, self.nsteps + 1)
+            name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
         self.time = after.time
-        carried = after.remainder, after.time_remainder, after.thermostat
+        carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
-
-    def _name_step(self, error: BaseException, number: int) -> None:
-        if getattr(error, "step", None) is None:
-            with suppress(AttributeError):
-                error.step = number  # type: ignore[attr-defined]
-            error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
+        if after.barostat is not None:
+            self._cell = _cell_of(self.atoms)
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
@@ -209,7 +212,7 @@ class ConstrainedDynamics(MolecularDynamics):
             try:
                 self._systems().forces(state.positions, state.velocities, state.time, self.nsteps)
             except Exception as error:
-                self._name_step(error, self.nsteps)
+                name_step(error, self.nsteps)
                 raise
 
     def _put(self, positions: FloatArray, velocities: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -260,7 +263,8 @@ class ConstrainedDynamics(MolecularDynamics):
             x[...] = state.positions
         else:
             self._momenta, v = self._put(state.positions, state.velocities)
-        self._state = State(state.positions, v, self.time, forces, self.nsteps, state.remainder, thermostat=thermostat)
+        carried = state.remainder, 0.0, thermostat, None if last is None else in_cell(last.barostat, atoms.cell.array)
+        self._state = State(state.positions, v, self.time, forces, self.nsteps, *carried)
         self._cell = cell
         return self._state
 
@@ -295,14 +299,14 @@ class ConstrainedDynamics(MolecularDynamics):
             self._bound = None
         bound = self._bound
         if bound is None or not bound.fits(atoms):
-            rows = [*self._rows(present), *self._more]
+            rows = [*_rows(atoms, present), *self._more]
             bound = bind(rows, atoms, self._degenerate, self.time)
             # Targets that were left open stay as found, also when the engine is built again.
             self._more = bound.given[len(rows) - len(self._more) :]
             self._bound, self._present, self._state = bound, present, None
             self._only_forces = any(isinstance(item, FORCES_ONLY) for item in present)
-            self._system = System(bound.motion, self._force, potential=self._energy, friction=self._friction, far=_FAR)
-            self.stepper.check(self._system)
+            self._system = self._made(bound.motion)
+            self._mover.check(self._system)
             moving = self._system.inverse_masses > 0
             shape = (len(atoms), 3)
             self._weights = (
@@ -314,15 +318,8 @@ class ConstrainedDynamics(MolecularDynamics):
         assert self._system is not None
         return self._system
 
-    def _rows(self, present: Iterable[Any]) -> list[Constraint]:
-        rows: list[Constraint] = []
-        for item in present:
-            if isinstance(item, FORCES_ONLY):
-                continue
-            if isinstance(item, Constraints):
-                item.engine(self.atoms)  # settles targets that are open
-            rows.extend(translated(self.atoms, [item]))
-        return rows
+    def _made(self, motion: Motion) -> System:
+        return System(motion, self._force, potential=self._energy, friction=self._friction, far=FAR)
 
     def _energy(self, x: FloatArray, time: float) -> float:
         """Of the calculator, and of Hookean and ExternalForce."""
@@ -334,6 +331,25 @@ class ConstrainedDynamics(MolecularDynamics):
         if self._only_forces:
             return applied_forces(self.atoms)
         return self.atoms.get_forces(apply_constraint=False)
+
+
+def _rows(atoms: Atoms, present: Iterable[Any]) -> list[Constraint]:
+    rows: list[Constraint] = []
+    for item in present:
+        if isinstance(item, FORCES_ONLY):
+            continue
+        if isinstance(item, Constraints):
+            item.engine(atoms)  # settles targets that are open
+        rows.extend(translated(atoms, [item]))
+    return rows
+
+
+def name_step(error: BaseException, number: int) -> None:
+    """Note in an error which step it belongs to."""
+    if getattr(error, "step", None) is None:
+        with suppress(AttributeError):
+            error.step = number  # type: ignore[attr-defined]
+        error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
 
 def _cell_of(atoms: Atoms) -> bytes:

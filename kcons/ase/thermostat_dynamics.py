@@ -12,14 +12,17 @@ import numpy as np
 from ase import Atoms, units
 from numpy.typing import ArrayLike
 
-from kcons.ase.dynamics import ConstrainedDynamics
+from kcons.ase.dynamics import FAR, ConstrainedDynamics
+from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
-from kcons.steppers import State
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.steppers import State, Stepper, System
 from kcons.thermostats import HamiltonianMonteCarlo, Isokinetic, Langevin, NoseHooverChain, thermal_velocities
 from kcons.thermostats.freedom import Momentum, open_directions, positive
 from kcons.thermostats.isokinetic.isokinetic import Convention
+from kcons.thermostats.pressure import Barostat, ConstantPressure
 
 
 class ThermostattedDynamics(ConstrainedDynamics):
@@ -46,19 +49,22 @@ class ThermostattedDynamics(ConstrainedDynamics):
         stepper: Isokinetic | Langevin | NoseHooverChain | HamiltonianMonteCarlo,
         *,
         restart: str | PathLike[str] | None = None,
+        barostat: Barostat | None = None,
         **kwargs: Any,
     ) -> None:
+        self.barostat = barostat
         if restart is not None:
             if "state" in kwargs:
                 raise InputError("give restart or state, not both", item="restart")
             kwargs["state"] = _read(restart, len(atoms))
-        before = atoms.positions.copy(), atoms.get_momenta()
+        before = atoms.positions.copy(), atoms.get_momenta(), atoms.cell.array.copy()
         try:
             super().__init__(atoms, timestep, stepper, **kwargs)
             self._begin()
         except BaseException:
             atoms.set_positions(before[0], apply_constraint=False)
             atoms.set_momenta(before[1], apply_constraint=False)
+            atoms.cell[...] = before[2]
             raise
 
     def _begin(self) -> None:
@@ -76,6 +82,24 @@ class ThermostattedDynamics(ConstrainedDynamics):
             momenta, v = self._put(state.positions, begun.velocities)
             begun = replace(begun, velocities=v)
         self._momenta, self._state = momenta, begun
+
+    @property
+    def _mover(self) -> Stepper:
+        return self.stepper if self.barostat is None else ConstantPressure(self.stepper, self.barostat)
+
+    def _made(self, motion: Motion) -> System:
+        if self.barostat is None:
+            return super()._made(motion)
+        if np.any(self._friction):
+            raise UnsupportedError("friction takes out heat beside the thermostat; leave it out")
+        system = AtomsSystem(motion, self._force, self._energy, self.atoms, stressless=self._only_forces, far=FAR)
+        self.barostat.pieces(system, self.atoms.arrays["positions"], self.time)
+        return system
+
+    def _resume(self, state: State) -> None:
+        if state.cell is not None and self.barostat is not None:
+            self.atoms.cell[...] = state.cell
+        super()._resume(state)
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the state, all it takes to continue to the last bit with `restart=file` (see `State.save`).
@@ -103,7 +127,7 @@ class ThermostattedDynamics(ConstrainedDynamics):
 
     def get_conserved_energy(self) -> float:
         """The quantity in eV that the exact motion conserves, where targets rest; see the thermostat in the core."""
-        stepper = cast(Isokinetic | Langevin | NoseHooverChain, self.stepper)
+        stepper = cast(Isokinetic | Langevin | NoseHooverChain | ConstantPressure, self._mover)
         system = self._systems()
         return float(stepper.conserved_energy(system, self._start(system)))
 

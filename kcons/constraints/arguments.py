@@ -70,6 +70,18 @@ def as_array(values: ArrayLike, shape: tuple[int, int], item: str) -> FloatArray
     return np.require(array, requirements=["C", "A", "W"])
 
 
+def finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
+    """A copy of values for each atom, shape (n_atoms, 3); `InputError` where they are not finite."""
+    array: FloatArray = np.array(numbers(values, item), order="C")
+    if array.shape != (n_atoms, 3):
+        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        atom = int(np.argmax(bad))
+        raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
+    return array
+
+
 def lent(array: FloatArray) -> FloatArray:
     """The same numbers, for a function of the user: it can read them and not change them."""
     view = array.view()

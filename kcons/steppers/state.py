@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, lent, numbers
+from kcons.constraints.arguments import as_array, finite_array, lent, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
@@ -58,8 +58,8 @@ class State:
         size of what is held (see `System.initial_state`).
     time_remainder : float
         What rounding took from the time, so that a million steps of dt are a million dt.
-    thermostat : ndarray or None
-        Variables of the thermostat, if there is one.
+    thermostat, barostat : ndarray or None
+        Their variables, if there are such; those of a barostat begin with the cell.
     """
 
     positions: FloatArray
@@ -70,6 +70,7 @@ class State:
     remainder: FloatArray | None = None
     time_remainder: float = 0.0
     thermostat: FloatArray | None = None
+    barostat: FloatArray | None = None
 
     def __init__(
         self,
@@ -81,6 +82,7 @@ class State:
         remainder: FloatArray | None = None,
         time_remainder: float = 0.0,
         thermostat: FloatArray | None = None,
+        barostat: FloatArray | None = None,
     ) -> None:
         # Written out, since a step makes one: what dataclass writes takes three times as long.
         own = vars(self)
@@ -92,6 +94,12 @@ class State:
         own["remainder"] = remainder
         own["time_remainder"] = time_remainder
         own["thermostat"] = thermostat
+        own["barostat"] = barostat
+
+    @property
+    def cell(self) -> FloatArray | None:
+        """The cell that a barostat has come to, vectors as rows, shape (3, 3); None without one."""
+        return None if self.barostat is None else self.barostat[:9].reshape(3, 3)
 
     def later(self, dt: float) -> tuple[float, float]:
         """Time after `dt`, and what its rounding leaves over (Knuth's exact sum)."""
@@ -158,6 +166,7 @@ class _Shown(State):
     forces = property(lambda self: _lent(vars(self)["forces"]))  # type: ignore[assignment]
     remainder = property(lambda self: _lent(vars(self)["remainder"]))  # type: ignore[assignment]
     thermostat = property(lambda self: _lent(vars(self)["thermostat"]))  # type: ignore[assignment]
+    barostat = property(lambda self: _lent(vars(self)["barostat"]))  # type: ignore[assignment]
 
 
 def _lent(array: FloatArray | None) -> FloatArray | None:
@@ -172,8 +181,8 @@ def _checked(values: dict[str, Any]) -> dict[str, Any]:
     for name in ("positions", "velocities", "forces", "remainder"):
         if name in values:
             values[name] = as_array(values[name], shape, name)
-    if "thermostat" in values:
-        values["thermostat"] = np.atleast_1d(numbers(values["thermostat"], "thermostat"))
+    for name in {"thermostat", "barostat"} & set(values):
+        values[name] = np.atleast_1d(numbers(values[name], name))
     for name, kind in (("time", float | int), ("time_remainder", float | int), ("step", int)):
         if not isinstance(values.get(name, 0), kind):
             raise ValueError(f"{name} is {values[name]!r:.40}")
@@ -305,9 +314,9 @@ class System:
         """
         if not math.isfinite(time):
             raise InputError(f"time is {time}", item="time")
-        x = _finite_array(positions, self.n_atoms, "positions")
+        x = finite_array(positions, self.n_atoms, "positions")
         given = velocities is not None
-        v = _finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
+        v = finite_array(velocities, self.n_atoms, "velocities") if given else np.zeros_like(x)
         motion, held = self.motion, self.motion.constraint_set
         if held.n_rows == 0:
             return State(x, v, time)
@@ -478,17 +487,6 @@ class System:
         """Whether what is held is so far from the origin that the rounding of its positions would show."""
         atoms = self._free_of_origin
         return atoms is not None and bool(beyond(x, atoms, self.anchor, self.far))
-
-
-def _finite_array(values: ArrayLike | None, n_atoms: int, item: str) -> FloatArray:
-    array: FloatArray = np.array(numbers(values, item), order="C")
-    if array.shape != (n_atoms, 3):
-        raise InputError(f"{item} must have shape ({n_atoms}, 3), not {array.shape}", item=item)
-    bad = ~np.isfinite(array).all(axis=1)
-    if bad.any():
-        atom = int(np.argmax(bad))
-        raise InputError(f"{item} of atom {atom} is not finite: {array[atom]}", item=item, atoms=[atom])
-    return array
 
 
 def _fixed_atoms(motion: Motion) -> IntArray:

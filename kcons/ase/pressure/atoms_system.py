@@ -1,0 +1,82 @@
+"""Atoms as a system whose cell can change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import PropertyNotImplementedError
+from numpy.typing import ArrayLike
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.thermostats.pressure import CellSystem
+
+_WITHOUT_STRESS = (
+    "the calculator has no stress, which CellRescaling needs; use MonteCarloBarostat, which judges by energies alone"
+)
+
+
+class AtomsSystem(CellSystem):
+    """Constraints and forces of `Atoms`, whose own cell is the one that changes.
+
+    Parameters
+    ----------
+    motion : Motion
+    force, potential : callable
+        Of positions and time, in the cell that the atoms have.
+    atoms : ase.Atoms
+        With a periodic cell.
+    stressless : bool
+        Whether constraints of ASE add forces, which no stress knows of.
+    far : float
+
+    Raises
+    ------
+    InputError
+        The cell is not periodic.
+    """
+
+    def __init__(
+        self,
+        motion: Motion,
+        force: Callable[[FloatArray, float], ArrayLike],
+        potential: Callable[[FloatArray, float], float],
+        atoms: Atoms,
+        *,
+        stressless: bool = False,
+        far: float,
+    ) -> None:
+        self.atoms = atoms
+        if motion.lattice is None:
+            raise InputError(
+                "the atoms have no periodic cell, and a barostat nothing to change: set atoms.cell and atoms.pbc",
+                item="cell",
+            )
+        self._stressless = stressless
+        super().__init__(
+            motion, lambda x, t, cell: force(x, t), lambda x, t, cell: potential(x, t), self._stress, far=far
+        )
+
+    @property
+    def cell(self) -> FloatArray:
+        return np.array(self.atoms.cell.array)
+
+    def set_cell(self, cell: FloatArray, positions: FloatArray) -> None:
+        super().set_cell(cell, positions)
+        self.atoms.cell[...] = cell
+        self.atoms.arrays["positions"][...] = positions
+
+    def _stress(self, x: FloatArray, time: float, cell: FloatArray) -> FloatArray:
+        if self._stressless:
+            raise UnsupportedError(
+                "forces that constraints of ASE add have no stress; use MonteCarloBarostat, which judges by energies"
+            )
+        self.atoms.arrays["positions"][...] = x
+        try:
+            found = self.atoms.get_stress(voigt=False, apply_constraint=False)
+        except PropertyNotImplementedError as error:
+            raise UnsupportedError(_WITHOUT_STRESS) from error
+        return np.asarray(found, dtype=float)

@@ -1,0 +1,18 @@
+"""Constant pressure on constraints: cells that change, and what moves along with them.
+
+- `cell_system`: a system whose cell can change
+- `pieces`: what moves as one: clusters tied by constraints, molecules, free atoms
+- `strains`: the ways in which a cell may change
+- `barostat`: trial cells, and the rule by which they are accepted
+- `monte_carlo_barostat`, `cell_rescaling`: where trial cells come from
+- `constant_pressure`: a stepper with a barostat
+"""
+
+from kcons.thermostats.pressure.barostat import Barostat
+from kcons.thermostats.pressure.cell_rescaling import CellRescaling
+from kcons.thermostats.pressure.cell_system import CellSystem
+from kcons.thermostats.pressure.constant_pressure import ConstantPressure
+from kcons.thermostats.pressure.monte_carlo_barostat import MonteCarloBarostat
+from kcons.thermostats.pressure.pieces import Pieces
+
+__all__ = ["Barostat", "CellRescaling", "CellSystem", "ConstantPressure", "MonteCarloBarostat", "Pieces"]

@@ -1,0 +1,122 @@
+"""A system whose cell can change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.arguments import as_array
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.steppers import System
+
+#: A function of positions, time and cell (vectors as rows, shape (3, 3)).
+InCellFunction = Callable[[FloatArray, float, FloatArray], ArrayLike]
+
+
+class CellSystem(System):
+    """Constraints, masses and forces in a periodic cell that a barostat changes.
+
+    Parameters
+    ----------
+    motion : Motion
+        Of a `ConstraintSet` made with a cell.
+    force, potential : callable, optional
+        Forces, shape (n_atoms, 3), and potential energy as functions of positions, time and cell. Both or neither.
+    stress : callable, optional
+        The derivative of the potential by a strain of all atoms and the cell, over the volume, shape (3, 3): positive
+        where the system pulls its walls together. For `CellRescaling`.
+    far : float
+        As for `System`.
+
+    Attributes
+    ----------
+    cell : ndarray, shape (3, 3)
+        Vectors as rows.
+    periodic : ndarray of bool, shape (3,)
+
+    Raises
+    ------
+    InputError
+        The constraint set has no cell; a force without a potential.
+    """
+
+    def __init__(
+        self,
+        motion: Motion,
+        force: InCellFunction | None = None,
+        potential: InCellFunction | None = None,
+        stress: InCellFunction | None = None,
+        *,
+        far: float = 8.0,
+    ) -> None:
+        lattice = motion.lattice
+        if lattice is None:
+            raise InputError("the constraint set has no cell: give ConstraintSet(..., cell=) one", item="cell")
+        if (force is None) != (potential is None):
+            raise InputError(
+                "give force and potential, or neither: a change of the cell is judged by the energy", item="potential"
+            )
+        self._matrix = lattice[0].copy()
+        self.periodic: NDArray[np.bool_] = lattice[1].any(axis=0)
+        self.stress_of = stress
+        super().__init__(
+            motion,
+            None if force is None else (lambda x, t: force(x, t, self.cell)),
+            potential=None if potential is None else (lambda x, t: float(np.asarray(potential(x, t, self.cell)))),
+            far=far,
+        )
+
+    @property
+    def cell(self) -> FloatArray:
+        return self._matrix
+
+    def set_cell(self, cell: FloatArray, positions: FloatArray) -> None:
+        """Change the cell; `positions` are those in it.
+
+        Raises
+        ------
+        InputError, ImageError
+            As `Motion.set_cell`; nothing was changed.
+        """
+        self.motion.set_cell(cell, self.periodic.tolist(), positions)
+        self._matrix = np.array(cell)
+
+    def energy(self, x: FloatArray, time: float, step: int) -> float:
+        """The potential energy; infinite where atoms overlap.
+
+        Raises
+        ------
+        NonFiniteError
+            It is NaN.
+        """
+        found = 0.0 if self.potential is None else float(self.potential(x, time))
+        if np.isnan(found):
+            error = NonFiniteError(f"the potential energy is NaN in a trial cell at step {step}")
+            error.step = step
+            raise error
+        return found
+
+    def stress(self, x: FloatArray, time: float) -> FloatArray:
+        """Shape (3, 3), symmetric.
+
+        Raises
+        ------
+        UnsupportedError
+            Nobody knows it.
+        NonFiniteError
+            It is not finite.
+        """
+        if self.stress_of is None:
+            if self.force is None:
+                return np.zeros((3, 3))
+            raise UnsupportedError(
+                "this System has no stress; give stress=, or use MonteCarloBarostat, which needs none"
+            )
+        found = as_array(self.stress_of(x, time, self.cell), (3, 3), "stress")
+        if not np.isfinite(found).all():
+            raise NonFiniteError("the stress is not finite: look at what the force field returned")
+        return 0.5 * (found + found.T)

@@ -1,0 +1,172 @@
+"""A stepper with a barostat."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion.certificate import checked_every
+from kcons.steppers import State, Stepper, System
+from kcons.steppers.operations import Operation
+from kcons.steppers.stepper import Listed
+from kcons.thermostats.isokinetic.isokinetic import Isokinetic
+from kcons.thermostats.langevin import Langevin
+from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.pressure.barostat import WORK, Barostat
+from kcons.thermostats.pressure.cell_system import CellSystem
+
+
+class ConstantPressure(Listed):
+    """Steps of a thermostat, and a trial of the barostat after every so many.
+
+    Parameters
+    ----------
+    stepper : Langevin, NoseHooverChain or Isokinetic
+        Others keep no temperature, or remember energies and forces of the cell that was.
+    barostat : Barostat
+
+    Notes
+    -----
+    `State.barostat` holds the cell (`State.cell`), the energy that trials have brought, and what the barostat has
+    learned. Trials are a function of the seed and of the number of the step: a run that is continued from a saved state
+    is the same to the last bit. The cell of the `System` follows the state that a step begins with.
+    """
+
+    reversible = False
+    symplectic = False
+
+    def __init__(self, stepper: Stepper, barostat: Barostat) -> None:
+        self.stepper, self.barostat = stepper, barostat
+
+    def __repr__(self) -> str:
+        return f"ConstantPressure({self.stepper!r}, {self.barostat!r})"
+
+    @property
+    def order(self) -> int:
+        return self.stepper.order
+
+    @property
+    def force_evaluations(self) -> int:
+        """Of the stepper; a trial takes one more, and two energies."""
+        return self.stepper.force_evaluations
+
+    @property
+    def holds(self) -> bool:
+        """Whether states can be certified."""
+        return bool(getattr(self.stepper, "holds", True))
+
+    def operations(self, system: System | None = None) -> tuple[Operation, ...]:
+        inner = self.stepper.operations(system) if isinstance(self.stepper, Listed) else ()
+        return (*inner, self.barostat.operation)
+
+    def check(self, system: System) -> None:
+        """Raise `UnsupportedError` without a thermostat, and where the stepper may not be used."""
+        self.stepper.check(system)
+        if not isinstance(system, CellSystem):
+            raise UnsupportedError("a barostat needs a system whose cell can change: make a CellSystem")
+        if not isinstance(self.stepper, Langevin | NoseHooverChain | Isokinetic):
+            raise UnsupportedError(
+                f"{self.stepper!r} keeps no temperature, by which a barostat judges its trials, or does not know that "
+                "the cell has changed; use Langevin, NoseHooverChain or Isokinetic"
+            )
+        if isinstance(self.stepper, Isokinetic) and self.stepper.atoms is not None:
+            raise UnsupportedError("an isokinetic thermostat on some atoms gives the others no temperature; take all")
+
+    def start(self, system: System, state: State) -> State:
+        """The state in its cell, with variables of the barostat.
+
+        Raises
+        ------
+        UnsupportedError, InputError
+            As `check`, and as `Barostat.pieces`; the state carries variables of another barostat.
+        """
+        self.check(system)
+        assert isinstance(system, CellSystem)
+        if state.barostat is None:
+            self.barostat.pieces(system, state.positions, state.time)
+            state = replace(state, barostat=self.barostat.begin(system))
+            if self.barostat.needs_stress:
+                system.stress(state.positions, state.time)
+            return state
+        if state.barostat.shape != self.barostat.begin(system).shape:
+            raise InputError(
+                f"the state carries variables of another barostat, not of {self.barostat!r}; start with "
+                "dataclasses.replace(state, barostat=None)",
+                item="barostat",
+            )
+        cell = state.cell
+        assert cell is not None
+        if not (cell == system.cell).all():
+            system.set_cell(cell, state.positions)
+        return state
+
+    def step(self, system: System, state: State, dt: float) -> State:
+        """Advance by `dt`.
+
+        Raises
+        ------
+        KconsError
+            As the stepper and the barostat; the state is as it was, also the cell of the system.
+        """
+        return self._advanced(system, state, dt, 1)
+
+    def march(self, system: System, state: State, dt: float, steps: int, *, check_every: int | None = None) -> State:
+        """The state after so many steps, the same to the last bit as by `step`."""
+        check_every, spare = checked_every(check_every if dt != 0 else 0)
+        while steps > 0:
+            n = system.schedule.within(min(steps, self.barostat.every - state.step % self.barostat.every), check_every)
+            state = self._advanced(system, state, dt, n)
+            system.schedule.made(n, check_every, state, dt, spare=spare)
+            steps -= n
+        return state
+
+    def _advanced(self, system: System, state: State, dt: float, steps: int) -> State:
+        if dt < 0:
+            raise InputError(f"the time step is {dt}; trials of a barostat cannot be taken back", item="dt")
+        state = self.start(system, state)
+        assert isinstance(system, CellSystem)
+        march = getattr(self.stepper, "march", None)
+        if steps > 1 and march is not None:
+            after = march(system, state, dt, steps, check_every=0)
+        else:
+            after = state
+            for _ in range(steps):
+                after = self.stepper.step(system, after, dt)
+        after = replace(after, barostat=state.barostat)
+        if dt and after.step % self.barostat.every == 0:
+            after = self._pressed(system, after, dt)
+        return after
+
+    def _pressed(self, system: CellSystem, state: State, dt: float) -> State:
+        try:
+            after = self.barostat.move(system, state, self.thermal_energy(state), dt)
+        except Exception as error:
+            if getattr(error, "step", None) is None:
+                error.step = state.step  # type: ignore[attr-defined]
+            raise
+        if isinstance(self.stepper, Isokinetic) and after.positions is not state.positions:
+            # Its variables know of the forces: it finds both anew.
+            return replace(after, forces=None)
+        return after
+
+    def thermal_energy(self, state: State) -> float:
+        """kT of the configurations that the stepper samples."""
+        if isinstance(self.stepper, Isokinetic):
+            assert state.thermostat is not None
+            return float(state.thermostat[0] / (state.thermostat[3] - 1))
+        return float(self.stepper.thermal_energy)  # type: ignore[attr-defined]  # see `check`
+
+    def conserved_energy(self, system: System, state: State) -> float:
+        """What the thermostat conserves, less the energy that trials have brought."""
+        work = 0.0 if state.barostat is None else float(state.barostat[WORK])
+        return float(self.stepper.conserved_energy(system, state)) - work  # type: ignore[attr-defined]
+
+
+def in_cell(variables: FloatArray | None, cell: FloatArray) -> FloatArray | None:
+    """Variables of a barostat that goes on in a cell that somebody else has changed."""
+    if variables is None:
+        return None
+    own = variables.copy()
+    own[:WORK] = cell.ravel()
+    return own

@@ -1,0 +1,243 @@
+"""What moves as one when the cell changes: clusters tied by constraints, molecules, free atoms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kcons.constraints.arguments import check_pairs
+from kcons.constraints.constraint import IntArray
+from kcons.constraints.periodic.one_piece import follow_parents, spanning_tree
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion.motion import Motion
+from kcons.thermostats.pressure.cell_system import CellSystem
+
+Held = Literal["refuse", "stay"]
+
+#: How far each atom is moved to see whether a row knows a place in space, relative to the size of the system.
+TURN = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Pieces of a system.
+
+    Attributes
+    ----------
+    label : ndarray of int, shape (n_atoms,)
+        The piece of each atom.
+    weight : ndarray, shape (n_atoms,)
+        Share of each atom in the mass of its piece.
+    mass : ndarray, shape (n_pieces,)
+    open : ndarray of bool, shape (n_pieces, 3)
+        The axes along which a piece follows the cell.
+    tree : tuple of ndarray of int
+        Atoms and the parents next to which they are, for pieces cut by the faces of the cell.
+    """
+
+    label: IntArray
+    weight: FloatArray
+    mass: FloatArray
+    open: NDArray[np.bool_]
+    tree: tuple[IntArray, IntArray]
+
+    def __len__(self) -> int:
+        return len(self.mass)
+
+    @property
+    def moving(self) -> IntArray:
+        """How many pieces follow the cell along each axis, shape (3,)."""
+        return self.open.sum(axis=0)
+
+    def whole(self, x: FloatArray, lattice: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions with each piece in one piece, and by how many cells atoms were moved for it."""
+        y = x.copy()
+        follow_parents(y, *self.tree, lattice)
+        return y, np.round((y - x) @ lattice[1])
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Of an array over atoms, shape (n_atoms, 3), for each piece."""
+        n = len(self)
+        return np.stack([np.bincount(self.label, values[:, k], n) for k in range(3)], axis=1)
+
+    def centres(self, y: FloatArray) -> FloatArray:
+        """Centres of mass of positions in one piece (or their velocities), shape (n_pieces, 3)."""
+        return self.sums(self.weight[:, None] * y)
+
+    def along(self, y: FloatArray, strain: FloatArray) -> FloatArray:
+        """By how much each atom moves where centres R move by R `strain`, shape (n_atoms, 3)."""
+        moved = self.centres(y) @ strain
+        moved *= self.open
+        return moved.take(self.label, axis=0)
+
+    def moved(self, x: FloatArray, change: FloatArray, lattice: FloatArray) -> FloatArray:
+        """Displacements for a cell that becomes cell (1 + `change`), each atom in the image that it is stored in.
+
+        Raises
+        ------
+        UnsupportedError
+            What stays in its place is stored across a face of the cell that moves.
+        """
+        y, cells = self.whole(x, lattice)
+        d = self.along(y, change)
+        images = cells @ (lattice[0] @ change)
+        stays = ~self.open[self.label]
+        if images[stays].any():
+            atom = int(np.argmax((stays & (images != 0)).any(axis=1)))
+            raise UnsupportedError(
+                f"atom {atom} is held in its place across a face of the cell that the barostat moves: the constraint "
+                "would mean another place. Store what is held with its neighbours on the same side"
+            )
+        return d - images
+
+
+def find_pieces(
+    system: CellSystem,
+    positions: FloatArray,
+    axes: NDArray[np.bool_],
+    molecules: ArrayLike | None = None,
+    held: Held = "refuse",
+    time: float = 0.0,
+) -> Pieces:
+    """Pieces of a system by its constraints, and by bonds if they are given.
+
+    Parameters
+    ----------
+    system : CellSystem
+    positions : ndarray, shape (n_atoms, 3)
+    axes : ndarray of bool, shape (3,)
+        The axes along which the cell changes.
+    molecules : array_like of int, shape (n, 2), optional
+        Bonds: what they join moves as one as well.
+    held : {'refuse', 'stay'}
+        What to do with pieces that a row holds in space along such an axis: refuse them, or leave them where they are,
+        as walls from outside.
+
+    Raises
+    ------
+    UnsupportedError
+        Pieces held in space; a row that closes upon itself through the cell; nothing could follow the cell.
+    InputError
+        Bonds of unknown atoms.
+    """
+    motion, n_atoms = system.motion, system.n_atoms
+    constraint_set = motion.constraint_set
+    links = [_chained(c.atoms) for c in constraint_set.constraints if c.n_rows and c.width > 1]
+    nearest = [_chained(c.atoms if c.whole is None else c.atoms[~c.whole]) for c in constraint_set.constraints]
+    if constraint_set.images is not None:
+        tree = constraint_set.images
+        nearest.append(np.stack([tree.parents, tree.atoms], axis=1))
+    if molecules is not None:
+        bonds = check_pairs(molecules, n_atoms)
+        links.append(bonds)
+        nearest.append(bonds)
+    wound = any(c.windings is not None and c.windings.any() for c in constraint_set.constraints)
+    label = _labels(links, n_atoms)
+    rows = rows_open(motion, positions, time)
+    opened = np.ones((int(label.max()) + 1, 3), dtype=bool)
+    placed = np.zeros(n_atoms, dtype=bool)
+    first = 0
+    for item in constraint_set.constraints:
+        here = rows[first : first + item.n_rows]
+        first += item.n_rows
+        closed = ~here.all(axis=1)
+        placed[item.atoms[closed].ravel()] = True
+        for axis in range(3):
+            opened[label[item.atoms[~here[:, axis]].ravel()], axis] = False
+    shut = ~opened & axes
+    if shut.any() and held == "refuse":
+        piece = int(np.argmax(shut.any(axis=1)))
+        atom = int(np.flatnonzero((label == piece) & placed)[0])
+        touching = constraint_set.incidence[:, [atom]].toarray().ravel() != 0
+        row = int(np.argmax(touching & ~(rows | ~axes).all(axis=1)))
+        axis_name = "xyz"[int(np.argmax(shut[piece]))]
+        raise UnsupportedError(
+            f"row {constraint_set.row_name(row)} holds atom {atom} in space along {axis_name}, and the barostat moves "
+            "everything along with the cell. Use a kind that leaves this axis alone, or held='stay': what is held then "
+            "stays as a wall from outside, and the pressure is that of the rest"
+        )
+    if not opened[:, axes].any():
+        raise UnsupportedError("no piece of the system could follow the cell: all are held in space")
+    masses = np.where(system.inverse_masses[:, 0] > 0, system.masses, 0.0)
+    masses[~np.isin(label, label[masses > 0])] = 1.0  # fixed atoms alone
+    total = np.bincount(label, masses).astype(float)
+    order = np.argsort(~placed, kind="stable")
+    near = _joined(nearest)
+    pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order))
+    lattice = lattice_of(system)
+    y, _ = pieces.whole(positions, lattice)
+    closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))
+    if wound or len(closing):
+        pair = f" between atoms {near[closing[0], 0]} and {near[closing[0], 1]}" if len(closing) else ""
+        raise UnsupportedError(
+            f"what is tied together closes upon itself through the cell{pair}: it fixes the cell. Keep the volume "
+            "constant, or hold only what does not close"
+        )
+    return pieces
+
+
+def rows_open(motion: Motion, positions: FloatArray, time: float = 0.0) -> NDArray[np.bool_]:
+    """Whether all atoms of a row may be shifted along an axis without a change of it, shape (n_rows, 3)."""
+    held = motion.constraint_set
+    placed = np.zeros(held.n_rows, dtype=bool)
+    rolling = np.zeros(held.n_rows, dtype=bool)
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        placed[start : start + item.n_rows] = not item.translation_invariant
+        rolling[start : start + item.n_rows] = not item.holonomic
+    opened = np.repeat(~placed[:, None], 3, axis=1)
+    if not placed.any():
+        return opened
+    # As `open_directions` of the thermostats, for each row and each axis.
+    rng = np.random.default_rng(0)
+    size = float(np.ptp(positions, axis=0).max(initial=0.0)) or 1.0
+    every = np.tile(np.eye(3), (motion.n_atoms, 1))
+    opened[placed & ~rolling] = True
+    for spread in (0.0, TURN * size, TURN * size):
+        with np.errstate(all="ignore"):
+            rows = held.jacobian(positions + spread * rng.standard_normal(positions.shape), time)
+        change = np.abs(np.asarray(rows @ every))
+        scale = np.sqrt(np.asarray(rows.multiply(rows).sum(axis=1)).ravel())[:, None]
+        opened &= ~placed[:, None] | (change <= 1e-9 * scale)  # NaN: a surface not defined nearby has a place
+    return opened
+
+
+def _chained(atoms: IntArray) -> IntArray:
+    """Neighbours in the lists of atoms, shape (n, 2)."""
+    return np.stack([atoms[:, :-1], atoms[:, 1:]], axis=-1).reshape(-1, 2)
+
+
+def _joined(links: Iterable[IntArray]) -> IntArray:
+    return np.concatenate([np.zeros((0, 2), np.int64), *links])
+
+
+def _labels(links: Iterable[IntArray], n_atoms: int) -> IntArray:
+    """A number for each atom, the same for those that links join."""
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
+    pairs = _joined(links)
+    graph = sp.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n_atoms, n_atoms))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def lattice_of(system: CellSystem) -> FloatArray:
+    """The cell and its inverse, shape (2, 3, 3)."""
+    lattice = system.motion.lattice
+    assert lattice is not None  # a CellSystem has one
+    return lattice
+
+
+def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> None:
+    """Raise `InputError` where the cell is not periodic along an axis that is to change."""
+    wrong = axes & ~system.periodic
+    if wrong.any():
+        raise InputError(
+            f"kind={kind!r} changes the cell along {'xyz'[int(np.argmax(wrong))]}, in which it is not periodic; "
+            "for a slab use kind='lateral', or make the cell periodic",
+            item="kind",
+        )

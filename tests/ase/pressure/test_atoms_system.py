@@ -1,0 +1,261 @@
+"""Dynamics of ASE at constant pressure: a barostat beside each thermostat."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import units
+from ase.build import bulk
+from ase.calculators.emt import EMT
+from ase.constraints import Hookean
+from ase_systems import FS, TEMPERATURE, Field, Free, dumbbells, follow
+from pressure_systems import correlation_time, p_value
+from scipy import stats
+
+from kcons.ase import (
+    ConstrainedLangevin,
+    ConstrainedMonteCarlo,
+    ConstrainedNoseHoover,
+    IsokineticDynamics,
+    constrain,
+    draw_velocities,
+)
+from kcons.constraints import Distance, FixedAtoms, Plane
+from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
+
+KT = units.kB * TEMPERATURE
+N, SIDE = 60, 40.0
+PRESSURE = (N + 1) * KT / SIDE**3
+MADE = {
+    "langevin": lambda a, **k: ConstrainedLangevin(a, 2 * FS, TEMPERATURE, 0.1 / FS, rng=1, **k),
+    "nose-hoover": lambda a, **k: ConstrainedNoseHoover(a, 2 * FS, TEMPERATURE, 50 * FS, momentum="free", **k),
+    "isokinetic": lambda a, **k: IsokineticDynamics(a, 2 * FS, TEMPERATURE, momentum="free", **k),
+}
+made = pytest.mark.parametrize("name", MADE)
+
+
+def barostats(**kwargs):
+    return {
+        "monte carlo": MonteCarloBarostat(PRESSURE, **{"every": 1, "width": 0.25, "seed": 3, **kwargs}),
+        "rescaling": CellRescaling(PRESSURE, 4 * FS, 1 / PRESSURE, **{"every": 1, "seed": 3, **kwargs}),
+    }
+
+
+def gas():
+    return dumbbells(N, side=SIDE)
+
+
+@pytest.mark.parametrize(("name", "which"), [("nose-hoover", "monte carlo"), ("isokinetic", "rescaling")])
+def test_volumes_of_a_rigid_ideal_gas(name, which):
+    atoms, held = gas()
+    dyn = MADE[name](atoms, barostat=barostats(seed=4)[which])
+    volumes = follow(dyn, atoms.get_volume, 400)[50:]
+    exact = stats.gamma(N + 1, scale=KT / PRESSURE)
+    assert p_value(volumes, exact) > 0.01
+    error = exact.std() * np.sqrt(correlation_time(volumes) / len(volumes))
+    assert error < 0.04 * exact.mean()
+    assert abs(volumes.mean() - exact.mean()) < 3 * error
+    held.engine(atoms).certify(atoms.positions, atoms.get_velocities())
+    assert dyn.listing().splitlines()[-1].split()[0] == "press"
+
+
+@made
+@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
+def test_a_run_goes_on_bit_for_bit(name, which, tmp_path):
+    barostat = barostats(every=3, kind="semi-isotropic")[which]
+    atoms, _ = gas()
+    other = atoms.copy()
+    whole = MADE[name](atoms, barostat=barostat)
+    whole.run(7)
+    whole.save(tmp_path / "state.npz")
+    whole.run(8)
+    other.calc = Free()
+    again = MADE[name](other, barostat=barostat, restart=tmp_path / "state.npz")
+    again.run(8)
+    assert other.cell.array.tolist() == atoms.cell.array.tolist() != [[SIDE, 0, 0], [0, SIDE, 0], [0, 0, SIDE]]
+    assert np.array_equal(other.positions, atoms.positions)
+    assert np.array_equal(other.get_momenta(), atoms.get_momenta())
+    assert np.array_equal(again.state.barostat, whole.state.barostat)
+
+
+# -- forces, and what moves ---------------------------------------------------------------------------
+
+
+def crystal(calculator=None):
+    """Copper with two bonds held; the forces of EMT tell of volume."""
+    atoms = bulk("Cu", cubic=True) * 2
+    atoms.rattle(0.05, rng=np.random.default_rng(3))
+    atoms.calc = EMT() if calculator is None else calculator
+    constrain(atoms, Distance([[0, 1], [2, 3]]))
+    draw_velocities(atoms, 300, 1)
+    return atoms
+
+
+@pytest.mark.parametrize("kind", ["isotropic", "semi-isotropic", "anisotropic", "flexible"])
+@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
+def test_the_energy_that_trials_bring_is_accounted_for(which, kind):
+    atoms = crystal()
+    made = {
+        "monte carlo": MonteCarloBarostat(0.0, every=2, kind=kind, width=1e-3),
+        "rescaling": CellRescaling(0.0, 100 * FS, 1.0, every=2, kind=kind),
+    }[which]
+    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=made)
+    before, cell = dyn.get_conserved_energy(), atoms.cell.array.copy()
+    dyn.run(40)
+    assert abs(atoms.get_volume() / abs(np.linalg.det(cell)) - 1) > 1e-4
+    assert dyn.get_conserved_energy() == pytest.approx(before, abs=2e-3)
+    tried = dyn.state.barostat[10:].reshape(3, -1)[0]
+    assert tried.sum() == 20
+    assert 0.1 < np.nanmean(made.acceptance(dyn.state)) <= 1
+    if kind == "flexible":
+        assert atoms.cell.array[0, 1] == atoms.cell.array[0, 2] == atoms.cell.array[1, 2] == 0
+        assert which == "monte carlo" or abs(atoms.cell.array[2, 0]) > 1e-4
+
+
+def test_forces_after_a_trial_are_those_in_the_new_cell():
+    atoms = crystal()
+    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0, every=1))
+    dyn.run(3)
+    fresh = atoms.copy()
+    fresh.set_constraint()
+    fresh.calc = EMT()
+    assert dyn.state.forces == pytest.approx(fresh.get_forces(), abs=1e-12)
+
+
+def test_adsorbates_on_planes_follow_in_the_plane():
+    atoms, _ = gas()
+    atoms.set_constraint()
+    constrain(atoms, Plane(np.arange(0, 2 * N, 2), [0, 0, 1]))
+    heights = atoms.positions[::2, 2].copy()
+    # Atoms on planes and free ones: N is that of the open directions.
+    dyn = MADE["langevin"](
+        atoms, barostat=MonteCarloBarostat(0.0, tension=-2 * N * KT / SIDE**2, every=1, kind="lateral")
+    )
+    areas = follow(dyn, lambda: atoms.cell[0, 0] ** 2, 400)[100:]
+    assert atoms.positions[::2, 2] == pytest.approx(heights, abs=1e-12)
+    assert atoms.cell[2, 2] == SIDE
+    exact = (2 * N + 1) / (2 * N) * SIDE**2
+    assert abs(areas.mean() / exact - 1) < 3 * 0.09 * np.sqrt(correlation_time(areas) / len(areas))
+
+
+def test_fixed_atoms_stay_as_a_wall_where_asked():
+    atoms, _ = gas()
+    atoms.set_constraint()
+    constrain(atoms, [FixedAtoms([0, 1]), Distance([[2, 3]])])
+    with pytest.raises(UnsupportedError, match=r"FixedAtoms.* holds atom 0 in space along z.*held='stay'"):
+        MADE["langevin"](atoms, barostat=MonteCarloBarostat(PRESSURE, kind="normal"))
+    barostat = MonteCarloBarostat(PRESSURE, kind="normal", held="stay", every=1, width=0.05)
+    before = atoms.positions[:2].copy()
+    dyn = MADE["langevin"](atoms, barostat=barostat)
+    dyn.run(20)
+    assert np.array_equal(atoms.positions[:2], before)
+    assert barostat.pieces(dyn._systems(), atoms.positions).moving.tolist() == [2 * N - 3] * 3
+    assert atoms.cell[2, 2] != SIDE
+
+
+# -- errors, with the state kept --------------------------------------------------------------------------------
+
+
+def refused(atoms, dyn, error, match, steps=200):
+    seen = []
+
+    def remember():
+        seen[:] = [atoms.cell.array.copy(), atoms.positions.copy(), atoms.get_momenta()]
+
+    dyn.attach(remember)
+    remember()
+    with pytest.raises(error, match=match) as found:
+        dyn.run(steps)
+    assert np.array_equal(atoms.cell.array, seen[0])
+    assert np.array_equal(atoms.positions, seen[1])
+    assert np.array_equal(atoms.get_momenta(), seen[2])
+    assert found.value.step == dyn.nsteps + 1
+    return found.value
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, "high", None])
+def test_pressure_must_be_a_number(value):
+    with pytest.raises(InputError, match="pressure is"):
+        MonteCarloBarostat(value)
+    with pytest.raises(InputError, match="pressure is"):
+        CellRescaling(value, 1.0, 1.0)
+
+
+def test_a_calculator_without_stress():
+    atoms = crystal(Field())
+    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0))
+    x = atoms.get_positions()
+    with pytest.raises(UnsupportedError, match=r"no stress.*MonteCarloBarostat"):
+        dyn.run(1)
+    assert np.array_equal(atoms.positions, x)
+
+
+@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
+def test_a_cell_below_twice_the_cutoff(which):
+    atoms, _ = gas()
+    dyn = MADE["langevin"](atoms, barostat=barostats(cutoff=SIDE / 2 - 0.5)[which])
+    refused(atoms, dyn, InputError, "less than twice the cutoff")
+
+
+@pytest.mark.parametrize("which", ["monte carlo", "rescaling"])
+def test_a_cell_below_twice_a_constraint(which):
+    atoms, _ = gas()
+    atoms.positions[1] = atoms.positions[0] + [SIDE / 2 - 0.5, 0, 0]
+    atoms.set_constraint()
+    constrain(atoms, Distance(np.arange(2 * N).reshape(-1, 2)))
+    dyn = MADE["langevin"](atoms, barostat=barostats()[which])
+    refused(atoms, dyn, InputError, "half the box")
+
+
+def test_an_energy_that_is_nan():
+    class Bad(Free):
+        def calculate(self, atoms=None, properties=("energy",), system_changes=()):
+            super().calculate(atoms, properties, system_changes)
+            if atoms.get_volume() < 0.97 * SIDE**3:
+                self.results["energy"] = np.nan
+
+    atoms, _ = gas()
+    atoms.calc = Bad()
+    dyn = MADE["langevin"](atoms, barostat=barostats()["monte carlo"])
+    refused(atoms, dyn, NonFiniteError, "energy is NaN")
+
+
+def test_what_has_no_temperature_or_no_cell():
+    atoms, _ = gas()
+    with pytest.raises(UnsupportedError, match="keeps no temperature"):
+        ConstrainedMonteCarlo(atoms, FS, TEMPERATURE, 3, barostat=MonteCarloBarostat(0.0))
+    with pytest.raises(UnsupportedError, match="friction"):
+        MADE["isokinetic"](atoms, barostat=MonteCarloBarostat(0.0), friction=0.1)
+    atoms.pbc = [True, True, False]
+    with pytest.raises(InputError, match=r"along z.*'lateral'"):
+        MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
+    atoms.pbc = False
+    with pytest.raises(InputError, match="no periodic cell"):
+        MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
+
+
+def test_forces_of_ase_constraints_count_in_the_energy():
+    atoms = crystal()
+    atoms.set_constraint([*atoms.constraints, Hookean(a1=4, a2=5, rt=2.0, k=5.0)])
+    dyn = ConstrainedLangevin(
+        atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=MonteCarloBarostat(0.0, every=2, width=1e-3)
+    )
+    before = dyn.get_conserved_energy()
+    dyn.run(20)
+    assert dyn.get_conserved_energy() == pytest.approx(before, abs=2e-3)
+    dyn = ConstrainedLangevin(atoms, 1 * FS, 300, 0.01 / FS, rng=1, barostat=CellRescaling(0.0, 100 * FS, 1.0))
+    with pytest.raises(UnsupportedError, match="no stress"):
+        dyn.run(1)
+
+
+def test_a_user_may_change_the_cell_between_steps():
+    atoms, _ = gas()
+    dyn = MADE["langevin"](atoms, barostat=barostats()["monte carlo"])
+    dyn.run(5)
+    tried = dyn.state.barostat[10]
+    atoms.set_cell(1.05 * atoms.cell.array, scale_atoms=False)
+    volume = atoms.get_volume()
+    dyn.run(1)
+    assert abs(atoms.get_volume() / volume - 1) < 0.3
+    assert dyn.state.barostat[10] == tried + 1

@@ -1,0 +1,106 @@
+"""Stochastic cell rescaling: exact volumes, the derivative it goes by, and the way to the pressure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pressure_systems import METHANE, cells_of, gas, no_force, p_value, round_shape, started
+from scipy import stats
+
+from kcons.errors import InputError
+from kcons.thermostats.pressure import CellRescaling
+from kcons.thermostats.pressure.barostat import Place
+from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
+from kcons.thermostats.pressure.strains import Strains
+
+
+@pytest.mark.parametrize("tau", [2.0, 30.0])
+def test_volumes_of_a_rigid_ideal_gas(tau):
+    """Also with steps that are long against tau, which are no longer those of an equation of motion."""
+    n, side = 100, 12.0
+    system, x = gas(METHANE, n, side)
+    pressure = (n + 1) / side**3
+    barostat = CellRescaling(pressure, tau, 1 / pressure, every=1, seed=2)
+    state = started(system, x, barostat)
+    volumes = np.linalg.det(cells_of(system, state, barostat, 1200))
+    assert p_value(volumes, stats.gamma(n + 1, scale=1 / pressure)) > 0.01
+
+
+def waves(k=0.7):
+    """A field that is periodic in the cell, its forces and stress."""
+
+    def phase(x, h):
+        return 2 * np.pi * x @ np.linalg.inv(h).sum(axis=1)
+
+    def potential(x, t, h):
+        return k * np.cos(phase(x, h)).sum() + 0.3 * (h**2).sum()
+
+    def force(x, t, h):
+        return k * np.sin(phase(x, h))[:, None] * 2 * np.pi * np.linalg.inv(h).sum(axis=1)
+
+    def stress(x, t, h):  # the phase is that of fractional coordinates, which a strain does not change
+        return 0.6 * h.T @ h / abs(np.linalg.det(h))
+
+    return {"force": force, "potential": potential, "stress": stress}
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_energy_by_strain_is_the_derivative(turned):
+    system, x = gas(METHANE, 6, **waves())
+    rng = np.random.default_rng(5)
+    cell = np.tril(0.5 * rng.standard_normal((3, 3))) + 12 * np.eye(3)
+    if turned:
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        cell = cell @ (turn * np.sign(np.linalg.det(turn)))
+    pieces = find_pieces(system, x, np.ones(3, bool))
+    x = x + pieces.moved(x, np.linalg.inv(system.cell) @ cell - np.eye(3), lattice_of(system))
+    system.set_cell(cell, x)
+    place = Place(cell, x, 0.0, system.forces(x, x, 0.0, 0), system.stress(x, 0.0))
+    found = energy_by_strain(system, pieces, place)
+    strains = Strains.of("flexible")
+    frame = strains.frame(cell)
+    for k, generator in enumerate(strains.generators_in(frame)):
+        energies = []
+        for h in (1e-5, -1e-5):
+            matrix = strains.matrix(h * np.eye(6)[k], frame)
+            system.set_cell(cell, x)
+            y = x + pieces.moved(x, matrix - np.eye(3), lattice_of(system))
+            system.set_cell(cell @ matrix, y)
+            energies.append(system.energy(y, 0.0, 0))
+        assert (found * generator).sum() == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-6, abs=1e-6)
+
+
+def round_stress(x, t, h):
+    volume = abs(np.linalg.det(h))
+    return 200 * volume ** (-5 / 3) * (h.T @ h - (h**2).sum() / 3 * np.eye(3))
+
+
+@pytest.mark.parametrize("kind", ["semi-isotropic", "anisotropic", "flexible"])
+def test_volumes_of_other_kinds(kind):
+    """Beside a potential that keeps the shape of the cell and knows nothing of its volume."""
+    n, side = 100, 12.0
+    system, x = gas(n=n, side=side, force=no_force, potential=round_shape, stress=round_stress)
+    pressure = (n + 1) / side**3
+    barostat = CellRescaling(pressure, 8.0, 1 / pressure, every=1, seed=2, kind=kind)
+    volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
+    assert p_value(volumes, stats.gamma(n + 1, scale=1 / pressure)) > 0.01
+
+
+def test_far_from_the_pressure_it_goes_there():
+    """A tenfold pressure, within a few tau."""
+    n, side = 100, 20.0
+    system, x = gas(n=n, side=side)
+    pressure = 10 * n / side**3
+    barostat = CellRescaling(pressure, 20.0, 1 / pressure, every=1, seed=2)
+    volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 300))
+    assert volumes[-100:].mean() == pytest.approx((n + 1) / pressure, rel=0.1)
+    assert volumes[10] > 0.3 * side**3
+
+
+def test_bad_input():
+    for bad in (0.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="tau"):
+            CellRescaling(1.0, bad, 1.0)
+        with pytest.raises(InputError, match="compressibility"):
+            CellRescaling(1.0, 1.0, bad)

@@ -1,0 +1,117 @@
+"""A stepper with a barostat, in the core."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pressure_systems import TRIANGLE, correlation_time, gas, p_value
+from scipy import stats
+from thermostat_systems import dumbbells
+
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import Rattle, State, run
+from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
+
+N, SIDE = 40, 12.0
+PRESSURE = (N + 1) / SIDE**3
+STEPPERS = {
+    "langevin": lambda: Langevin(1.0, 0.5, seed=2),
+    "nose-hoover": lambda: NoseHooverChain(1.0, period=3.0, momentum="free"),
+    "isokinetic": lambda: Isokinetic(1.0, momentum="free"),
+}
+
+
+def made(name, every=1, barostat=MonteCarloBarostat, **kwargs):
+    more = {"width": 0.25} if barostat is MonteCarloBarostat else {"tau": 5.0, "compressibility": 1 / PRESSURE}
+    return ConstantPressure(STEPPERS[name](), barostat(PRESSURE, every=every, **more, **kwargs))
+
+
+def begun(**functions):
+    system, x = gas(TRIANGLE, N, SIDE, **functions)
+    return system, system.initial_state(x, thermal_velocities(system, x, 1.0, 4))
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_volumes_between_steps(name):
+    system, state = begun()
+    volumes = []
+    run(system, state, 0.05, 500, stepper=made(name), observers=[lambda s: volumes.append(s.cell)], every=1)
+    volumes = np.linalg.det(np.array(volumes[1:]))
+    exact = stats.gamma(N + 1, scale=1 / PRESSURE)
+    assert p_value(volumes, exact) > 0.01
+    error = exact.std() * np.sqrt(correlation_time(volumes) / len(volumes))
+    assert abs(volumes.mean() - exact.mean()) < 3 * error
+
+
+@pytest.mark.parametrize("barostat", [MonteCarloBarostat, CellRescaling])
+@pytest.mark.parametrize("name", STEPPERS)
+def test_a_run_goes_on_bit_for_bit(name, barostat, tmp_path):
+    stepper = made(name, 3, barostat)
+    system, state = begun()
+    middle = run(system, state, 0.05, 7, stepper=stepper)
+    middle.save(tmp_path / "state.npz")
+    last = run(system, middle, 0.05, 8, stepper=stepper)
+    # In a system of another cell, and after a later state of the same one.
+    for other in (system, begun()[0]):
+        again = run(other, State.load(tmp_path / "state.npz"), 0.05, 8, stepper=made(name, 3, barostat))
+        for key, value in vars(last).items():
+            assert np.array_equal(getattr(again, key), value), key
+        assert np.array_equal(other.cell, last.cell)
+
+
+def test_march_is_the_same_as_steps():
+    system, state = begun()
+    stepper = ConstantPressure(Langevin(1.0, 0.5, seed=2), MonteCarloBarostat(PRESSURE, every=4, width=0.2))
+    one = state = stepper.start(system, state)
+    for _ in range(10):
+        one = stepper.step(system, one, 0.05)
+    many = stepper.march(system, state, 0.05, 10)
+    assert np.array_equal(one.positions, many.positions)
+    assert np.array_equal(one.barostat, many.barostat)
+
+
+def test_listing():
+    lines = made("langevin", 25, kind="anisotropic").listing().splitlines()
+    assert lines[0].startswith("a step of ConstantPressure(Langevin(")
+    assert lines[-1].split()[0] == "press"
+    assert "(anisotropic), every 25 steps" in lines[-1]
+    assert lines[1:-1] == Langevin(1.0, 0.5, seed=2).listing().splitlines()[1:]
+
+
+def test_zero_and_negative_steps():
+    system, state = begun()
+    stepper = made("langevin")
+    still = stepper.step(system, state, 0.0)
+    assert np.array_equal(still.cell, SIDE * np.eye(3))
+    with pytest.raises(InputError, match="taken back"):
+        stepper.step(system, state, -0.1)
+
+
+def test_what_is_refused():
+    system, state = begun()
+    barostat = MonteCarloBarostat(PRESSURE)
+    with pytest.raises(UnsupportedError, match="keeps no temperature"):
+        ConstantPressure(Rattle(), barostat).step(system, state, 0.1)
+    with pytest.raises(UnsupportedError, match="some atoms"):
+        ConstantPressure(Isokinetic(1.0, atoms=[0, 1, 2]), barostat).step(system, state, 0.1)
+    plain, x = dumbbells()
+    with pytest.raises(UnsupportedError, match="CellSystem"):
+        ConstantPressure(Langevin(1.0, 1.0, 0), barostat).step(plain, plain.initial_state(x), 0.1)
+    after = made("langevin").step(system, state, 0.1)
+    with pytest.raises(InputError, match="another barostat"):
+        made("langevin", kind="anisotropic").step(system, after, 0.1)
+    assert made("langevin", kind="anisotropic").step(system, replace(after, barostat=None), 0.1).cell is not None
+
+
+def test_a_failing_trial_leaves_the_cell():
+    system, state = begun(force=lambda x, t, h: 0 * x, potential=lambda x, t, h: 0.0 if h[0, 0] == SIDE else np.nan)
+    stepper = made("langevin", 3)
+    state = run(system, state, 0.05, 2, stepper=stepper)
+    with pytest.raises(FloatingPointError) as found:
+        run(system, state, 0.05, 1, stepper=stepper)
+    assert found.value.step == 3
+    assert np.array_equal(system.cell, SIDE * np.eye(3))
+    assert np.array_equal(system.motion.lattice[0], SIDE * np.eye(3))

@@ -1,0 +1,118 @@
+"""What moves as one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pressure_systems import METHANE, gas, placed
+
+from kcons.constraints import Angle, CenterOfMass, Distance, FixedAtoms, Plane, Sphere
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion import Motion
+from kcons.thermostats.pressure import CellSystem
+from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
+
+ALL = np.ones(3, bool)
+
+
+def system_of(rows, x, cell=12.0, pbc=True):
+    held = ConstraintSet(rows, x, np.arange(1.0, len(x) + 1), cell=np.eye(3) * cell, pbc=pbc)
+    return CellSystem(Motion(held, x))
+
+
+def test_pieces_move_by_their_centres_and_keep_their_shape():
+    """Wherever their atoms are stored."""
+    system, x = gas(METHANE, 8)
+    pieces = find_pieces(system, x, ALL)
+    assert pieces.label.tolist() == np.repeat(np.arange(8), 5).tolist()
+    assert pieces.moving.tolist() == [8, 8, 8]
+    change = 0.1 * np.random.default_rng(1).standard_normal((3, 3))
+    lattice = lattice_of(system)
+    y = x + pieces.moved(x, change, lattice)
+    system.set_cell(lattice[0] @ (np.eye(3) + change), y)
+    assert system.motion.constraint_set.value(y, 0.0) == pytest.approx(np.zeros(80), abs=1e-13)
+    # Differences of centres scale, up to cell vectors.
+    before, after = pieces.whole(x, lattice)[0], pieces.whole(y, lattice_of(system))[0]
+    d = pieces.centres(after) - pieces.centres(before) @ (np.eye(3) + change)
+    assert d == pytest.approx(np.zeros((8, 3)), abs=1e-13)
+    m = system.masses.reshape(8, 5, 1)
+    assert pieces.centres(before) == pytest.approx((m * before.reshape(8, 5, 3)).sum(1) / m.sum(1), abs=1e-13)
+    assert pieces.mass == pytest.approx(m.sum((1, 2)))
+
+
+def test_images_shift_with_the_cell():
+    """An atom stored 3 cells away is so afterwards."""
+    system, x = gas(n=4)
+    far = x + np.array([3, -2, 0]) * 12.0 * (np.arange(8) % 3 == 0)[:, None]
+    pieces = find_pieces(system, x, ALL)
+    change = np.diag([0.05, -0.02, 0.01])
+    lattice = lattice_of(system)
+    moved = far + pieces.moved(far, change, lattice) - x - pieces.moved(x, change, lattice)
+    cells = moved @ np.linalg.inv(lattice[0] @ (np.eye(3) + change))
+    assert cells == pytest.approx(np.round(cells), abs=1e-12)
+
+
+def test_bonds_tie_what_constraints_do_not():
+    x = placed(METHANE, 2, 12.0, 3)
+    system = system_of(Distance([[0, 1]]), x)
+    assert len(find_pieces(system, x, ALL)) == 9
+    bonds = [[0, 2], [0, 3], [0, 4], [5, 6]]
+    pieces = find_pieces(system, x, ALL, bonds)
+    assert len(pieces) == 5
+    assert len(set(pieces.label[:5].tolist())) == 1
+    with pytest.raises(InputError, match="pair"):
+        find_pieces(system, x, ALL, [[0, 99]])
+
+
+def test_rows_tie_whatever_they_are():
+    x = placed(METHANE, 2, 12.0, 3)
+    system = system_of([Angle([[1, 0, 2]]), Distance([[4, 5]])], x)
+    assert len(find_pieces(system, x, ALL)) == 10 - 2 - 1
+
+
+def test_planes_are_open_in_the_plane():
+    x = placed(METHANE, 2, 12.0, 3)
+    system = system_of([Plane([0, 6], [0, 0, 1]), Distance([[0, 1]])], x)
+    with pytest.raises(UnsupportedError, match=r"Plane.* holds atom 0 in space along z"):
+        find_pieces(system, x, ALL)
+    pieces = find_pieces(system, x, np.array([True, True, False]))
+    assert pieces.moving.tolist() == [9, 9, 7]
+    assert find_pieces(system, x, ALL, held="stay").moving.tolist() == [9, 9, 7]
+    oblique = system_of(Plane([0], [0, 1, 1]), x)
+    assert find_pieces(oblique, x, ALL, held="stay").moving.tolist() == [10, 9, 9]
+
+
+@pytest.mark.parametrize("row", [FixedAtoms([0]), Sphere([0], [50.0, 0, 0], 4.0), CenterOfMass([[0, 1, 2]])])
+def test_what_is_held_in_space_is_refused_or_stays(row):
+    x = np.concatenate([METHANE + 3.0, METHANE + 8.0])
+    if isinstance(row, Sphere):
+        x += [51.0, -3, -3]
+        x[1] = x[0] + [0, 0.5, 1.0]
+    system = system_of([row, Distance([[0, 1]])], x)
+    with pytest.raises(UnsupportedError, match=r"holds atom 0 in space along x.*held='stay'"):
+        find_pieces(system, x, ALL)
+    pieces = find_pieces(system, x, ALL, held="stay")
+    left = 7 if isinstance(row, CenterOfMass) else 8
+    assert pieces.moving.tolist() == [left] * 3
+    d = pieces.moved(x, 0.1 * np.eye(3), lattice_of(system))
+    assert not d[0].any()
+    assert d[5].any()
+
+
+def test_nothing_is_left_to_move():
+    x = placed(METHANE, 1, 12.0, 3)
+    system = system_of(FixedAtoms(np.arange(5)), x)
+    with pytest.raises(UnsupportedError, match="no piece"):
+        find_pieces(system, x, ALL, held="stay")
+
+
+def test_a_framework_through_the_cell_is_refused():
+    x = np.array([[1.0 + 3 * k, 6 + 0.9 * (k % 2), 5.0] for k in range(4)])
+    ring = [[0, 1], [1, 2], [2, 3], [3, 0]]
+    with pytest.raises(UnsupportedError, match=r"closes upon itself through the cell between atoms \d and \d"):
+        find_pieces(system_of(Distance(ring), x), x, ALL)
+    open_chain = system_of(Distance(ring[:3]), x)
+    assert len(find_pieces(open_chain, x, ALL)) == 1
+    with pytest.raises(UnsupportedError, match="closes upon itself"):
+        find_pieces(open_chain, x, ALL, ring)
