@@ -83,8 +83,8 @@ def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
         raise InputError("all forces are one group: there are no slow kicks in the middle", item="slow_kicks")
     if levels[1].steps % 2:
         raise InputError(
-            f"group {levels[1].group!r} takes {levels[1].steps} steps, between which there is no middle for slow kicks; "
-            "give an even number",
+            f"group {levels[1].group!r} takes {levels[1].steps} steps, between which there is no middle for slow "
+            "kicks; give an even number",
             item="slow_kicks",
         )
     return True
