@@ -23,6 +23,7 @@ try:
     from kcons.openmm.ensembles.langevin_ensemble import Langevin
     from kcons.openmm.ensembles.monte_carlo_sampler import HamiltonianMonteCarlo
     from kcons.openmm.ensembles.nose_hoover_ensemble import NoseHoover, NoseHooverMiddle
+    from kcons.openmm.ensembles.respa_ensemble import IsokineticCircles, LangevinRespa
     from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
     from kcons.openmm.integrator.guard import positions_of, velocities_of
     from kcons.openmm.integrator.precision import Precision
@@ -43,7 +44,9 @@ __all__ = [
     "ExpressionSurface",
     "HamiltonianMonteCarlo",
     "Isokinetic",
+    "IsokineticCircles",
     "Langevin",
+    "LangevinRespa",
     "NoseHoover",
     "NoseHooverMiddle",
     "Precision",
