@@ -54,6 +54,9 @@ class MultipleTimeSteps(ThermostattedDynamics):
         Of the small steps, with 1 or 6 calls of `fast` in each.
     substeps : int
         Flights along the constraints in each half of a small step, for order 2.
+    slow_kicks : {'ends', 'middle'}
+        With 'middle' the atoms are halfway between two slow kicks at the end of a step, where averages are better; what
+        is logged there costs a call of `slow`.
     **kwargs
         As for `ConstrainedDynamics`; and restart, the path of a file written by `save`.
 
@@ -87,7 +90,12 @@ class MultipleTimeSteps(ThermostattedDynamics):
         self.seed = (
             int(seed) if isinstance(seed, int | np.integer) else int(np.random.default_rng(seed).integers(2**63))
         )
-        own = ("order", "substeps", *(("spheres", "auxiliary") if bath == "spheres" else ("conserve_momentum",)))
+        own = (
+            "order",
+            "substeps",
+            "slow_kicks",
+            *(("spheres", "auxiliary") if bath == "spheres" else ("conserve_momentum",)),
+        )
         self._options = {name: kwargs.pop(name) for name in own if name in kwargs}
         self._options["steps"] = {"slow": 1, "fast": fast_steps}
         self._bath: Bath = bath

@@ -126,6 +126,7 @@ def _parser() -> Parser:
         metavar="E",
         help="also find the cheapest method and step that make at most this error, by measurement",
     )
+    studies.add_steps(compare)
     compare.add_argument(
         "--criterion",
         choices=("error", "drift", "temperature"),
@@ -182,6 +183,8 @@ def _compare(chosen: argparse.Namespace) -> int:
     target: float | None = chosen.target_error
     if target is not None and not (target > 0 and isfinite(target)):
         raise InputError(f"--target-error is {target:g}; give a positive number such as 1e-6", item="target_error")
+    if chosen.slow is not None or chosen.fast is not None:
+        return studies.compare_steps(chosen, budget, folder)
     if chosen.scene in test_systems.FLUIDS:
         if target is not None:
             raise InputError("--target-error is for trajectories; a fluid has averages", item="target_error")

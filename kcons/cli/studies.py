@@ -1,4 +1,4 @@
-"""The commands `kcons hardcases` and `kcons stability`."""
+"""The commands `kcons hardcases` and `kcons stability`, and `kcons compare --slow --fast`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from kcons.cli.terminal import console, names, say_written, show
+from kcons.cli.terminal import console, names, rendered, say_written, show
+from kcons.errors import InputError
 
 
 def add(commands: Any) -> None:
@@ -35,6 +36,16 @@ def add(commands: Any) -> None:
         "--into", type=Path, nargs="+", metavar="FILE", help="add to these results (JSON) and this page (Markdown)"
     )
     stability.set_defaults(run=_stability)
+
+
+def add_steps(compare: argparse.ArgumentParser) -> None:
+    """Options of `kcons compare` for expensive and cheap forces."""
+    layers = compare.add_argument_group(
+        "expensive and cheap forces: how long may the step be? For fluids how far molecules reach (--fast 6), for "
+        "files forces as in --forces (--slow gfn2 --fast amber14-all,amber14/tip3p)"
+    )
+    layers.add_argument("--slow", metavar="FORCES", help="the expensive ones (default for fluids: half the box)")
+    layers.add_argument("--fast", metavar="FORCES", help="the cheap ones")
 
 
 def _hard_cases(chosen: argparse.Namespace) -> int:
@@ -76,3 +87,66 @@ def _stability(chosen: argparse.Namespace) -> int:
     print(report.text(result))
     say_written([kept, *report.write(result, chosen.out)])
     return 0
+
+
+def compare_steps(chosen: argparse.Namespace, budget: float, folder: Path) -> int:
+    """Bias against evaluations of the expensive forces."""
+    from kcons.cli.progress import Bars
+    from kcons.comparison.averages import long_steps
+    from kcons.comparison.averages import long_steps_report as report
+
+    long_steps.chosen(chosen.methods)  # complain before any work
+    if chosen.fast is None:
+        raise InputError("--slow needs --fast: give the cheap forces, too", item="fast")
+    if chosen.target_error is not None or chosen.forces is not None:
+        raise InputError("--slow and --fast take the place of --forces, and have no --target-error", item="slow")
+    with Bars() as watcher:
+        with watcher.piece("building the system", 1):
+            layers = _layers(chosen)
+        unit = layers.units.time_unit
+        steps = None if chosen.dt is None else [dt * unit for dt in chosen.dt]
+        folder.mkdir(parents=True, exist_ok=True)  # complain before the long part
+        asked = {"slow": chosen.slow, "fast": chosen.fast, "size": chosen.size, "quick": chosen.quick}
+        result = long_steps.compare(
+            layers,
+            methods=chosen.methods,
+            steps=steps,
+            budget=budget,
+            seed=chosen.seed,
+            watcher=watcher,
+            settings=asked,
+        )
+    table, explained = report.table(result.runs, result.units, result.title), report.explanation(result.runs)
+    show(table, explained, console())
+    say_written(report.write(result, folder, tables=[rendered(table), explained]))
+    return 0
+
+
+def _layers(chosen: argparse.Namespace) -> Any:
+    """The system with both forces."""
+    from kcons.comparison import test_systems
+    from kcons.comparison.averages import layers
+
+    if chosen.scene in test_systems.FLUIDS:
+        try:
+            fast, slow = float(chosen.fast), None if chosen.slow is None else float(chosen.slow)
+        except ValueError:
+            raise InputError(
+                f"--slow {chosen.slow} --fast {chosen.fast}: for a fluid give how far molecules reach, such as 4",
+                item="fast",
+            ) from None
+        fluid = test_systems.build_fluid(chosen.scene, chosen.size, chosen.seed, quick=chosen.quick)
+        return layers.of_fluid(fluid, fast, slow, sweeps=2000 if chosen.quick else 20_000, seed=chosen.seed)
+    if chosen.scene is None or not Path(chosen.scene).is_file():
+        known = ", ".join(test_systems.FLUIDS)
+        raise InputError(f"--slow and --fast are for {known} and for files, not {chosen.scene!r}", item="scene")
+    if chosen.slow is None:
+        raise InputError("a file needs --slow and --fast, the expensive and the cheap forces", item="slow")
+    given = {
+        name: getattr(chosen, name) for name in ("coordinates", "constrain", "select", "rigid_residues", "platform")
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    expensive = test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.slow, **given)
+    return layers.of_test_systems(
+        expensive, test_systems.from_file(chosen.scene, chosen.seed, forces=chosen.fast, **given)
+    )

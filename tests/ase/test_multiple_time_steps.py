@@ -119,6 +119,16 @@ def test_logs_and_trajectories_cost_no_call(tmp_path):
     assert len((tmp_path / "run.log").read_text().splitlines()) == 6
 
 
+def test_slow_kicks_in_the_middle_of_a_step():
+    atoms, slow = waters(), Waves(0.05)
+    options = {**TWO, "slow_kicks": "middle"}
+    moving = MultipleTimeSteps(atoms, 4 * FS, fast=Waves(), slow=slow, bath="spheres", **options)
+    moving.run(5)
+    assert slow.calls == 6 and moving.evaluations == {"fast": 25, "slow": 5}  # one call looked whether it fits
+    assert moving.state.forces is None
+    assert "slow_kicks='middle'" in repr(moving.stepper)
+
+
 def test_forces_that_ase_objects_add():
     one, two = waters(), waters()
     for atoms in (one, two):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
+import pytest
+
 from kcons.cli import main
 from kcons.comparison.stability import fuzz
 
@@ -21,3 +25,29 @@ def test_stability(tmp_path, capsys, monkeypatch):
     assert main.main(["stability", "--quick", "--only", "fuzz", "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "300 random molecules" in shown and "stability.html" in shown
+
+
+def test_how_long_the_step_may_be(tmp_path, monkeypatch, capsys):
+    """A fluid with near molecules inside; a table, and files."""
+    monkeypatch.chdir(tmp_path)
+    command = "compare thermostat-water --quick --fast 3.8 --methods spheres --dt 4 --budget 2 --out found"
+    assert main.main(command.split()) == 0
+    assert "isokinetic spheres" in capsys.readouterr().out
+    data = json.loads((tmp_path / "found" / "compare.json").read_text(encoding="utf-8"))
+    assert data["format"] == "kcons-long-steps-1" and {run["step"] for run in data["runs"]} == {4.0}
+
+
+@pytest.mark.parametrize(
+    "command, text",
+    [
+        ("compare thermostat-water --slow 4", "--slow needs --fast"),
+        ("compare thermostat-water --fast near", "give how far molecules reach"),
+        ("compare chain --fast 3", "are for thermostat, thermostat-dumbbells, thermostat-water and for files"),
+        ("compare thermostat-water --fast 3 --methods rattle", "there is no method 'rattle'"),
+        ("compare thermostat-water --fast 9", "molecules reach 9"),
+    ],
+)
+def test_expensive_and_cheap_forces_that_cannot_be(command, text, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main.main(command.split()) == 2
+    assert text in capsys.readouterr().err

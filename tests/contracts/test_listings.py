@@ -37,6 +37,7 @@ ALL = [
     *(Langevin(1.0, 0.5, 1), Langevin(1.0, 0.5, 1, substeps=1), ReversibilityCheck(Suzuki4())),
     *(Isokinetic(1.0), Isokinetic(1.0, order=4), Isokinetic(1.0, order=6)),
     *(LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 3}), LangevinRespa(1.0, 0.5, 1, order=4)),
+    LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 2}, slow_kicks="middle"),
     *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}, order=4), IsokineticSpheres(1.0, 0.5, 1)),
     *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
 ]
@@ -74,7 +75,14 @@ def test_every_public_stepper_is_here() -> None:
     others = {each.__name__ for each in public if isinstance(each, type) and hasattr(each, "step")} - {
         each.__name__ for each in listed
     }
-    assert others == {"Baumgarte", "ProjectedRungeKutta4", "ProjectedVerlet", "State", "Stepper"}
+    assert others == {
+        "Baumgarte",
+        "HamiltonianMonteCarlo",
+        "ProjectedRungeKutta4",
+        "ProjectedVerlet",
+        "State",
+        "Stepper",
+    }
 
 
 @EVERY

@@ -3,7 +3,7 @@
 - `system`, `potential`, `minimal`: the contract, forces, solutions in minimal coordinates
 - `sphere`, `fekete`, `bead`, `pendulums`, `rotor`: particles, beads, pendulums and tops
 - `chain`, `butane`, `molecule`, `slab`: chains and molecules
-- `lennard_jones`, `dumbbells`, `water`, `fluid`: fluids
+- `lennard_jones`, `near_molecules`, `dumbbells`, `water`, `fluid`: fluids
 - `openmm_engine`, `structure`, `any_file`: OpenMM's forces, PDB files, any file
 """
 

@@ -130,25 +130,14 @@ class LennardJones:
         """
         y = np.array(x, dtype=np.float64)
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
-        accepted = _metropolis(
-            y,
-            self.first,
-            self.sites,
-            self.box,
-            self.cutoff,
-            thermal_energy,
-            every,
-            rng,
-            shift,
-            turn,
-            energies,
-        )
+        common = self.first, self.sites, self.box, np.array([self.cutoff]), thermal_energy, every, rng
+        accepted = _metropolis(y, *common, (shift, turn), energies, _one)
         return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
 
 
 @numba.njit(cache=True, nogil=True)
-def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
-    """u, u'/r and u'' of two sites."""
+def _pair(r2, a, b, cutoff, end):  # type: ignore[no-untyped-def]
+    """u, u'/r and u'' of two sites, switched off at `end`."""
     r = np.sqrt(r2)
     s = a[1] + b[1]
     q = a[2] * b[2]
@@ -158,9 +147,9 @@ def _pair(r2, a, b, cutoff):  # type: ignore[no-untyped-def]
     u = e * (c - 1.0) + q * (1.0 / r + 0.5 * field * r2 - 1.5 / cutoff)
     d = -e * (12.0 * c - 6.0) / r + q * (field * r - 1.0 / r2)
     dd = e * (156.0 * c - 42.0) / r2 + q * (2.0 / (r2 * r) + field)
-    begin = SWITCH * cutoff
+    begin = SWITCH * end
     if r > begin:
-        w = 1.0 / (cutoff - begin)
+        w = 1.0 / (end - begin)
         t = (r - begin) * w
         k = 1.0 - t * t * t * (10.0 - t * (15.0 - 6.0 * t))
         dk = -30.0 * t * t * (1.0 - t) * (1.0 - t) * w
@@ -201,7 +190,7 @@ def _evaluate(x, molecule, sites, box, cutoff, f):  # type: ignore[no-untyped-de
                 continue
             dx, dy, dz, r2 = _line(x, i, j, box, inverse)
             if r2 < cut2:
-                u, slope, _ = _pair(r2, sites[i], sites[j], cutoff)
+                u, slope, _ = _pair(r2, sites[i], sites[j], cutoff, cutoff)
                 total += u
                 _push(f, i, j, slope * dx, slope * dy, slope * dz)
     return total
@@ -231,7 +220,7 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
                 continue
             dx, dy, dz, r2 = _line(x, i, j, box, inverse)
             if r2 < cut2:
-                _, slope, bend = _pair(r2, sites[i], sites[j], cutoff)
+                _, slope, bend = _pair(r2, sites[i], sites[j], cutoff, cutoff)
                 _push(f, i, j, slope * dx, slope * dy, slope * dz)
                 shifts += 2.0 * (bend + 2.0 * slope)
                 for k in (i, j):
@@ -257,8 +246,9 @@ def _rigid(x, molecule, first, sites, box, cutoff):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, nogil=True)
-def _one(y, a, b, x, sites, box, cutoff):  # type: ignore[no-untyped-def]
+def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
     """Energy of atoms a..b at y with all others at x."""
+    cutoff = reach[0]
     total, cut2, inverse = 0.0, cutoff * cutoff, 1.0 / box
     for i in range(a, b):
         for j in range(x.shape[0]):
@@ -270,16 +260,16 @@ def _one(y, a, b, x, sites, box, cutoff):  # type: ignore[no-untyped-def]
                 d -= box * np.rint(d * inverse)
                 r2 += d * d
             if r2 < cut2:
-                total += _pair(r2, sites[i], sites[j], cutoff)[0]
+                total += _pair(r2, sites[i], sites[j], cutoff, cutoff)[0]
     return total
 
 
 @numba.njit(cache=True, nogil=True)
-def _metropolis(x, first, sites, box, cutoff, kt, every, rng, shift, turn, energies):  # type: ignore[no-untyped-def]
+def _metropolis(x, first, sites, box, reach, kt, every, rng, moves, energies, one):  # type: ignore[no-untyped-def]
     molecules = len(first) - 1
     energy = 0.0
     for k in range(molecules):
-        energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, sites, box, cutoff)
+        energy += 0.5 * one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, reach)
     accepted = 0
     for record in range(len(energies)):
         for _ in range(every * molecules):
@@ -291,13 +281,14 @@ def _metropolis(x, first, sites, box, cutoff, kt, every, rng, shift, turn, energ
                 centre += y[i] / (b - a)
             axis = rng.normal(0.0, 1.0, 3)
             axis /= np.sqrt((axis * axis).sum())
-            angle = turn * (2.0 * rng.random() - 1.0)
+            angle = moves[1] * (2.0 * rng.random() - 1.0)
             sine, cosine = np.sin(angle), np.cos(angle)
-            move = shift * (2.0 * rng.random(3) - 1.0)
+            move = moves[0] * (2.0 * rng.random(3) - 1.0)
             for i in range(b - a):
                 p = y[i] - centre
                 y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
-            change = _one(y, a, b, x, sites, box, cutoff) - _one(x[a:b], a, b, x, sites, box, cutoff)
+            change = one(y, a, b, x, first, sites, box, reach)
+            change -= one(x[a:b], a, b, x, first, sites, box, reach)
             if change <= 0.0 or rng.random() < np.exp(-change / kt):
                 x[a:b] = y
                 energy += change

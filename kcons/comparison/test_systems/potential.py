@@ -56,11 +56,16 @@ class Potential:
         self._update(x)
         return self._energy
 
+    def watched(self, x: FloatArray) -> tuple[float, FloatArray]:
+        """Energy and forces at `x` for an onlooker: neither counted nor remembered."""
+        if self._last is not None and self._forces is not None and np.array_equal(self._last, x):
+            return self._energy, self._forces.copy()
+        energy, forces = self._evaluate(x)
+        return float(energy), np.asarray(forces, float)
+
     def watched_energy(self, x: FloatArray) -> float:
-        """Potential energy at `x` for an onlooker: neither counted nor remembered."""
-        if self._last is not None and np.array_equal(self._last, x):
-            return self._energy
-        return float(self._evaluate(x)[0])
+        """The energy of `watched`."""
+        return self.watched(x)[0]
 
     def forget(self) -> None:
         """Start counting anew; the next point is evaluated whatever it is."""

@@ -11,12 +11,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints import Constraint, MovingTarget
+from kcons.constraints import Constraint, Distance, MovingTarget
 from kcons.constraints.arguments import ANGLE, LENGTH
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.motion.motion import Motion
 
@@ -25,6 +25,8 @@ Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
 #: What the sides of a window and the directions of a pull are called.
 SIDES, DIRECTIONS = ("up", "down"), ("forward", "backward")
+#: Steps of a structure on its way to a window where nothing can be turned, and what bonds may change by.
+_WALK, _STRETCHED = 20, 0.1
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,36 @@ class Held:
         return rows
 
     def placed(self, values: ArrayLike) -> tuple[Motion, FloatArray]:
-        """The engine of a window, and the initial structure with groups turned and moved so that it is there."""
+        """The engine of a window, and the initial structure with groups turned and moved so that it is there.
+
+        Within a ring nothing turns without bending angles. There it goes to the nearest point by small steps.
+
+        Raises
+        ------
+        InfeasibleError
+            Neither way keeps the bonds.
+        """
         motion = Motion(self._set([*self.others, *self.at(values)]), self.positions)
-        return motion, motion.restore_positions(self.positions, bonds=self.bonds)
+        try:
+            return motion, motion.restore_positions(self.positions, bonds=self.bonds)
+        except InfeasibleError:
+            x = self._walked(np.asarray(values, dtype=np.float64))
+            if x is None:
+                raise
+            return motion, motion.restore_positions(x, bonds=[])
+
+    def _walked(self, values: FloatArray) -> FloatArray | None:
+        """The initial structure brought to `values` by small steps; None where a bond would change too much."""
+        way, turns = values - self.found, self.periods > 0
+        way[turns] -= self.periods[turns] * np.round(way[turns] / self.periods[turns])
+        x = self.positions
+        for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
+            rows = [*self.others, *self.at(self.found + share * way)]
+            x = Motion(self._set(rows), x).restore_positions(x, bonds=[])
+        held = {frozenset(row) for item in self.coordinates.values() for row in item.atoms.tolist()}
+        bonds = [pair for pair in np.asarray(self.bonds()).tolist() if frozenset(pair) not in held]
+        if not bonds:
+            return x
+        lengths = self._set([Distance(bonds)])
+        change = lengths.measure(x) / lengths.measure(self.positions) - 1
+        return x if np.abs(change).max() < _STRETCHED else None

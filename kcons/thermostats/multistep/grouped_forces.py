@@ -19,7 +19,8 @@ class GroupedForces:
     """Forces by the names of their groups.
 
     A state carries them, if there are two or more, behind the variables of its thermostat, so that a run that is
-    continued evaluates nothing anew.
+    continued evaluates nothing anew. Where the slowest group, the first, kicks in the middle of steps it carries none,
+    and each step begins with an evaluation of the others.
 
     Attributes
     ----------
@@ -33,6 +34,7 @@ class GroupedForces:
     system: System
     names: tuple[str, ...]
     now: dict[str, FloatArray]
+    middle: bool = False
 
     @classmethod
     def of(
@@ -44,6 +46,7 @@ class GroupedForces:
         name: str,
         *,
         mark: float | None = None,
+        middle: bool = False,
     ) -> tuple[GroupedForces, FloatArray | None]:
         """Forces at a state, evaluated where it has none, and the variables of its thermostat, which begin with `mark`.
 
@@ -53,13 +56,16 @@ class GroupedForces:
             The state carries variables of another thermostat.
         """
         size = 3 * system.n_atoms
-        stored = len(names) * size if len(names) > 1 else 0
+        stored = len(names) * size if len(names) > 1 and not middle else 0
         if mark is not None and state.thermostat is not None and state.thermostat.flat[0] != mark:
             carried(state, -1, name)
         known = carried(state, variables + stored, name)
         x, _, forces = system.taken(state)
-        found = cls(system, names, {})
-        if forces is not None and not stored:
+        found = cls(system, names, {}, middle)
+        if middle:
+            for group in names[1:]:
+                found.evaluate(group, x, state.time, state.step)
+        elif forces is not None and not stored:
             found.now[names[0]] = forces
         elif forces is not None and known:
             assert state.thermostat is not None
@@ -87,13 +93,15 @@ class GroupedForces:
         check_finite(f, "force", step)
         self.now[name] = f
 
-    def total(self) -> FloatArray:
-        """Their sum."""
+    def total(self) -> FloatArray | None:
+        """Their sum, None where the slowest ones are those of another place."""
+        if self.middle:
+            return None
         first, *others = (self.now[name] for name in self.names)
         return first if not others else first + sum(others[1:], start=others[0])
 
     def closed(self, variables: FloatArray) -> FloatArray:
         """What a state carries: the variables of the thermostat, and forces."""
-        if len(self.names) == 1:
+        if len(self.names) == 1 or self.middle:
             return variables
         return np.concatenate([variables, *(self.now[name].ravel() for name in self.names)])

@@ -2,7 +2,8 @@
 
 The slowest group kicks at the ends of the step, and between its kicks the next one makes its steps, and so on
 (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1990 (1992)). The innermost group moves the atoms, by a symmetric
-scheme of order 2 or 4, with the heat bath in its middle.
+scheme of order 2 or 4, with the heat bath in its middle. The same chain of operations may begin half a step later, so
+that slow forces kick in the middle of a step, and states are those halfway between two kicks.
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES
+
+#: Where the slowest forces kick: half at each end of the step, or once in its middle.
+SlowKicks = Literal["ends", "middle"]
 
 
 @dataclass(frozen=True)
@@ -62,8 +67,37 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
     return tuple(levels)
 
 
+def middle_of(levels: tuple[Level, ...], slow_kicks: SlowKicks) -> bool:
+    """Whether the slowest group kicks in the middle of the step.
+
+    Raises
+    ------
+    InputError
+        An unknown place; steps of the next group that have no middle.
+    """
+    if slow_kicks not in ("ends", "middle"):
+        raise InputError(f"slow_kicks is {slow_kicks!r}; choose 'ends' or 'middle'", item="slow_kicks")
+    if slow_kicks == "ends":
+        return False
+    if len(levels) == 1:
+        raise InputError("all forces are one group: there are no slow kicks in the middle", item="slow_kicks")
+    if levels[1].steps % 2:
+        raise InputError(
+            f"group {levels[1].group!r} takes {levels[1].steps} steps, between which there is no middle for slow "
+            "kicks; give an even number",
+            item="slow_kicks",
+        )
+    return True
+
+
 def nested(
-    levels: tuple[Level, ...], order: int, flight: tuple[float, ...], *, turns: bool = False, exact: bool = False
+    levels: tuple[Level, ...],
+    order: int,
+    flight: tuple[float, ...],
+    *,
+    turns: bool = False,
+    exact: bool = False,
+    middle: bool = False,
 ) -> tuple[Operation, ...]:
     """A step.
 
@@ -78,13 +112,22 @@ def nested(
         Kicks on spheres, before which velocities are put onto the constraints.
     exact : bool
         Fly along great circles.
+    middle : bool
+        The slowest group kicks once, in the middle.
     """
     kicks, drifts, _ = SCHEMES[order]
-    inner = levels[-1].steps
-    middle = len(drifts) % 2 == 1
-    halves = [d for k, d in enumerate(drifts) for d in ([d / 2] * 2 if middle and k == len(drifts) // 2 else [d])]
+    inner, odd = levels[-1].steps, len(drifts) % 2 == 1
+    halves = [d for k, d in enumerate(drifts) for d in ([d / 2] * 2 if odd and k == len(drifts) // 2 else [d])]
     flights = iter(drifts_of([d / inner for _ in range(inner) for d in halves], flight, exact=exact))
-    done = list(_level(levels, 0, kicks, drifts, flights, turns))
+    if middle:
+        group, count = levels[0].group, levels[1].steps
+        done: list[Operation] = []
+        for number in range(count):
+            if 2 * number == count:
+                done += [Evaluate(group), (Turn if turns else Kick)(1.0, group)]
+            done += _level(levels, 1, kicks, drifts, flights, turns)
+    else:
+        done = list(_level(levels, 0, kicks, drifts, flights, turns))
     if not turns:
         done.append(Project())
     return tuple(done)

@@ -16,7 +16,7 @@ from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.thermostats.langevin import Langevin, LangevinStep
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
 
 
 def inner_flight(order: int, substeps: int) -> tuple[float, ...]:
@@ -56,6 +56,10 @@ class LangevinRespa(Langevin):
         RATTLE substeps in each drift, for order 2.
     conserve_momentum : bool
         See `Langevin`.
+    slow_kicks : {'ends', 'middle'}
+        Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
+        slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
+        each energy that is read costs an evaluation, and the other groups are evaluated once more a step.
 
     Raises
     ------
@@ -82,20 +86,23 @@ class LangevinRespa(Langevin):
         order: int = 2,
         substeps: int = 3,
         conserve_momentum: bool = False,
+        slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, seed, substeps=substeps, conserve_momentum=conserve_momentum)
         self.levels: tuple[Level, ...] = levels_of(steps)
         flight = inner_flight(order, self.substeps)
         self.inner_order = order
-        self._substeps = nested(self.levels, order, flight)
-        self._great_circles = nested(self.levels, order, (1.0,), exact=True)
+        self.middle = middle_of(self.levels, slow_kicks)
+        self._substeps = nested(self.levels, order, flight, middle=self.middle)
+        self._great_circles = nested(self.levels, order, (1.0,), exact=True, middle=self.middle)
         self.force_evaluations = sum(evaluations(self._substeps).values())
 
     def __repr__(self) -> str:
         steps = {level.group: level.steps for level in self.levels}
         given = "" if steps == {"": 1} else f", steps={steps}"
-        order = "" if self.inner_order == 2 else f", order={self.inner_order}"
-        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given}{order})"
+        given += "" if self.inner_order == 2 else f", order={self.inner_order}"
+        given += ", slow_kicks='middle'" if self.middle else ""
+        return f"LangevinRespa({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def check(self, system: System) -> None:
         """Raise `UnsupportedError` or `InputError` where the groups of forces are not those that have steps, too."""
@@ -111,7 +118,7 @@ class RespaStep(LangevinStep):
 
     def __init__(self, system: System, start: State, dt: float, thermostat: LangevinRespa) -> None:
         names = tuple(level.group for level in thermostat.levels)
-        groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa")
+        groups, _ = GroupedForces.of(system, start, names, 1, "LangevinRespa", middle=thermostat.middle)
         super().__init__(system, start, dt, thermostat)
         self.groups = groups
         self.equal_flights = thermostat.inner_order == 2

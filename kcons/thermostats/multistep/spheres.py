@@ -24,7 +24,7 @@ from kcons.thermostats.langevin import SeededBath
 from kcons.thermostats.multistep import sphere_kernels as kernels
 from kcons.thermostats.multistep.force_groups import group_names
 from kcons.thermostats.multistep.grouped_forces import GroupedForces
-from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+from kcons.thermostats.multistep.nesting import Level, SlowKicks, evaluations, levels_of, middle_of, nested
 from kcons.thermostats.multistep.respa import inner_flight
 from kcons.thermostats.multistep.sphere_layout import KINDS, SphereLayout, Spheres, refuse_driven
 
@@ -60,6 +60,10 @@ class IsokineticSpheres(SeededBath):
         Of the innermost scheme.
     substeps : int
         RATTLE substeps in each drift, for order 2.
+    slow_kicks : {'ends', 'middle'}
+        Where the slowest forces kick: half at each end of the step, or once in its middle. States halfway between two
+        slow kicks are nearer to the canonical distribution than those at the kicks; they know no slow forces, so that
+        each energy that is read costs an evaluation, and the other groups are evaluated once more a step.
 
     Raises
     ------
@@ -90,6 +94,7 @@ class IsokineticSpheres(SeededBath):
         auxiliary: int = 1,
         order: int = 2,
         substeps: int = 3,
+        slow_kicks: SlowKicks = "ends",
     ) -> None:
         super().__init__(thermal_energy, friction, seed, substeps)
         if not self.friction > 0:
@@ -103,8 +108,9 @@ class IsokineticSpheres(SeededBath):
         self.auxiliary = int(auxiliary)
         self.inner_order = order
         flight = inner_flight(order, self.substeps)
-        self._in_flights = nested(self.levels, order, flight, turns=True)
-        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True)
+        self.middle = middle_of(self.levels, slow_kicks)
+        self._in_flights = nested(self.levels, order, flight, turns=True, middle=self.middle)
+        self._great_circles = nested(self.levels, order, (1.0,), turns=True, exact=True, middle=self.middle)
         self.force_evaluations = sum(evaluations(self._in_flights).values())
         self._known: tuple[System, SphereLayout, FloatArray] | None = None
         self._told = False
@@ -114,6 +120,7 @@ class IsokineticSpheres(SeededBath):
         given = "" if steps == {"": 1} else f", steps={steps}"
         given += f", spheres={self.spheres!r}, auxiliary={self.auxiliary}"
         given += "" if self.inner_order == 2 else f", order={self.inner_order}"
+        given += ", slow_kicks='middle'" if self.middle else ""
         return f"IsokineticSpheres({self.thermal_energy!r}, {self.friction!r}, seed={self.seed}{given})"
 
     def operations(self, system: System | None = None) -> tuple[Operation, ...]:
@@ -180,7 +187,7 @@ class SphereStep(ArrayStep):
         #: What the variables begin with, since those of another thermostat may be as many.
         self.mark = -1.0 - n * auxiliary
         self.groups, known = GroupedForces.of(
-            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark
+            system, start, names, 1 + n * auxiliary, "IsokineticSpheres", mark=self.mark, middle=bath.middle
         )
         super().__init__(system, start, dt)
         self.bath, self.squares = bath, squares

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kcons.constraints import Dihedral, Distance, Formula, KnifeEdge
-from kcons.errors import InputError, UnsupportedError
+from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy import Settings, Window
 from kcons.free_energy.windows.window import Held, digest_of, scales_of
 
@@ -42,6 +42,34 @@ def test_groups_are_turned_and_keep_their_shape():
     assert motion.constraint_set.measure(x)[-1] == pytest.approx(start + 2.0 - 2 * np.pi * (start + 2.0 > np.pi))
     for i, j in [*BONDS, [3, 4], [1, 3], [1, 4]]:
         assert np.linalg.norm(x[i] - x[j]) == pytest.approx(np.linalg.norm(X[i] - X[j]), rel=2e-3)
+
+
+#: A ring of four, puckered by 16 degrees, with a neighbour on each atom.
+CORNERS = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, -0.1], [-1.0, 0.0, 0.1], [0.0, -1.0, -0.1]])
+RING = np.concatenate([CORNERS, 2.0 * CORNERS])
+AROUND = [[0, 1], [1, 2], [2, 3], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]]
+
+
+def ring(bonds=AROUND, others=()):
+    pucker = {"pucker": Dihedral([[0, 1, 2, 3]])}
+    return Held(pucker, list(others), RING, np.ones(8), None, True, lambda: np.array(bonds))
+
+
+def test_a_ring_comes_to_its_window_by_small_steps():
+    """No part of a ring can be turned; bonds change little, and those that are held not at all."""
+    rows = ring(others=[Distance(AROUND[:2])])
+    start = float(rows.found[0])
+    assert abs(start) == pytest.approx(0.278, abs=1e-3)
+    motion, x = rows.placed([-start])  # to its mirror image
+    assert motion.constraint_set.measure(x)[-1] == pytest.approx(-start, abs=1e-10)
+    lengths = [np.linalg.norm(y[[a for a, _ in AROUND]] - y[[b for _, b in AROUND]], axis=1) for y in (RING, x)]
+    assert np.abs(lengths[1] / lengths[0] - 1).max() < 0.1
+    assert lengths[1][:2] == pytest.approx(lengths[0][:2], rel=1e-12)
+
+
+def test_a_ring_is_not_torn():
+    with pytest.raises(InfeasibleError, match="angle"):
+        ring().placed([2.5])
 
 
 def test_a_pull_ends_where_the_window_is():

@@ -10,7 +10,7 @@ import pytest
 
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Project, Turn, drifts_of
-from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, nested
+from kcons.thermostats.multistep.nesting import Level, evaluations, levels_of, middle_of, nested
 
 THREE = levels_of({"fast": 12, "slow": 1, "medium": 4})
 
@@ -54,6 +54,31 @@ def test_every_group_kicks_and_every_drift_flies_for_the_whole_step(order, turns
     assert evaluations(done) == {"slow": 1, "medium": 4, "fast": 12 * (1 if order == 2 else 6)}
     ends = [o.ends[-1] for o in done if isinstance(o, Fly)]
     assert ends[-1] == 1.0 and math.fsum(o.fraction for o in done if isinstance(o, Fly)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_slow_kicks_in_the_middle(turns):
+    """Of the same chain of operations: between the same inner steps, with one kick in place of two halves."""
+    levels = levels_of({"slow": 1, "fast": 4})
+    at_ends, middle = (nested(levels, 2, (1.0,), turns=turns, middle=where) for where in (False, True))
+    push = Turn if turns else Kick
+    last = len(at_ends) - (0 if turns else 1)
+    inner, tail = at_ends[1 : last - 2], at_ends[last:]
+    half = len(inner) // 2
+    assert middle == (*inner[:half], Evaluate("slow"), push(1.0, "slow"), *inner[half:], *tail)
+
+
+@pytest.mark.parametrize(
+    ("steps", "where", "words"),
+    [
+        ({"slow": 1, "fast": 4}, "start", "slow_kicks is 'start'; choose 'ends' or 'middle'"),
+        ({"slow": 1, "fast": 3}, "middle", "takes 3 steps, between which there is no middle"),
+        (None, "middle", "all forces are one group"),
+    ],
+)
+def test_places_of_slow_kicks_that_cannot_be(steps, where, words):
+    with pytest.raises(InputError, match=words):
+        middle_of(levels_of(steps), where)
 
 
 @pytest.mark.parametrize("order", [2, 4])

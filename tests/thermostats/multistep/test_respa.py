@@ -85,6 +85,34 @@ def test_an_inner_scheme_of_order_four():
     assert slopes == pytest.approx([4, 4], abs=0.5)
 
 
+def test_slow_kicks_in_the_middle_are_of_order_two_and_made_once():
+    held, x = dumbbells(2)
+    split = grouped(held.motion, fast=stiff, slow=gentle)
+    state = held.initial_state(x, 0.3 * np.random.default_rng(1).normal(size=x.shape), project=True)
+    stepper = LangevinRespa(0.5, 0.0, 3, steps=TWO, slow_kicks="middle")
+    known = run(split, state, 1 / 512, 512, stepper=Langevin(0.5, 0.0, 3))
+    ends = [run(split, state, 1 / n, n, stepper=stepper) for n in (8, 16, 32)]
+    errors = [np.abs(end.positions - known.positions).max() for end in ends]
+    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([2, 2], abs=0.25)
+    split.force.evaluations.update(fast=0, slow=0)
+    assert run(split, state, 0.1, 3, stepper=stepper).forces is None
+    assert split.force.evaluations == {"fast": 3 * 5, "slow": 3}
+
+
+@pytest.mark.parametrize("kind", [LangevinRespa, IsokineticSpheres])
+def test_a_run_with_kicks_in_the_middle_goes_on_to_the_last_bit(kind):
+    held, state = molecules("bent", 3, ions=1)
+    split = grouped(held.motion, fast=springs, slow=gentle)
+    made = lambda: kind(0.5, 1.0, 3, steps=TWO, slow_kicks="middle")  # noqa: E731
+    end = run(split, state, 0.1, 8, stepper=made())
+    file = io.BytesIO()
+    run(split, state, 0.1, 4, stepper=made()).save(file)
+    file.seek(0)
+    other = run(split, State.load(file), 0.1, 4, stepper=made())
+    for name in ("positions", "velocities", "thermostat"):
+        np.testing.assert_array_equal(getattr(end, name), getattr(other, name))
+
+
 @pytest.mark.parametrize("kind", [LangevinRespa, IsokineticSpheres])
 def test_a_run_goes_on_to_the_last_bit(kind):
     """Also where forces at the same place differ in their last digits from one evaluation to the next."""
@@ -132,6 +160,7 @@ def test_words():
     lines = LangevinRespa(0.5, 1.0, 3, steps=TWO).listing().splitlines()
     assert lines[1].endswith("change velocities by forces: slow")
     assert [line.endswith("forces at the new positions: fast") for line in lines].count(True) == 4
+    assert repr(LangevinRespa(0.5, 1.0, 3, steps=TWO, slow_kicks="middle")).endswith("slow_kicks='middle')")
     assert repr(LangevinRespa(0.5, 1.0, 3)) == "LangevinRespa(0.5, 1.0, seed=3)"
 
 

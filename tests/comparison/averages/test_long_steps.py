@@ -1,0 +1,111 @@
+"""Bias against evaluations of expensive forces: counts are right, what is right is found so, what fails is shown."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from ase import units
+
+from kcons.comparison import fluid, long_steps
+from kcons.comparison.averages.layers import of_fluid
+from kcons.comparison.averages.long_steps import METHODS, Stepped, best, compare, measure
+from kcons.errors import InputError
+
+FS = units.fs
+
+
+@pytest.fixture(scope="module")
+def layers():
+    return of_fluid(fluid.water(27), 3.8, sweeps=2000, inner=2 * FS)
+
+
+@pytest.fixture(scope="module")
+def runs(layers):
+    steps = {"langevin": 2, "langevin-respa": 4, "spheres": 4, "hmc": 4}
+    return {name: measure(layers, METHODS[name], dt * FS, 0.01 / FS, length=4000 * FS) for name, dt in steps.items()}
+
+
+def test_every_method_is_right_at_a_fine_step(layers, runs):
+    for run in runs.values():
+        assert run.status == "ok", run.note
+        for value, error in [*run.kinds.values(), run.energy_off]:
+            assert abs(value) <= 4 * error
+        assert set(run.kinds) == {"shift", "turn"} and run.kinds["shift"][1] < 0.1
+        assert run.samples >= long_steps.FEWEST and run.seconds > 0
+
+
+def test_evaluations_are_counted(runs):
+    """One of the expensive forces a step, with several steps cheap ones besides; in Monte Carlo those of its scheme."""
+    for name, per_step in (("langevin", 1), ("langevin-respa", 1), ("spheres", 1)):
+        run = runs[name]
+        assert run.evaluations == pytest.approx(per_step * run.length / run.step, abs=2)
+    assert runs["langevin"].cheap == 0 and runs["hmc"].cheap == 0
+    # Of two inner steps each ends where the next begins, and the expensive forces are asked for at one of these places.
+    for name in ("langevin-respa", "spheres"):
+        assert runs[name].cheap == pytest.approx(2 * runs[name].evaluations, abs=3)
+    assert runs["hmc"].evaluations == pytest.approx(6 * runs["hmc"].length / 4, rel=0.1)
+    assert runs["hmc"].accepted > 0.9 and runs["langevin"].accepted is None
+
+
+def test_errors_after_the_same_work(runs):
+    run = runs["langevin"]
+    off, error = run.energy_off
+    bias = max(off**2 - error**2, 0)
+    assert run.after(run.evaluations) == pytest.approx(math.sqrt(bias + run.energy[1] ** 2))
+    assert run.after(100 * run.evaluations) <= run.after(run.evaluations)
+    assert run.per_time == pytest.approx(run.evaluations / run.length)
+
+
+def test_results_can_be_repeated(layers, runs):
+    again = measure(layers, METHODS["spheres"], 4 * FS, 0.01 / FS, length=4000 * FS)
+    assert again.energy == runs["spheres"].energy and again.kinds == runs["spheres"].kinds
+
+
+def test_a_step_that_is_too_long_is_shown(layers):
+    run = measure(layers, METHODS["langevin"], 60 * FS, 0.01 / FS, length=60_000 * FS)
+    assert run.status == "failed" and "Error" in run.note and run.kinds == {}
+    short = measure(layers, METHODS["langevin"], 2 * FS, 0.01 / FS, length=60 * FS)
+    assert short.status == "partial" and "too few" in short.note
+
+
+def run_of(**changes):
+    values = {"method": "spheres", "step": 4.0, "friction": 1.0, "status": "ok", "evaluations": 1000, "length": 4000.0}
+    return Stepped(**{**values, "energy": (1.0, 0.1), "energy_off": (0.2, 0.1), "correlation": 50.0, **changes})
+
+
+def test_the_best_friction():
+    """Of each method and step, by the error after the same work; by the cost of a sample without a reference."""
+    a, b = run_of(), run_of(friction=2.0, energy_off=(0.5, 0.1))
+    c, d = run_of(step=8.0, status="failed"), run_of(step=8.0, energy_off=(3.0, 0.1))
+    assert best([b, a, c, d]) == [a, d]
+    slow, quick = run_of(energy_off=None, correlation=9.0), run_of(energy_off=None, correlation=5.0, friction=3.0)
+    assert best([slow, quick]) == [quick]
+    assert math.isnan(quick.after())
+
+
+def test_comparison(layers):
+    found = compare(layers, methods=["langevin-respa"], steps=[4 * FS], frictions=[0.01 / FS, 0.02 / FS], budget=1.0)
+    assert [(run.step, run.friction) for run in found.runs] == [(4.0, pytest.approx(0.01)), (4.0, pytest.approx(0.02))]
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert data["format"] == "kcons-long-steps-1" and data["settings"]["methods"] == ["langevin-respa"]
+    assert data["reference"][0] == pytest.approx(layers.reference.value / 27)
+
+
+def test_bad_input(layers):
+    with pytest.raises(InputError, match="there is no method 'rattle'; there are langevin"):
+        compare(layers, methods=["rattle"])
+    for text, arguments in (
+        ("dt is", {"step": 0.0}),
+        ("friction is", {"friction": -1.0}),
+        ("length is", {"length": float("nan")}),
+        ("either length or budget", {"budget": 1.0}),
+        ("is too long", {"step": 1000 * FS}),
+    ):
+        given = {"step": 2 * FS, "friction": 1.0, "length": 1.0, **arguments}
+        step, friction = given.pop("step"), given.pop("friction")
+        with pytest.raises(InputError, match=text):
+            measure(layers, METHODS["spheres"], step, friction, **given)
+    with pytest.raises(InputError, match="give a positive number of seconds"):
+        compare(layers, budget=0)
