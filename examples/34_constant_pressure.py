@@ -10,6 +10,8 @@ distances, of which nine are independent. Water is TIP3P with a reaction field, 
 
 from __future__ import annotations
 
+import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +19,25 @@ from typing import Any
 import numba
 import numpy as np
 from ase import units
+from ase.build import fcc100
+from ase.calculators.emt import EMT
 
 from kcons import ConstraintSet
-from kcons.constraints import Distance
+from kcons.ase import ConstrainedLangevin, constrain, draw_velocities
+from kcons.comparison import environment, json_files
+from kcons.constraints import Distance, Plane
 from kcons.motion import Motion
 from kcons.steppers import run
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
-from kcons.thermostats.pressure import CellRescaling, CellSystem, ConstantPressure, MonteCarloBarostat
+from kcons.thermostats import (
+    CellRescaling,
+    CellSystem,
+    ConstantPressure,
+    Isokinetic,
+    Langevin,
+    MonteCarloBarostat,
+    NoseHooverChain,
+    thermal_velocities,
+)
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results" / "constant_pressure.json"
 
@@ -214,19 +228,43 @@ def slope(one: dict[str, Any], two: dict[str, Any]) -> tuple[float, float, float
 WATERS, TEMPERATURE, BAR = 64, 300.0, units.bar
 
 
-def water_system() -> Any:
-    """TIP3P with a reaction field of 5.5 angstrom, in OpenMM."""
+def water_system(waters: int = WATERS, cutoff: float = 0.55) -> Any:
+    """TIP3P with a reaction field in OpenMM; positions on a lattice, and the side of the box."""
     import openmm
 
-    from kcons.comparison.test_systems import water
-
-    built = water.build(WATERS)
-    system = built.openmm.copy()
-    force = next(f for f in system.getForces() if isinstance(f, openmm.NonbondedForce))
+    edge = round(waters ** (1 / 3))
+    side = 3.13 * edge
+    system, force, rng, x = openmm.System(), openmm.NonbondedForce(), np.random.default_rng(1), []
     force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
-    force.setCutoffDistance(0.55)
-    force.setUseSwitchingFunction(False)
-    return system, built.positions, float(built.cell[0])
+    force.setCutoffDistance(cutoff)
+    force.setUseDispersionCorrection(False)
+    half = np.radians(104.52 / 2)
+    shape = 0.9572 * np.array([[0, 0, 0], [np.cos(half), np.sin(half), 0], [np.cos(half), -np.sin(half), 0]])
+    for place in np.ndindex(edge, edge, edge):
+        first = system.getNumParticles()
+        for mass, charge, sigma, depth in (
+            (15.9994, -0.834, 0.315061, 0.1521 * 4.184),
+            *[(1.008, 0.417, 1.0, 0.0)] * 2,
+        ):
+            system.addParticle(mass)
+            force.addParticle(charge, sigma, depth)
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            system.addConstraint(first + a, first + b, 0.1 * float(np.linalg.norm(shape[a] - shape[b])))
+            force.addException(first + a, first + b, 0.0, 1.0, 0.0)
+        x.extend(shape @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + 3.13 * np.array(place))
+    system.addForce(force)
+    system.setDefaultPeriodicBoxVectors(*(0.1 * side * np.eye(3)))
+    return system, np.array(x), side
+
+
+def minimised(system: Any, x: np.ndarray) -> np.ndarray:
+    """Positions on their constraints without overlaps."""
+    import openmm
+
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(0.1 * x)
+    openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
+    return 10 * np.array(context.getState(positions=True).getPositions(asNumpy=True)._value)
 
 
 class Engine:
@@ -284,12 +322,14 @@ def run_water(barostat: str, thermostat: str, steps: int, every: int = 25, seed:
         platform = openmm.Platform.getPlatformByName("CPU")
         context = openmm.Context(system, integrator, platform, {"Threads": "1"})
         context.setPositions(0.1 * x)
+        openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
         context.setVelocitiesToTemperature(TEMPERATURE, seed)
         for _ in range(steps // 25):
             integrator.step(25)
             volumes.append(1e3 * context.getState().getPeriodicBoxVolume()._value)
         acceptance = None
     else:
+        x = minimised(system, x)
         rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
         for k in reversed(range(len(rows))):
             system.removeConstraint(k)
@@ -328,20 +368,158 @@ def run_water(barostat: str, thermostat: str, steps: int, every: int = 25, seed:
     }
 
 
-FULL = {
-    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 800_000),
-    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 400_000),
-    "water, rescaling": partial(run_water, "rescaling", "Langevin", 400_000),
-    "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 200_000),
+# -- what a barostat costs --------------------------------------------------------------------------------------
+
+
+def cost(barostat: str, waters: int, turns: int) -> dict[str, Any]:
+    """Processor time of a step with a barostat over that of one without, at the default frequency, in turns."""
+    system, x, side = water_system(waters, 0.55 if waters == WATERS else 0.9)
+    x = minimised(system, x)
+    rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    for k in reversed(range(len(rows))):
+        system.removeConstraint(k)
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+    held = ConstraintSet(
+        Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows]), x, masses, cell=np.full(3, side)
+    )
+    engine = Engine(system)
+    ours = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+    thermal = units.kB * TEMPERATURE
+    alone = Langevin(thermal, 0.001 / units.fs, 1)
+    press = MonteCarloBarostat(BAR) if barostat == "Monte Carlo" else CellRescaling(BAR, 300 * units.fs, 5e-5 / BAR)
+    both = ConstantPressure(alone, press)
+    plain = ours.initial_state(x, thermal_velocities(ours, x, thermal, 1), project=True)
+    plain = run(ours, plain, 2 * units.fs, 500, stepper=alone)
+    ratios = []
+    for _ in range(turns):
+        begun = time.process_time()
+        run(ours, plain, 2 * units.fs, 250, stepper=alone, check_every=0)
+        middle = time.process_time()
+        cell = ours.cell
+        run(ours, plain, 2 * units.fs, 250, stepper=both, check_every=0)
+        ratios.append((time.process_time() - middle) / (middle - begun))
+        ours.set_cell(cell, plain.positions)
+    return {"barostat": barostat, "molecules": waters, "turns": turns, "ratio": float(np.median(ratios))}
+
+
+# -- a molecular crystal, a slab ------------------------------------------------------------------------------------
+
+
+def crystal(steps: int) -> dict[str, Any]:
+    """Rigid diatomics as in alpha nitrogen, 108 of them; three lengths of the cell that change by themselves."""
+    basis = np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    axes = np.array([[1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    side, bond, thermal = 1.75, 0.33, 0.3
+    places = (np.array(list(np.ndindex(3, 3, 3)))[:, None] + basis).reshape(-1, 3) * side
+    turned = np.tile(axes, (27, 1)) * bond / 2
+    x = np.stack([places - turned, places + turned], axis=1).reshape(-1, 3)
+    held = ConstraintSet(Distance(np.arange(216).reshape(-1, 2)), x, np.ones(216), cell=np.full(3, 3 * side))
+    forces = Sites(2, 1.0)
+    system = CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress)
+    stepper = ConstantPressure(
+        Langevin(thermal, 1.0, 1), CellRescaling(0.5, 0.5, 0.01, kind="anisotropic", every=10, seed=1, cutoff=CUTOFF)
+    )
+    sides = []
+    state = system.initial_state(x, thermal_velocities(system, x, thermal, 1))
+    note = lambda seen: sides.append(np.diag(seen.cell) / 3)  # noqa: E731
+    run(system, stepper.start(system, state), 0.004, steps, stepper=stepper, observers=[note], every=10)
+    kept = np.array(sides)[len(sides) // 5 :]
+    return {"steps": steps, "sides": [mean_and_error(kept[:, k]) for k in range(3)]}
+
+
+def slab(steps: int) -> dict[str, Any]:
+    """Copper (100) by EMT, four layers in a cell without a third direction; the lowest layer slides in its plane."""
+    atoms = fcc100("Cu", (3, 3, 4), vacuum=None, orthogonal=True)
+    atoms.pbc = [True, True, False]
+    atoms.cell[2, 2] = 1.0
+    atoms.calc = EMT()
+    lowest = np.flatnonzero(atoms.positions[:, 2] < 0.1)
+    constrain(atoms, Plane(lowest, [0, 0, 1]))
+    draw_velocities(atoms, TEMPERATURE, 1)
+    flat = atoms.cell.lengths()[0] / 3
+    barostat = MonteCarloBarostat(0.0, kind="lateral", every=5, seed=1)
+    dynamics = ConstrainedLangevin(atoms, 3 * units.fs, TEMPERATURE, 0.01 / units.fs, rng=1, barostat=barostat)
+    sides: list[float] = []
+    dynamics.attach(lambda: sides.append(atoms.cell.lengths()[0] / 3), interval=5)
+    dynamics.run(steps)
+    heights = float(np.ptp(atoms.positions[lowest, 2]))
+    return {
+        "steps": steps,
+        "perfect": flat,
+        "side": mean_and_error(sides[len(sides) // 5 :]),
+        "spread of heights": heights,
+    }
+
+
+RUNS: dict[str, Any] = {
+    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 600_000, 10),
+    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10),
+    "water, rescaling": partial(run_water, "rescaling", "Langevin", 200_000),
+    "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 100_000),
     **{
-        f"{fluid_}, {b}, {t}": partial(run_fluid, fluid_, b, t, 120_000)
-        for fluid_ in FLUIDS
+        f"{name}, {b}, {t}": partial(run_fluid, name, b, t, 60_000)
+        for name in FLUIDS
         for b, t in (("Monte Carlo", "Langevin"), ("rescaling", "Langevin"), ("rescaling", "isokinetic"))
     },
-    "dumbbells, Monte Carlo, Nose-Hoover": partial(run_fluid, "dumbbells", "Monte Carlo", "Nose-Hoover", 120_000),
+    "dumbbells, Monte Carlo, Nose-Hoover": partial(run_fluid, "dumbbells", "Monte Carlo", "Nose-Hoover", 60_000),
     **{
-        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 120_000, **more, seed=2)
+        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 60_000, **more, seed=2)
         for b in ("Monte Carlo", "rescaling")
         for what, more in (("denser", {"denser": 1.3}), ("hotter", {"hotter": 1.1}))
     },
+    **{f"cost, {b}, {n} waters": partial(cost, b, n, 20) for b in ("Monte Carlo", "rescaling") for n in (WATERS, 216)},
+    "crystal": partial(crystal, 20_000),
+    "slab": partial(slab, 20_000),
 }
+
+
+def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Means and errors of what was run, with the slopes between pressures and temperatures."""
+    told: dict[str, Any] = {"format": "kcons constant pressure", "environment": environment(), "runs": {}}
+    told["slopes"] = []
+    for name, one in found.items():
+        rest = {key: value for key, value in one.items() if key not in ("volumes", "energies")}
+        if "volumes" in one:
+            kappa = compressed(one["volumes"])
+            rest["volume"], rest["energy"] = mean_and_error(one["volumes"]), mean_and_error(one["energies"])
+            rest["compressibility"] = [value / one["temperature"] for value in kappa]
+        told["runs"][name] = rest
+    for b in ("Monte Carlo", "rescaling"):
+        first = found.get(f"dumbbells, {b}, Langevin")
+        for what in ("denser", "hotter"):
+            other = found.get(f"dumbbells, {b}, Langevin, {what}")
+            if first and other:
+                value, error, exact = slope(first, other)
+                told["slopes"].append({"barostat": b, "to": what, "found": value, "error": error, "exact": exact})
+    return told
+
+
+def main(arguments: list[str]) -> None:
+    """Short runs of a few, or full ones."""
+    if "--full" in arguments:
+        names = [name for name in arguments if name in RUNS] or list(RUNS)
+        found = {}
+        for name in names:
+            found[name] = RUNS[name]()
+            print(name, {k: v for k, v in found[name].items() if k not in ("volumes", "energies")}, flush=True)
+        if len(names) == len(RUNS):
+            json_files.write(RESULTS, summary(found))
+        return
+    print("A fluid of 32 rigid dumbbells at kT = 2, P = 1 (reduced units):")
+    for barostat in ("Monte Carlo", "rescaling"):
+        one = run_fluid("dumbbells", barostat, "Langevin", 600)
+        volume, error = mean_and_error(one["volumes"])
+        print(
+            f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {one['acceptance']:.0%} of trials accepted"
+        )
+    short = crystal(100)
+    print("A crystal of rigid diatomics: sides", ", ".join(f"{side:.4f}" for side, _ in short["sides"]))
+    short = slab(60)
+    print(f"A copper slab at 300 K: {short['side'][0]:.4f} A from row to row, {short['perfect']:.4f} A at rest")
+    print("A step of water at constant pressure:")
+    lines = ConstantPressure(Langevin(0.026, 0.001, 1), MonteCarloBarostat(BAR)).listing().splitlines()
+    print("\n".join(f"  {line}" for line in lines))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

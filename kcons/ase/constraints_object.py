@@ -199,22 +199,9 @@ class Constraints(FixConstraint):
         N k T / V). Without momenta, or where they are zero, it is the static part, which makes the stress the
         derivative of the energy under a strain after which the constraints are restored. Rows with a place
         in space count as external forces and have no part.
-
-        Raises
-        ------
-        UnsupportedError
-            The atoms are off the constraints: what scales atoms with the cell and asks for the stress there, as ASE's
-            StrainFilter, does not respect them.
+        Refused where atoms are off the constraints.
         """
-        bound = self._bound(atoms)
-        try:
-            require_on_surface(bound.motion.constraint_set, atoms.arrays["positions"])
-        except InputError as error:
-            raise UnsupportedError(
-                f"the stress is asked for off the constraints ({error}); StrainFilter and barostats that scale atoms "
-                "leave them. Relax cells with FrechetCellFilter, or restore the atoms first"
-            ) from error
-        virial = virial_of(bound.motion, atoms, applied_forces(atoms))
+        virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
         stress -= virial[VOIGT] / atoms.get_volume()
 
     def adjust_cell(self, atoms: Atoms, cell: Any) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints.target import FloatArray
-from kcons.thermostats.pressure import Pieces, find_pieces, pressure
+from kcons.thermostats.pressure import Pieces, find_pieces, instantaneous_pressure
 from kcons.thermostats.pressure.measured import Virial
 
 
@@ -26,7 +26,7 @@ class PressureReporter:
     file : path or text file, optional
         Where to write time (fs), volume (A^3) and pressure (bar), a line for each call.
     virial : {'molecular', 'atomic', 'difference'}
-        See `kcons.thermostats.pressure.pressure`; 'difference' is for calculators without stress.
+        See `kcons.thermostats.instantaneous_pressure`; 'difference' is for calculators without stress.
     molecules : array_like of int, shape (n, 2), optional
         Bonds, for pieces; by default those of the barostat.
     temperature_K : float, optional
@@ -50,6 +50,7 @@ class PressureReporter:
     ) -> None:
         self.dynamics, self.virial, self.molecules = dynamics, virial, molecules
         self.thermal = None if temperature_K is None else units.kB * temperature_K
+        self._own = isinstance(file, str | Path)
         self._file = Path(file).open("w") if isinstance(file, str | Path) else file  # noqa: SIM115
         if self._file is not None:
             print("# time/fs  volume/A^3  pressure/bar", file=self._file)
@@ -57,11 +58,17 @@ class PressureReporter:
         self.values: list[FloatArray] = []
         self.volumes: list[float] = []
 
+    def __del__(self) -> None:
+        if getattr(self, "_own", False) and self._file is not None:
+            self._file.close()
+
     def __call__(self) -> None:
         dynamics, atoms = self.dynamics, self.dynamics.atoms
         system, pieces = self._system()
         state = dynamics.state.copied()
-        self.values.append(pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal))
+        self.values.append(
+            instantaneous_pressure(system, state, self.virial, pieces=pieces, thermal_energy=self.thermal)
+        )
         self.volumes.append(float(atoms.get_volume()))
         if self._file is not None:
             bar = np.trace(self.values[-1]) / 3 / units.bar

@@ -91,9 +91,14 @@ class PressureReporter:
 
     def __init__(self, file: str | IO[str], reportInterval: int, temperature: float | None = None) -> None:
         self._interval, self._temperature = int(reportInterval), temperature
+        self._own = isinstance(file, str)
         self._file = open(file, "w") if isinstance(file, str) else file  # noqa: SIM115
         print('#"Step","Box Volume (nm^3)","Pressure (bar)"', file=self._file)
         self.values: list[float] = []
+
+    def __del__(self) -> None:
+        if getattr(self, "_own", False):
+            self._file.close()
 
     def describeNextReport(self, simulation: app.Simulation) -> dict[str, Any]:
         """As OpenMM asks."""

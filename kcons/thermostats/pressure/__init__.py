@@ -13,7 +13,7 @@ from kcons.thermostats.pressure.barostat import Barostat
 from kcons.thermostats.pressure.cell_rescaling import CellRescaling
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.constant_pressure import ConstantPressure
-from kcons.thermostats.pressure.measured import PressureObserver, constraint_virial, pressure
+from kcons.thermostats.pressure.measured import PressureObserver, constraint_virial, instantaneous_pressure
 from kcons.thermostats.pressure.monte_carlo_barostat import MonteCarloBarostat
 from kcons.thermostats.pressure.pieces import Pieces, find_pieces
 
@@ -27,5 +27,5 @@ __all__ = [
     "PressureObserver",
     "constraint_virial",
     "find_pieces",
-    "pressure",
+    "instantaneous_pressure",
 ]

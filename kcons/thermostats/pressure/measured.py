@@ -47,7 +47,7 @@ def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArra
     return 0.5 * (virial + virial.T)
 
 
-def pressure(
+def instantaneous_pressure(
     system: CellSystem,
     state: State,
     virial: Virial = "molecular",
@@ -125,7 +125,7 @@ class PressureObserver:
     ----------
     system : CellSystem
     virial, thermal_energy
-        As for `pressure`.
+        As for `instantaneous_pressure`.
     pieces : Pieces, optional
         Those of a barostat: `barostat.pieces(system, positions)`.
 
@@ -153,7 +153,9 @@ class PressureObserver:
         if self.pieces is None and self.virial != "atomic":
             self.pieces = find_pieces(self.system, own.positions, np.ones(3, dtype=bool), time=own.time)
         self.values.append(
-            pressure(self.system, own, self.virial, pieces=self.pieces, thermal_energy=self.thermal_energy)
+            instantaneous_pressure(
+                self.system, own, self.virial, pieces=self.pieces, thermal_energy=self.thermal_energy
+            )
         )
         self.volumes.append(float(abs(np.linalg.det(self.system.cell))))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from ase import units
@@ -46,13 +44,13 @@ def test_molecular_pressure_by_stress_and_by_differences():
     assert np.array_equal(atoms.cell.array, before)
 
 
-def test_a_reporter_changes_no_run():
+def test_a_reporter_changes_no_run(tmp_path):
     runs = []
     for watched in (False, True):
         atoms, _ = dumbbells(20, side=30.0)
         barostat = MonteCarloBarostat(20 * units.kB * TEMPERATURE / 30**3, every=2, width=0.2)
         dynamics = ConstrainedLangevin(atoms, 2 * FS, TEMPERATURE, 0.01 / FS, rng=1, barostat=barostat)
-        file = io.StringIO()
+        file = tmp_path / "pressure.txt"
         if watched:
             reporter = PressureReporter(dynamics, file, virial="difference", temperature_K=TEMPERATURE)
             dynamics.attach(reporter, interval=1)
@@ -60,7 +58,7 @@ def test_a_reporter_changes_no_run():
         runs.append((atoms.cell.array.copy(), atoms.get_positions(), atoms.get_momenta()))
     for one, other in zip(*runs, strict=True):
         assert np.array_equal(one, other)
-    lines = file.getvalue().splitlines()
+    lines = file.read_text().splitlines()
     assert len(lines) == 11
     time, volume, bar = (float(v) for v in lines[-1].split())
     assert time == pytest.approx(18.0)

@@ -12,7 +12,7 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import run
 from kcons.thermostats import Langevin, thermal_velocities
-from kcons.thermostats.pressure import CellSystem, PressureObserver, find_pieces, pressure
+from kcons.thermostats.pressure import CellSystem, PressureObserver, find_pieces, instantaneous_pressure
 
 SIDE = 12.0
 
@@ -53,7 +53,9 @@ def test_three_ways_to_one_pressure(shape):
     """Of rigid molecules all agree at any instant: d/dt of sum m r.v about their centres is zero."""
     system, state = started(shape)
     state = run(system, state, 0.05, 5, stepper=Langevin(1.0, 1.0, seed=1))
-    molecular, atomic, difference = (pressure(system, state, way) for way in ("molecular", "atomic", "difference"))
+    molecular, atomic, difference = (
+        instantaneous_pressure(system, state, way) for way in ("molecular", "atomic", "difference")
+    )
     assert np.trace(atomic) == pytest.approx(np.trace(molecular), abs=1e-12)
     assert np.trace(difference) == pytest.approx(np.trace(molecular), rel=1e-6)
     assert abs(atomic - molecular).max() > 1e-4  # in single directions they are equal in the mean only
@@ -81,11 +83,11 @@ def test_means_agree():
 def test_bonds_make_pieces():
     system, state = started()
     one = find_pieces(system, state.positions, np.ones(3, bool), [[0, 3]])
-    found = pressure(system, state, pieces=one, thermal_energy=1.0)
+    found = instantaneous_pressure(system, state, pieces=one, thermal_energy=1.0)
     # One piece less, and the first spring within it.
     d = state.positions[3] - state.positions[0]
     d -= SIDE * np.round(d / SIDE)
-    rest = pressure(system, state, thermal_energy=1.0)
+    rest = instantaneous_pressure(system, state, thermal_energy=1.0)
     assert np.trace(found) == pytest.approx(np.trace(rest), abs=1.0)
     assert np.trace(found) != pytest.approx(np.trace(rest), rel=1e-6)
 
@@ -93,11 +95,11 @@ def test_bonds_make_pieces():
 def test_what_is_refused():
     system, state = started()
     with pytest.raises(InputError, match="virial"):
-        pressure(system, state, "viral")
+        instantaneous_pressure(system, state, "viral")
     x = state.positions
     held = ConstraintSet(Distance([[0, 1]]), x, np.ones(len(x)), cell=np.full(3, SIDE))
     blind = CellSystem(Motion(held, x), lambda x, t, h: 0 * x, lambda x, t, h: 0.0)
     with pytest.raises(UnsupportedError, match="stress"):
-        pressure(blind, blind.initial_state(x), thermal_energy=1.0)
-    found = pressure(blind, blind.initial_state(x), "difference", thermal_energy=1.0)
+        instantaneous_pressure(blind, blind.initial_state(x), thermal_energy=1.0)
+    found = instantaneous_pressure(blind, blind.initial_state(x), "difference", thermal_energy=1.0)
     assert found == pytest.approx((len(x) - 1) / SIDE**3 * np.eye(3))
