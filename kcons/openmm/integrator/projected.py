@@ -109,7 +109,8 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         if self.row_groups:
             self.setIntegrationForceGroups(-1)
         self.program = Program(self)
-        self._plan = self._writer(self.program, self.scheme, self.parts, self.ensemble)
+        writer: type[LeanStepWriter] = getattr(self._ensemble, "writer", None) or self._writer
+        self._plan = writer(self.program, self.scheme, self.parts, self.ensemble)
         self._plan.write()
         listen(self)
 

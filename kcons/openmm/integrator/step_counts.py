@@ -137,6 +137,8 @@ class _Walk:
         self.program, self.iterations = program, iterations
         self.values: dict[str, Any] = {**program.numbers, **program.settings, **values}
         self.counts = StepCounts()
+        #: Groups that carry rows, None for all; those of several time steps carry forces.
+        self.rows: frozenset[int] | None = getattr(program.integrator, "row_groups", None)
         #: Group of the last evaluation, and whether it gave forces as well.
         self.group: str | None = None
         self.forces = False
@@ -188,7 +190,7 @@ class _Walk:
             if group != self.group or (name == "f" and not self.forces):
                 self.group = group
                 self.forces = name == "f" or self._forces_follow(k, group)
-                if group:
+                if group and (self.rows is None or int(group) in self.rows):
                     counts.row_evaluations += 1
                 else:
                     counts.force_evaluations += 1

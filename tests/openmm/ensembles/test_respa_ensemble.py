@@ -1,0 +1,240 @@
+"""Several time steps in OpenMM: the core's steps, OpenMM's own integrator, circles of free atoms, refusals."""
+
+import numpy as np
+import openmm
+import pytest
+from ensemble_runs import run
+from openmm import unit
+from openmm_parts import HeldCoordinates
+from openmm_systems import GPUS, PLATFORMS, alanine, context_of, state_of, water_box
+
+from kcons import ConstraintSet, Motion, State, System
+from kcons import run as steps_of
+from kcons.constraints import Distance
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import IsokineticCircles, Langevin, LangevinRespa, ProjectedIntegrator
+from kcons.thermostats import ForceGroups
+from kcons.thermostats import LangevinRespa as CoreRespa
+
+TWO = {0: 1, 1: 4}
+KT = 300 * unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin)
+
+
+def grouped(**options):
+    """Alanine dipeptide: bonds held, angles and torsions fast (group 1), the rest slow (group 0)."""
+    system, x, v = alanine(**options)
+    for force in system.getForces():
+        force.setForceGroup(0 if isinstance(force, openmm.NonbondedForce | openmm.CustomNonbondedForce) else 1)
+    return system, x, v
+
+
+def trapped(n=4, constraints=0):
+    """Free atoms in a trap with a softer slow force."""
+    system, fast, slow = openmm.System(), openmm.CustomExternalForce("40*(x^2+2*y^2+z^2)"), None
+    slow = openmm.CustomExternalForce("10*(cos(3*x)+y^4+z*y)")
+    for k in range(n):
+        system.addParticle(10.0 + k)
+        fast.addParticle(k)
+        slow.addParticle(k)
+    for k in range(constraints):
+        system.addConstraint(2 * k, 2 * k + 1, 0.1)
+    fast.setForceGroup(1)
+    system.addForce(fast)
+    system.addForce(slow)
+    rng = np.random.default_rng(2)
+    return system, 0.1 * rng.normal(size=(n, 3)), 0.3 * rng.normal(size=(n, 3))
+
+
+@pytest.mark.parametrize("slow_kicks", ["ends", "middle"])
+@pytest.mark.parametrize("steps", [TWO, {0: 1, 2: 2, 1: 4}], ids=["two groups", "three groups"])
+def test_it_makes_the_steps_of_the_core(steps, slow_kicks):
+    """Without friction."""
+    system, x, v = grouped()
+    if 2 in steps:
+        system.getForces()[1].setForceGroup(2)
+    probe = context_of(system, openmm.VerletIntegrator(1e-3))
+
+    def of(group):
+        def force(x, time):
+            probe.setPositions(x)
+            state = probe.getState(forces=True, groups={group})
+            return np.array(state.getForces(asNumpy=True)._value)
+
+        return force
+
+    pairs = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    rows = Distance([p[:2] for p in pairs], [p[2]._value for p in pairs])
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+    held = System(Motion(ConstraintSet(rows, x, masses), x), ForceGroups({str(g): of(g) for g in steps}))
+    named = {str(group): count for group, count in steps.items()}
+    core = CoreRespa(KT, 0.0, 3, steps=named, substeps=1, slow_kicks=slow_kicks)
+    end = steps_of(held, State(x, held.motion.project_velocities(x, v)), 2e-3, 5, stepper=core)
+    integrator = ProjectedIntegrator(2e-3, tolerance=1e-13, ensemble=LangevinRespa(300, 0.0, steps, slow_kicks))
+    found = state_of(run(system, integrator, x, v, 5))
+    np.testing.assert_allclose(found[0], end.positions, rtol=0, atol=2e-11)
+    np.testing.assert_allclose(found[1], end.velocities, rtol=0, atol=1e-8)
+    assert "forces of group 1 act" in integrator.listing()
+    counts = integrator.counts()
+    assert counts.constraint_solves == 2 * max(steps.values()) + 1 and not counts.row_evaluations
+    # Of all groups; the fastest ones once more after each kick of others.
+    assert counts.force_evaluations == (6 if len(steps) == 2 else 10)
+
+
+def test_without_friction_it_makes_the_steps_of_openmm_s_own_integrator():
+    system, x, v = trapped()
+    own = openmm.MTSLangevinIntegrator(300, 0.0, 0.01, [(0, 1), (1, 4)])
+    ends = [
+        state_of(run(system, integrator, x, v, 20))
+        for integrator in (own, ProjectedIntegrator(0.01, ensemble=LangevinRespa(300, 0.0, TWO)))
+    ]
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("platform", [*PLATFORMS, *GPUS[-2:-1]])
+def test_constraints_are_held_and_a_seed_repeats(platform):
+    system, x, v = grouped()
+    ends = []
+    for _ in range(1 if "OpenCL" in platform else 2):  # where kernels are compiled for each Context
+        integrator = ProjectedIntegrator(4e-3, ensemble=LangevinRespa(300, 5.0, TWO))
+        integrator.setRandomNumberSeed(5)
+        context = run(system, integrator, x, v, 10, platform)
+        integrator.check()
+        ends.append(state_of(context))
+    assert np.abs(ends[0][0] - ends[-1][0]).max() <= 1e-6
+    assert np.abs(ends[0][0] - x).max() > 1e-3
+
+
+def test_velocities_have_the_temperature():
+    system, x = water_box()
+    system.getForces()[0].setForceGroup(0)
+    weak = openmm.CustomExternalForce("1e-3*x^2")
+    for k in range(0, 81, 3):
+        weak.addParticle(k)
+    weak.setForceGroup(1)
+    system.addForce(weak)
+    for force in system.getForces()[:1]:
+        for k in range(81):
+            force.setParticleParameters(k, 0.0, 0.3, 0.0)
+    integrator = ProjectedIntegrator(8e-3, ensemble=LangevinRespa(300, 200.0, TWO))
+    integrator.setRandomNumberSeed(11)
+    context = context_of(system, integrator)
+    context.setPositions(x)
+    integrator.setVelocitiesToTemperature(context, 300, 7)
+    values = []
+    for _ in range(200):
+        integrator.step(1)
+        values.append(integrator.computeSystemTemperature()._value)
+    assert abs(np.mean(values) - 300) <= 3.5 * 300 * np.sqrt(2 / 162 / 200)
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_circles_keep_their_radius_and_are_canonical(platform):
+    """u^2 + w^2 = kT for each coordinate; <x^2> of a harmonic well."""
+    system, x, v = trapped(40)
+    system.removeForce(1)
+    soft = openmm.CustomExternalForce("60*(x^2+y^2+z^2)")
+    for k in range(40):
+        soft.addParticle(k)
+    system.addForce(soft)
+    integrator = ProjectedIntegrator(0.04, ensemble=IsokineticCircles(300, 5.0, TWO))
+    integrator.setRandomNumberSeed(5)
+    context = run(system, integrator, x, v, 50, platform)
+    masses = np.array([system.getParticleMass(k)._value for k in range(40)])[:, None]
+    values = []
+    for _ in range(600):
+        integrator.step(2)
+        values.append((state_of(context)[0] ** 2).mean(axis=0))
+    w = np.array([list(row) for row in integrator.getPerDofVariableByName("w")])
+    radius = masses * state_of(context)[1] ** 2 + w**2
+    np.testing.assert_allclose(radius, KT, rtol=1e-12 if platform == "Reference" else 2e-6)
+    expected = KT / np.array([200.0, 280.0, 200.0])
+    np.testing.assert_allclose(np.mean(values, axis=0), expected, rtol=0.06)
+
+
+def test_the_circular_kick_is_that_of_the_core():
+    from kcons.thermostats.multistep import sphere_kernels as kernels
+
+    system, x, v = trapped(3)
+    masses = np.array([10.0, 11.0, 12.0])
+    integrator = ProjectedIntegrator(0.05, ensemble=IsokineticCircles(300, 1e-30, TWO))
+    context = run(system, integrator, x, v, 1)
+    w = np.array([list(row) for row in integrator.getPerDofVariableByName("w")])
+    spheres = np.arange(9).reshape(3, 3)
+    tables = np.arange(3), np.concatenate([spheres, np.full((3, 1), -1)], axis=1), masses, masses
+    probe = context_of(system, openmm.VerletIntegrator(1e-3))
+
+    def force(group, at):
+        probe.setPositions(at)
+        return np.array(probe.getState(forces=True, groups={group}).getForces(asNumpy=True)._value)
+
+    squares, place = np.full(9, KT), x.copy()
+    u, own = v.copy(), np.zeros((9, 1))
+    kernels.turn(u, own, force(0, place) / masses[:, None], 0.025, squares, *tables)
+    for _ in range(4):
+        kernels.turn(u, own, force(1, place) / masses[:, None], 0.00625, squares, *tables)
+        place += 0.0125 * u
+        kernels.turn(u, own, force(1, place) / masses[:, None], 0.00625, squares, *tables)
+    kernels.turn(u, own, force(0, place) / masses[:, None], 0.025, squares, *tables)
+    np.testing.assert_allclose(state_of(context)[0], place, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(state_of(context)[1], u, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(w.ravel(), own.ravel(), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"steps": 4}, "steps must name each force group"),
+        ({"steps": {0: 1}}, "give two or more"),
+        ({"steps": {0: 1, 32: 4}}, "force group 32 is no number from 0 to 31"),
+        ({"steps": {0: 1, "fast": 4}}, "force group 'fast' is no number"),
+        ({"steps": {0: 1, 1: 0}}, "takes 0 steps"),
+        ({"steps": {0: 1, 1: 4, 2: 6}}, "does not divide"),
+        ({"friction": -1.0}, "friction"),
+        ({"slow_kicks": "middle", "steps": {0: 1, 1: 3}}, "no middle"),
+    ],
+)
+def test_bad_input(options, words):
+    with pytest.raises(InputError, match=words):
+        LangevinRespa(**{"temperature": 300, "friction": 1.0, "steps": TWO, **options})
+
+
+def test_circles_need_a_bath_and_free_atoms():
+    for temperature, friction in ((0, 1.0), (300, 0.0)):
+        with pytest.raises(InputError, match="above 0"):
+            IsokineticCircles(temperature, friction, TWO)
+    system, x, v = trapped(4, constraints=1)
+    x[1] = x[0] + [0.1, 0, 0]
+    with pytest.raises(UnsupportedError, match="for free atoms, and the System holds 1 constraints"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=IsokineticCircles(300, 1.0, TWO)), x, v, 1)
+
+
+def test_forces_of_other_groups_and_virtual_sites_and_parts():
+    system, x, v = trapped()
+    system.getForces()[0].setForceGroup(7)
+    integrator = ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO))
+    with pytest.raises(InputError, match="CustomExternalForce is in force group 7, which has no number of steps"):
+        run(system, integrator, x, v, 1)
+    system, x, v = trapped()
+    system.addParticle(0.0)
+    system.setVirtualSite(4, openmm.TwoParticleAverageSite(0, 1, 0.5, 0.5))
+    for force in system.getForces():
+        force.addParticle(3)
+    sites = np.vstack([x, 0.5 * (x[0] + x[1])]), np.vstack([v, 0 * v[0]])
+    with pytest.raises(UnsupportedError, match="virtual sites"):
+        run(system, ProjectedIntegrator(1e-3, ensemble=LangevinRespa(300, 1.0, TWO)), *sites, 1)
+    with pytest.raises(UnsupportedError, match="and no parts"):
+        ProjectedIntegrator(1e-3, parts=[HeldCoordinates([0], 0, 0.0, 5)], ensemble=LangevinRespa(300, 1.0, TWO))
+
+
+def test_temperature_friction_and_files():
+    ensemble = LangevinRespa(300, 1.0, TWO, "middle")
+    assert ensemble == LangevinRespa(300, 1.0, {1: 4, 0: 1}, "middle") != LangevinRespa(300, 1.0, TWO)
+    assert repr(ensemble) == "LangevinRespa(300 K, 1/ps, steps {0: 1, 1: 4}, slow kicks in the middle)"
+    integrator = ProjectedIntegrator(2e-3, ensemble=ensemble)
+    integrator.setTemperature(310)
+    integrator.setFriction(2.0)
+    assert integrator.ensemble == LangevinRespa(310, 2.0, TWO, "middle")
+    read = openmm.XmlSerializer.deserialize(openmm.XmlSerializer.serialize(integrator))
+    assert read.ensemble == integrator.ensemble
+    assert isinstance(ensemble, Langevin)
