@@ -110,7 +110,7 @@ def _panel(runs: Sequence[Stepped], units: Units, kind: str) -> Panel:
         curves.append(Curve(at, off, METHODS[name].title, style))
         for x, run in zip(at, seen, strict=True):
             value, error = 100 * abs(run.kinds[kind][0]), 100 * run.kinds[kind][1]
-            bar = [max(value - error, 0.1 * error), value + error]
+            bar = [max(value - error, min(value, 0.1 * error)), value + error]
             curves.append(Curve([x, x], bar, style={"color": colour, "linewidth": 1.0}))
     heading = KINDS[kind].partition("\n")[0]
     return Panel(curves, f"calls of the expensive forces a {units.long_time}", f"{heading} off by / %", plain="xy")
