@@ -228,6 +228,9 @@ class HamiltonianMonteCarlo:
     def _propose(self) -> None:
         held, context = self._held, self.context
         number = self.number + 1
+        guard = self.integrator._watch(context)
+        if guard.disturbed:  # positions near the constraints are brought onto them
+            guard.begin()
         x, time = positions_of(context), context.getTime()
         if math.isnan(held[POTENTIAL]) or self._others_acted(x):
             held[POTENTIAL] = self._potential()

@@ -228,6 +228,19 @@ def test_who_moves_particles_moves_the_energy():
     assert sampler.counts.accepted > before or sampler.state.thermostat[POTENTIAL] == pytest.approx(energy)
 
 
+def test_a_start_near_the_constraints_is_brought_onto_them():
+    """Once: a rejected proposal goes back to where it was put."""
+    sampler = trimer(steps=1, dt=0.01, spring=1.0)
+    sampler.context.setPositions(np.array([[1.01, 0, 0], [0, 0, 0], [0, 0.99, 0]]))
+    sampler.integrator.setStepSize(10.0)  # rejected
+    sampler.step(1)
+    x = state_of(sampler.context)[0]
+    assert sampler.counts.accepted == 0 and abs(np.linalg.norm(x[0] - x[1]) - 1) < 1e-9
+    sampler.integrator.setStepSize(0.01)
+    sampler.step(5)
+    assert sampler.counts.accepted == 5 and sampler.counts.mean_square < 1e-4
+
+
 def test_bad_input_changes_nothing():
     system, x = water_box(8)
 
