@@ -50,7 +50,7 @@ def smoke(python, folder):
     place = folder / "bin"
     commands = [
         [python, "-m", "venv", folder],
-        [place / "python", "-m", "pip", "install", "--quiet", ROOT],
+        [place / "python", "-m", "pip", "install", "--quiet", next(folder.parent.glob("dist/*.tar.gz"), ROOT)],
         [place / "python", "-c", STEP],
         [place / "kcons", "doctor"],
     ]

@@ -19,6 +19,7 @@ try:
     from kcons.ase.dynamics import ConstrainedDynamics
     from kcons.ase.monte_carlo import ConstrainedMonteCarlo
     from kcons.ase.multiple_time_steps import MultipleTimeSteps
+    from kcons.ase.pressure.reporter import PressureReporter
     from kcons.ase.rigid_water import rigid_water
     from kcons.ase.thermostat_dynamics import (
         ConstrainedLangevin,
@@ -40,6 +41,7 @@ __all__ = [
     "Constraints",
     "IsokineticDynamics",
     "MultipleTimeSteps",
+    "PressureReporter",
     "constrain",
     "constraints_of",
     "draw_velocities",

@@ -11,10 +11,11 @@ from ase.calculators.calculator import Calculator, PropertyNotImplementedError, 
 from numpy.typing import NDArray
 
 from kcons.ase.constraints_object import Constraints
-from kcons.ase.pressure.virial import VOIGT, constraint_virial
+from kcons.ase.pressure.virial import VOIGT
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.errors import InputError
+from kcons.thermostats.pressure import constraint_virial
 
 #: Residual, in units of what double precision can reach, up to which positions are taken as they are.
 _ON_SURFACE = 4.0

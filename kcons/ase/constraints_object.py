@@ -199,6 +199,7 @@ class Constraints(FixConstraint):
         N k T / V). Without momenta, or where they are zero, it is the static part, which makes the stress the
         derivative of the energy under a strain after which the constraints are restored. Rows with a place
         in space count as external forces and have no part.
+        Refused where atoms are off the constraints.
         """
         virial = virial_of(self._bound(atoms).motion, atoms, applied_forces(atoms))
         stress -= virial[VOIGT] / atoms.get_volume()

@@ -44,6 +44,10 @@ def add(commands: Any) -> None:
     check.add_argument("--frames", metavar="A:B:STEP", help="frames to look at (default all)")
     check.add_argument("--workers", type=int, default=1, help="threads (DCD files) or processes (default 1)")
     check.add_argument("--worst", type=int, default=10, help="rows to name (default 10)")
+    check.add_argument(
+        "--forces",
+        help="also the temperatures of the configurations, by forces as for compare (amber14-all,amber14/tip3p, gfn2)",
+    )
     check.add_argument("--no-rank", action="store_true", help="leave out rank and temperature")
     check.add_argument("--out", type=Path, help="folder for check.json, .png and .txt (default ./check-TRAJECTORY)")
     check.set_defaults(run=_check)
@@ -60,6 +64,10 @@ def _check(chosen: argparse.Namespace) -> int:
 
     if chosen.out is not None:
         report.refuse_others(chosen.out, chosen.trajectory)  # complain before any work
+    for name in ("rigid_bodies", "no_rigid_water"):
+        if chosen.forces is not None and getattr(chosen, name):
+            option = name.replace("_", "-")
+            raise InputError(f"--forces does not go with --{option}; leave one of them out", item="forces")
     try:
         result = _result(chosen, check_trajectory)
     except UnreadableError as error:
@@ -67,6 +75,8 @@ def _check(chosen: argparse.Namespace) -> int:
         print(f"kcons: {reason}", file=sys.stderr)
         say_written(_put(chosen, lambda folder: report.write_failure(chosen.trajectory, reason, folder)))
         return EXIT["incomplete"]
+    if chosen.forces is not None:
+        result.remarks += _temperatures(chosen, result)
     terminal = console()
     tables = (report.unit_table(result), report.row_table(result))
     terminal.print(report.summary(result), highlight=False, markup=False)
@@ -76,6 +86,14 @@ def _check(chosen: argparse.Namespace) -> int:
     text = [report.summary(result), *map(rendered, tables), result.verdict]
     say_written(_put(chosen, lambda folder: report.write(result, folder, tables=text)))
     return EXIT[result.status]
+
+
+def _temperatures(chosen: argparse.Namespace, result: CheckResult) -> list[str]:
+    from kcons.comparison.averages import trajectory_temperatures
+
+    options = {"constrain": chosen.constrain, "select": chosen.select, "rigid_residues": list(chosen.rigid_residues)}
+    found = trajectory_temperatures.along(chosen.trajectory, chosen.topology, chosen.forces, result.frames, **options)
+    return trajectory_temperatures.sentences(found)
 
 
 def _put(chosen: argparse.Namespace, write: Callable[[Path], list[Path]]) -> list[Path]:

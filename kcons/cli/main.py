@@ -283,7 +283,9 @@ def _compare_all(chosen: argparse.Namespace) -> int:
     if chosen.scene is not None or chosen.target_error is not None or chosen.methods is not None:
         raise InputError("--all runs all test systems and methods; choose parts of it by --only", item="all")
     if chosen.redraw is not None:
-        say_written(whole.redraw(chosen.redraw, chosen.into))
+        with Bars() as watcher:
+            written = whole.redraw(chosen.redraw, chosen.into, watcher)
+        say_written(written)
         return 0
     folder: Path = chosen.out or Path("compare-all")
     items = parts_of_the_whole.chosen(chosen.only)

@@ -31,6 +31,7 @@ _NAMES = {
     "test_systems.fluid": ("Fluid",),
     "test_systems.lennard_jones": ("LennardJones",),
     "test_systems.openmm_engine": ("system_of",),
+    "test_systems.system": ("ASE_UNITS",),
     "test_systems.potential": ("Potential", "PotentialCalculator"),
     "study.machine": ("environment",),
     "study.study": ("work_off",),

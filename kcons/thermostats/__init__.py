@@ -23,10 +23,22 @@ from kcons.thermostats.monte_carlo.replica_exchange import exchange
 from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
 from kcons.thermostats.multistep import ForceGroups, IsokineticSpheres, LangevinRespa, evaluations_per_sample
 from kcons.thermostats.nose_hoover import NoseHooverChain
+from kcons.thermostats.pressure import (
+    CellRescaling,
+    CellSystem,
+    ConstantPressure,
+    MonteCarloBarostat,
+    PressureObserver,
+    find_pieces,
+    instantaneous_pressure,
+)
 from kcons.thermostats.temperature_split import SplitTemperatures, TemperatureSplit
 from kcons.thermostats.thermal_velocities import thermal_velocities
 
 __all__ = [
+    "CellRescaling",
+    "CellSystem",
+    "ConstantPressure",
     "Counts",
     "Estimate",
     "ForceGroups",
@@ -36,7 +48,9 @@ __all__ = [
     "IsokineticSpheres",
     "Langevin",
     "LangevinRespa",
+    "MonteCarloBarostat",
     "NoseHooverChain",
+    "PressureObserver",
     "SplitTemperatures",
     "TemperatureSplit",
     "Tuned",
@@ -45,7 +59,9 @@ __all__ = [
     "configurational_temperature",
     "evaluations_per_sample",
     "exchange",
+    "find_pieces",
     "freedom",
+    "instantaneous_pressure",
     "mean",
     "thermal_velocities",
     "tune",

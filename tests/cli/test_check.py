@@ -271,3 +271,25 @@ def test_advice_is_of_the_command(folder, tmp_path, capsys):
 
 
 # -- picture ----------------------------------------------------------------------------------------
+
+
+def test_temperatures_of_configurations(folder, capsys, monkeypatch):
+    """Asked for with forces: among the remarks, on the page and in the file."""
+    from kcons.comparison.averages import trajectory_temperatures
+    from kcons.thermostats import Estimate, SplitTemperatures
+
+    asked = []
+
+    def along(*where, **options):
+        asked.append((where[2], list(where[3]), options["constrain"]))
+        return SplitTemperatures(Estimate(0.0259, 0.0001), Estimate(0.0267, 0.0002), None, 60, 60, 0.1, 0.2, 5, ())
+
+    assert command(folder, "good.xtc", "--forces", "lj") == 2
+    assert "5 frames are too few for temperatures; give 32 or more" in capsys.readouterr().err
+    monkeypatch.setattr(trajectory_temperatures, "along", along)
+    assert command(folder, "good.xtc", "--forces", "lj") == 0
+    told = "shifts of whole clusters 300.6 ± 1.2 K, turns of whole clusters 309.8 ± 2.3 K"
+    assert told in " ".join(capsys.readouterr().out.split()) and asked == [("lj", [0, 1, 2, 3, 4], "none")]
+    assert any(told in line for line in json.loads((folder / "out-good.xtc" / "check.json").read_text())["remarks"])
+    assert command(folder, "good.xtc", "--forces", "lj", "--no-rigid-water") == 2
+    assert "--forces does not go with --no-rigid-water" in capsys.readouterr().err

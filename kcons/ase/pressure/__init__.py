@@ -2,8 +2,9 @@
 
 - `virial`: the stress of the constraint forces
 - `atoms_system`: atoms as a system whose cell can change
+- `reporter`: the pressure along a run
 """
 
-from kcons.ase.pressure.virial import constraint_virial, virial_of
+from kcons.ase.pressure.virial import virial_of
 
-__all__ = ["constraint_virial", "virial_of"]
+__all__ = ["virial_of"]

@@ -4,5 +4,6 @@
 - `layers`: systems with expensive and cheap forces
 - `long_steps`, `long_steps_report`: bias against evaluations of expensive forces
 - `step_zero`: averages at step zero
+- `trajectory_temperatures`: those of a trajectory of any engine
 - `report`: tables, plots and files
 """

@@ -50,6 +50,9 @@ class Panel:
         As matplotlib's `grid` takes it.
     legend : str
         Size of letters of a legend inside of the panel; '' for none.
+    direct : bool
+        Names beside the panel at the heights of the last points of curves, in their colours; not in a legend. Curves
+        of which no coordinate is `along` an edge and which have a line are named.
     """
 
     curves: Sequence[Curve]
@@ -60,6 +63,7 @@ class Panel:
     plain: str = ""
     grid: Mapping[str, Any] = field(default_factory=lambda: {"alpha": 0.3})
     legend: str = ""
+    direct: bool = False
 
 
 def draw(
@@ -92,7 +96,11 @@ def draw(
     grid = figure.subplots(len(panels), len(panels[0]), sharey=same_y, squeeze=False)
     for axes, panel in zip(grid.flat, (panel for row in panels for panel in row), strict=True):
         _fill(axes, panel)
+    last = panels[-1][-1]
+    named = {curve.label for curve in last.curves if last.direct and _is_line(curve)}
     handles, labels = grid.flat[-1].get_legend_handles_labels()
+    kept = [k for k, label in enumerate(labels) if label not in named]
+    handles, labels = [handles[k] for k in kept], [labels[k] for k in kept]
     if legend and handles:
         figure.legend(handles, labels, loc="outside lower center", ncols=legend, fontsize=8)
     if title:
@@ -124,6 +132,36 @@ def _fill(axes: Axes, panel: Panel) -> None:
         axes.set_title(right, fontsize=8, loc="right")
     if panel.legend and panel.curves:
         axes.legend(fontsize=panel.legend)
+    if panel.direct:
+        _name_directly(axes, [curve for curve in panel.curves if _is_line(curve)])
+
+
+def _is_line(curve: Curve) -> bool:
+    return bool(curve.label) and not curve.along and curve.style.get("zorder") != 0
+
+
+def _name_directly(axes: Axes, curves: Sequence[Curve], least: float = 0.062) -> None:
+    """Names to the right of a panel, as near to the heights of the last points as they do not cover each other."""
+    if not curves:
+        return
+    axes.autoscale_view()
+    to_panel = axes.transData + axes.transAxes.inverted()
+    ends = [to_panel.transform((curve.x[-1], curve.y[-1])) for curve in curves]
+    order = sorted(range(len(curves)), key=lambda k: ends[k][1])
+    height = -least / 2
+    heights = {}
+    for k in order:
+        height = max(height + least, float(ends[k][1]))
+        heights[k] = height
+    beyond = max(0.0, height - 1.0)
+    for place, k in enumerate(order):
+        at = max(heights[k] - beyond, place * least)
+        colour = curves[k].style.get("color", "black")
+        look = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.5, "shrinkA": 0, "shrinkB": 3}
+        axes.annotate(
+            curves[k].label, tuple(ends[k]), (1.03, at), "axes fraction", "axes fraction", color=colour, fontsize=8,
+            va="center", arrowprops=look,
+        )  # fmt: skip
 
 
 def say(axes: Axes, words: str) -> None:

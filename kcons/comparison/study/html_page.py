@@ -31,6 +31,30 @@ td.long { white-space: normal; min-width: 16rem; }
 tr.good td:first-child { border-left: 4px solid #2a9d4a; }
 tr.bad td:first-child { border-left: 4px solid #d0342c; }
 pre { white-space: pre-wrap; font-size: 0.8rem; }
+th { cursor: pointer; }
+details > summary { cursor: pointer; margin: 0.5rem 0; }
+"""
+
+#: A click on a heading sorts its table, by number where cells begin with one; another click turns the order round.
+SORTING = """
+document.addEventListener("click", event => {
+  const head = event.target.closest("th");
+  if (!head) return;
+  const body = head.closest("table").tBodies[0], column = head.cellIndex;
+  const down = head.dataset.order === "up";
+  head.dataset.order = down ? "down" : "up";
+  const value = row => {
+    const text = row.cells[column].textContent.trim();
+    const number = parseFloat(text.replaceAll(",", ""));
+    return Number.isNaN(number) ? text : number;
+  };
+  const rows = [...body.rows].sort((a, b) => {
+    const [x, y] = [value(a), value(b)];
+    if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;
+    return (x < y ? -1 : x > y ? 1 : 0) * (down ? -1 : 1);
+  });
+  body.append(...rows);
+});
 """
 
 #: Cells with more characters than this may be broken into lines.
@@ -39,16 +63,23 @@ LONG = 40
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, and under it paragraphs, pictures and tables in this order; `literal` is set as it is."""
+    """A heading, and under it paragraphs, pictures and tables in this order; `literal` is set as it is.
+
+    `diagram` is HTML that is put before the pictures; `folded` tables are shown after a click.
+    """
 
     heading: str
     paragraphs: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
     literal: str = ""
+    diagram: str = ""
+    folded: bool = False
 
 
-def write(path: Path, title: str, sections: Sequence[Section], *, introduction: Sequence[str] = ()) -> Path:
+def write(
+    path: Path, title: str, sections: Sequence[Section], *, introduction: Sequence[str] = (), head: str = ""
+) -> Path:
     """Write the page.
 
     Parameters
@@ -59,6 +90,8 @@ def write(path: Path, title: str, sections: Sequence[Section], *, introduction: 
         Listed with links at the top.
     introduction : sequence of str
         Paragraphs before the list.
+    head : str
+        What diagrams need: HTML.
 
     Returns
     -------
@@ -69,7 +102,8 @@ def write(path: Path, title: str, sections: Sequence[Section], *, introduction: 
     path.write_text(
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<link rel="icon" href="data:,"><title>{escape(title)}</title><style>{STYLE}</style></head>\n'
+        f'<link rel="icon" href="data:,"><title>{escape(title)}</title><style>{STYLE}</style>'
+        f"<script>{SORTING}</script>{head}</head>\n"
         f"<body><h1>{escape(title)}</h1>{_paragraphs(introduction)}<nav><ol>{links}</ol></nav>\n{body}</body></html>\n",
         encoding="utf-8",
     )
@@ -83,9 +117,12 @@ def _section(number: int, section: Section) -> str:
     )
     literal = f"<pre>{escape(section.literal)}</pre>" if section.literal else ""
     tables = "".join(_table(table) for table in section.tables)
+    if section.folded and tables:
+        tables = f"<details><summary>All measurements</summary>{tables}{literal}</details>"
+        literal = ""
     return (
         f'<section><h2 id="s{number}">{escape(section.heading)}</h2>'
-        f"{_paragraphs(section.paragraphs)}{pictures}{tables}{literal}</section>\n"
+        f"{_paragraphs(section.paragraphs)}{section.diagram}{pictures}{tables}{literal}</section>\n"
     )
 
 

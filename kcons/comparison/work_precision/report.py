@@ -14,6 +14,7 @@ from kcons.comparison.methods.methods import METHODS
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw, say
 from kcons.comparison.study.tables import Table, duration, footnotes, numbered, verdict
+from kcons.comparison.work_precision.chosen_curves import MOST, Chosen, chosen
 from kcons.comparison.work_precision.fronts import ARRAYS, EVERY_MD_ENGINE, Cost, Standing, cost_of
 from kcons.comparison.work_precision.fronts import verdict as judge
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
@@ -198,27 +199,31 @@ def plot(comparison: Comparison, path: Path) -> None:
     figure(comparison).savefig(path, dpi=150)
 
 
-def figure(comparison: Comparison) -> Figure:
-    """Error against force evaluations and wall time, all axes logarithmic, the fronts of each MD engine marked."""
+def figure(comparison: Comparison, most: int = MOST) -> Figure:
+    """Error against force evaluations and wall time, all axes logarithmic, the fronts of each MD engine marked.
+
+    At most so many curves are shown; methods that coincide are one.
+    """
     units, environment = comparison.scene["units"], comparison.environment
     standings = judge(comparison).standings
-    names = len({m.method for m in comparison.measurements})
+    shown = chosen(comparison, most)
     grid = {"which": "major", "linewidth": 0.5, "alpha": 0.5}
     left = Panel(
-        _errors(comparison, standings, "evaluations"),
+        _errors(comparison, shown, standings, "evaluations"),
         f"force evaluations per simulated {units['long_time']}",
         f"rms error an atom at {comparison.scene['horizon']:g} {units['time']} / {units['length']}",
         plain="x",
         grid=grid,
     )
     right = Panel(
-        [*_errors(comparison, standings, "wall"), *_costs_without_error(comparison)],
+        [*_errors(comparison, shown, standings, "wall"), *_costs_without_error(comparison)],
         f"wall time per simulated {units['long_time']} / s",
         notes=("", f"{environment['cpu']}, 1 thread; {environment['date']}"),
         plain="x",
         grid=grid,
+        direct=True,
     )
-    size = (11, 5.0 + 0.22 * math.ceil(max(names, 3) / 3))
+    size = (12, 5.4)
     drawn = draw([[left, right]], size, title=comparison.scene["title"], same_y=True, legend=3)
     for axes in drawn.axes if not standings else ():
         say(axes, "no method reached the horizon")
@@ -244,18 +249,18 @@ BAND: Mapping[str, Any] = {
 }
 
 
-def _errors(comparison: Comparison, standings: Sequence[Standing], cost: Cost) -> list[Curve]:
+def _errors(comparison: Comparison, shown: Sequence[Chosen], standings: Sequence[Standing], cost: Cost) -> list[Curve]:
     """Error against a cost: a curve for each method, and a broad pale band along the front of each MD engine."""
     found = []
-    for name in dict.fromkeys(m.method for m in comparison.measurements):
-        colour, marker = style(name)
-        done = [m for m in comparison.of(name) if m.error and math.isfinite(m.error) and cost_of(m, cost) > 0]
+    for curve in shown:
+        colour, marker = style(curve.method)
+        done = [m for m in curve.points if cost_of(m, cost) > 0]
         if done:
-            # Where two methods do the same, both stay visible.
-            plain = name == "rattle"
+            # Where two methods do nearly the same, both stay visible.
+            plain = curve.method == "rattle"
             face, size = (colour, 6) if plain else ("none", 9)
             look: dict[str, Any] = {"color": colour, "marker": marker, "markerfacecolor": face, "markersize": size}
-            found.append(_curve(done, cost, done[0].title, {**look, "markeredgewidth": 1.6}))
+            found.append(_curve(done, cost, curve.name, {**look, "markeredgewidth": 1.6}))
     if _reference_in_sight(comparison):
         at = comparison.reference["error"]
         found.append(Curve([0, 1], [at, at], style={"color": "black", "linewidth": 0.8, "linestyle": ":"}, along="y"))

@@ -239,7 +239,7 @@ def unpacked(data: dict[str, Any]) -> dict[str, Any]:
     return {**data, "comparison": comparison}
 
 
-def redraw(folder: Path, into: Path | None = None) -> list[Path]:
+def redraw(folder: Path, into: Path | None = None, watcher: Watcher | None = None) -> list[Path]:
     """Pictures, tables and the page from the numbers in a folder; the table of winners goes `into` a page, too.
 
     Raises
@@ -250,9 +250,15 @@ def redraw(folder: Path, into: Path | None = None) -> list[Path]:
     found = parts(folder)
     if not found:
         raise InputError(f"there are no results of kcons compare --all in {folder}", item="redraw")
-    made = [path for part in found for path in whole_page.write_part(folder, part)]
-    filled = [] if into is None else whole_page.fill(into, found)
-    return [_page(folder), *made, *filled]
+    made: list[Path] = []
+    watching = watcher or Watcher()
+    with watching.piece("drawing", len(found) + 2):
+        for done, part in enumerate(found, 1):
+            made += whole_page.write_part(folder, part)
+            watching.advance(done)
+        filled = [] if into is None else whole_page.fill(into, found)
+        watching.advance(len(found) + 1)
+        return [_page(folder), *made, *filled]
 
 
 def parts(folder: Path) -> list[whole_page.Part]:

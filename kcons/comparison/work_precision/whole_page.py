@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from kcons.comparison.study import html_page
 from kcons.comparison.study.html_page import Section
 from kcons.comparison.study.tables import Table, duration, markdown, plain_text
-from kcons.comparison.work_precision import report
+from kcons.comparison.work_precision import interactive, report
 from kcons.comparison.work_precision.fronts import (
     COSTS,
     EVERY_MD_ENGINE,
@@ -67,12 +67,49 @@ class Part:
 def write(path: Path, parts: Sequence[Part]) -> Path:
     """The page of all parts."""
     sentences, close = _lost_and_won(parts)
+    compared = {part.key: part.comparison for part in parts if part.comparison is not None}
+    drawn = interactive.diagrams(compared)
+    gains = [picture] if (picture := gain_picture(parts)) is not None else []
     sections = [
+        Section("Who wins where", sentences[:1], gains, [winners(parts).of(SHORT)]),
+        Section("What these words mean, and close calls", [WINNERS_NOTE, *sentences[1:], *close]),
+        *(_section(part, drawn.get(part.key, "")) for part in parts),
         Section("Where and with what", tables=[_machines(parts)]),
-        Section("Who wins where", [WINNERS_NOTE, *sentences, *close], tables=[winners(parts)]),
-        *(_section(part) for part in parts),
     ]
-    return html_page.write(path, TITLE, sections, introduction=INTRODUCTION)
+    return html_page.write(path, TITLE, sections, introduction=INTRODUCTION, head=interactive.head())
+
+
+#: Of the picture of gains: colour and marker of each MD engine.
+ENGINES = {"arrays": ("#0072B2", "o"), "ASE": ("#D55E00", "^"), "OpenMM": ("#009E73", "s")}
+
+
+def gain_picture(parts: Sequence[Part]) -> Figure | None:
+    """Gains by test system and MD engine; None where nothing was compared."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [
+        (part.heading, [row for row in summary(part.comparison) if row["rivals"] and row["gain"]])
+        for part in parts
+        if part.comparison is not None
+    ]
+    rows = [(heading, found) for heading, found in rows if found]
+    if not rows:
+        return None
+    drawn = Figure(figsize=(8.5, 1.3 + 0.27 * len(rows)), layout="constrained")
+    FigureCanvasAgg(drawn)
+    axes = drawn.subplots()
+    for engine, (colour, marker) in ENGINES.items():
+        at = [(row["gain"], k) for k, (_, found) in enumerate(rows) for row in found if row["md_engine"] == engine]
+        if at:
+            axes.plot(*zip(*at, strict=True), linestyle="none", color=colour, marker=marker, label=engine, markersize=7)
+    axes.axvline(1.0, color="black", linewidth=0.8)
+    axes.set(xscale="log", xlabel="how many times cheaper kcons is than the cheapest other method, at the same error")
+    axes.set_yticks(range(len(rows)), [heading for heading, _ in rows], fontsize=9)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.grid(True, axis="both", linewidth=0.4, alpha=0.5)
+    axes.legend(title="MD engine", loc="best")
+    return drawn
 
 
 def write_part(folder: Path, part: Part) -> list[Path]:
@@ -97,15 +134,19 @@ def shown(part: Part) -> tuple[Figure | None, Table | None, str]:
     return None, None, ""
 
 
-def _section(part: Part) -> Section:
+def _section(part: Part, diagram: str = "") -> Section:
     for word in ("not run", "failed"):
         if word in part.data:
             return Section(part.heading, [f"{word}: {part.data[word]}"])
+    if diagram and part.comparison is not None:
+        found = part.comparison
+        measured = report.page_table(found)
+        return Section(part.heading, _notes(found), [], [measured], report.explanation(found), diagram, folded=True)
     figure, table, text = shown(part)
     if figure is None or table is None:
         return Section(part.heading, ["this version of kcons cannot show it"])
     notes = [] if part.comparison is None else _notes(part.comparison)
-    return Section(part.heading, notes, [figure], [table], text)
+    return Section(part.heading, notes, [figure], [table], text, folded=True)
 
 
 def _notes(found: Comparison) -> list[str]:
@@ -138,8 +179,8 @@ def _notes(found: Comparison) -> list[str]:
 
 
 def _machines(parts: Sequence[Part]) -> Table:
-    """Every machine, version and commit that measured a part, as a rule one."""
-    rows: dict[tuple[str, ...], list[str]] = {}
+    """Every machine with its versions that measured a part, as a rule one; all commits of one machine in one row."""
+    rows: dict[tuple[str, ...], tuple[list[str], list[str]]] = {}
     for part in parts:
         environment = part.data.get("environment")
         if environment is None:
@@ -148,10 +189,15 @@ def _machines(parts: Sequence[Part]) -> Table:
         processor = f"{environment['cpu']}, {environment['cores']} cores, {environment['threads']} thread used"
         what = "quick" if part.data["key"]["quick"] else "full"
         commit = environment["commit"] or "not from a repository"
-        row = (processor, f"{environment['system']}, Python {environment['python']}", versions, commit, what)
-        rows.setdefault(row, []).append(environment["date"])
+        row = (processor, f"{environment['system']}, Python {environment['python']}", versions, what)
+        commits, dates = rows.setdefault(row, ([], []))
+        commits.append(commit)
+        dates.append(environment["date"])
     headings = ["processor", "system", "versions", "commit", "run", "parts", "from", "to"]
-    cells = [[*row, str(len(dates)), min(dates), max(dates)] for row, dates in rows.items()]
+    cells = [
+        [*row[:3], ", ".join(dict.fromkeys(commits)), row[3], str(len(dates)), min(dates), max(dates)]
+        for row, (commits, dates) in rows.items()
+    ]
     return Table(headings, cells, words=(0, 1, 2, 3, 4, 6, 7))
 
 
@@ -198,6 +244,8 @@ def winners(parts: Sequence[Part]) -> Table:
     return Table(headings, rows, words=(0, 1, 2, 6, 7, 8, 9, 10), marks=marks)
 
 
+#: The picture of gains there.
+WINNERS_PICTURE = "who-wins-where.png"
 #: Where `fill` writes in a page of the documentation, and the parts whose figures it shows.
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
 PICTURES = (
@@ -223,6 +271,12 @@ def fill(path: Path, parts: Sequence[Part]) -> list[Path]:
     (path.parent / "figures").mkdir(exist_ok=True)
     written = [path]
     pictures = []
+    gains = gain_picture(parts)
+    if gains is not None:
+        target = path.parent / "figures" / WINNERS_PICTURE
+        gains.savefig(target, dpi=100)
+        pictures.append(f"![Who wins where](figures/{target.name})")
+        written.append(target)
     for part in parts:
         figure = shown(part)[0] if part.key in PICTURES else None
         if figure is not None:

@@ -247,7 +247,8 @@ class Barostat:
     def _log_chance(self, pieces: Pieces, before: Place, after: Place, trial: Trial, thermal_energy: float) -> float:
         """ln of the ratio of the distribution at the two places."""
         rise = after.energy - before.energy + self.pressure * (after.volume - before.volume)
-        rise -= self.tension * (after.area - before.area)
+        if self.tension:
+            rise -= self.tension * (after.area - before.area)
         return -rise / thermal_energy + self.strains.log_measure(trial.e, pieces.moving)
 
     def _modes(self, variables: FloatArray | None) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from kcons.comparison.study.curves import Curve, Panel, draw, say
@@ -54,3 +56,24 @@ def test_legends_inside_and_empty_panels():
     say(second, "nothing")
     assert [text.get_text() for text in second.texts] == ["nothing"]
     figure.draw_without_rendering()
+
+
+def test_names_beside_the_panel_do_not_cover_each_other():
+    """In the order of the last points, apart, in the colours of their curves; the legend has what is no curve."""
+    curves = [Curve([1, 10], [1.0, 1e-3 * (1 + k / 50)], f"c{k}", {"color": f"C{k}"}) for k in range(5)]
+    edge = Curve([2.0], [0.03], "costs", {"linestyle": "none", "marker": "x"}, along="x")
+    figure = draw([[Panel([*curves, edge], direct=True)]], (6, 3), legend=2)
+    (axes,) = figure.axes
+    heights = [text.xyann[1] for text in axes.texts]
+    assert [text.get_text() for text in axes.texts] == ["c0", "c1", "c2", "c3", "c4"]
+    assert all(after - before > 0.06 for before, after in pairwise(heights))
+    assert [text.get_color() for text in axes.texts] == [f"C{k}" for k in range(5)]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["costs"]
+
+
+def test_names_at_the_top_stay_inside():
+    curves = [Curve([1, 10], [1e-3, 1.0], f"c{k}") for k in range(8)]
+    figure = draw([[Panel(curves, direct=True)]], (6, 3))
+    heights = [text.xyann[1] for text in figure.axes[0].texts]
+    assert max(heights) <= 1.0 + 1e-9 and min(heights) >= 0.0

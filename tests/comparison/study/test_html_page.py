@@ -65,3 +65,13 @@ def test_a_row_of_the_wrong_length_of_marks_is_an_error(tmp_path):
     table = Table(["a"], [["1"], ["2"]], marks=["good"])
     with pytest.raises(ValueError):
         html_page.write(tmp_path / "p.html", "t", [html_page.Section("s", tables=[table])])
+
+
+def test_folded_tables_diagrams_and_sorting(tmp_path):
+    table = Table(["method"], [["a"]])
+    section = html_page.Section("S", tables=[table], literal="why", diagram='<div class="diagram"></div>', folded=True)
+    page = html_page.write(tmp_path / "p.html", "T", [section], head="<style>.x{}</style>").read_text()
+    assert (
+        page.index('<div class="diagram">') < page.index("<details>") < page.index("<table>") < page.index("</details>")
+    )
+    assert page.count("why") == 1 and "<style>.x{}</style></head>" in page and 'closest("th")' in page

@@ -169,7 +169,10 @@ def test_plot_has_both_panels_with_units():
     assert list(curves["kcons RATTLE"].get_xdata()) == [500.0, 1000.0]
     assert list(curves["kcons RATTLE"].get_ydata()) == [1.25e-3, 3.126e-4]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "scipy" in labels
+    # Curves are named beside the panel, in their colours; what is no curve stands in the legend.
+    names = {text.get_text(): text.get_color() for text in right.texts}
+    assert set(names) == {"kcons RATTLE", "scipy"} and not set(names) & set(labels)
+    assert names["kcons RATTLE"] == curves["kcons RATTLE"].get_color()
     assert any(label.startswith("baseline") for label in labels)
     assert any("stopped for the budget" in label for label in labels)
     # Methods differ in colour and marker.

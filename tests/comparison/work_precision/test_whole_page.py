@@ -28,9 +28,10 @@ def test_page_is_one_file_with_everything(finished):
     source = (finished / "index.html").read_text(encoding="utf-8")
     page.feed(source)
     assert page.addresses and all(address.startswith(("#", "data:")) for address in page.addresses)
-    assert not {"script", "iframe", "object", "embed", "form"} & set(page.tags)
+    assert not {"iframe", "object", "embed", "form"} & set(page.tags)
+    assert "fetch(" not in source and "XMLHttpRequest" not in source and "import(" not in source
     assert "url(" not in source and "@import" not in source
-    assert page.tags.count("img") == 2
+    assert page.tags.count("img") == 1 and page.tags.count("details") == 2
     for text in ("Who wins where", "Chain of 3 bonds", "Spheres", "A later test system", "not run: this version"):
         assert text in page.text
     environment = whole.read(finished, "sphere")["environment"]
@@ -93,7 +94,11 @@ def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, 
     page = tmp_path / "page.md"
     page.write_text(f"head\n{whole_page.BEGIN}\nold\n{whole_page.END}\ntail\n")
     parts_of_the_whole = whole.parts(finished)
-    assert whole_page.fill(page, parts_of_the_whole) == [page, tmp_path / "figures" / "report-sphere.png"]
+    assert whole_page.fill(page, parts_of_the_whole) == [
+        page,
+        tmp_path / "figures" / whole_page.WINNERS_PICTURE,
+        tmp_path / "figures" / "report-sphere.png",
+    ]
     first = page.read_text(encoding="utf-8")
     assert first.startswith("head\n") and first.endswith("\ntail\n") and "old" not in first
     assert "| test system | MD engine | decided by |" in first and "![Spheres](figures/report-sphere.png)" in first
@@ -103,3 +108,25 @@ def test_a_page_is_filled_between_its_marks_again_and_again(finished, tmp_path, 
     page.write_text("no marks")
     with pytest.raises(InputError, match="no place for results"):
         whole_page.fill(page, parts_of_the_whole)
+
+
+def test_the_page_opens_with_who_wins_where(finished):
+    page = Page()
+    page.feed((finished / "index.html").read_text(encoding="utf-8"))
+    source = (finished / "index.html").read_text(encoding="utf-8")
+    first = source.index("<section>")
+    assert source.index("Who wins where</h2>") < source.index("<img", first) < source.index("<table", first)
+    assert source.index("Where and with what</h2>") > source.index("Spheres</h2>")
+    assert source.count('class="diagram"') == 2 and len(source) < 6e6
+
+
+def test_commits_of_one_machine_are_one_row(finished):
+    parts = whole.parts(finished)
+    two = [dataclasses.replace(part, data=copy.deepcopy(part.data)) for part in parts]
+    measured = [part for part in two if "environment" in part.data]
+    assert len(whole_page._machines(two).rows) == 1
+    measured[1].data["environment"]["commit"] = "another"
+    table = whole_page._machines(two)
+    assert len(table.rows) == 1 and ", another" in table.rows[0][3]
+    measured[1].data["environment"]["cpu"] = "another processor"
+    assert len(whole_page._machines(two).rows) == 2

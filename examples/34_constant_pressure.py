@@ -1,0 +1,525 @@
+"""Constant pressure on constraints: fluids of rigid molecules, rigid water, a molecular crystal and a slab.
+
+python examples/34_constant_pressure.py                 short runs
+python examples/34_constant_pressure.py --full          those of docs/constant_pressure.md: an hour
+python examples/34_constant_pressure.py --full NAME...  some of them
+
+Fluids are in reduced units, of molecules with Lennard-Jones sites: dumbbells, and methane held by all its ten
+distances, of which nine are independent. Water is TIP3P with a reaction field, by OpenMM as a force engine.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from ase import units
+from ase.build import fcc100
+from ase.calculators.emt import EMT
+
+from kcons import ConstraintSet
+from kcons.ase import ConstrainedLangevin, constrain, draw_velocities
+from kcons.comparison import environment, json_files
+from kcons.constraints import Distance, Plane
+from kcons.motion import Motion
+from kcons.steppers import run
+from kcons.thermostats import (
+    CellRescaling,
+    CellSystem,
+    ConstantPressure,
+    Isokinetic,
+    Langevin,
+    MonteCarloBarostat,
+    NoseHooverChain,
+    thermal_velocities,
+)
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results" / "constant_pressure.json"
+
+# -- fluids of rigid molecules --------------------------------------------------------------------------------------
+
+CUTOFF = 2.0
+DUMBBELL = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+#: Shape, molecules, first side of the box, depth of the potential, temperature, pressure.
+FLUIDS = {
+    "dumbbells": (DUMBBELL, 32, 8.6, 1.0, 2.0, 1.0),
+    "methane, 10 distances of rank 9": (METHANE, 20, 9.6, 0.3, 2.0, 0.5),
+}
+
+
+@numba.njit
+def sites(x, h, size, depth, cutoff):  # type: ignore[no-untyped-def]
+    """Energy, forces and virial of sites of different molecules, cut off smoothly, in a box of side lengths h."""
+    n = len(x)
+    forces, virial, energy = np.zeros((n, 3)), np.zeros((3, 3)), 0.0
+    s6 = cutoff**-6
+    last, slope = 4 * depth * (s6 * s6 - s6), -24 * depth * (2 * s6 * s6 - s6) / cutoff
+    d = np.empty(3)
+    for i in range(n):
+        for j in range((i // size + 1) * size, n):
+            r2 = 0.0
+            for k in range(3):
+                d[k] = x[i, k] - x[j, k]
+                d[k] -= h[k] * np.rint(d[k] / h[k])
+                r2 += d[k] * d[k]
+            if r2 >= cutoff * cutoff:
+                continue
+            r = np.sqrt(r2)
+            s6 = r2**-3
+            energy += 4 * depth * (s6 * s6 - s6) - last - slope * (r - cutoff)
+            push = (24 * depth * (2 * s6 * s6 - s6) / r + slope) / r
+            for k in range(3):
+                forces[i, k] += push * d[k]
+                forces[j, k] -= push * d[k]
+                for m in range(3):
+                    virial[k, m] += push * d[k] * d[m]
+    return energy, forces, virial
+
+
+class Sites:
+    """Energy, forces and stress of `sites`, as functions of positions, time and cell."""
+
+    def __init__(self, size: int, depth: float) -> None:
+        self.size, self.depth = size, depth
+        self._known: tuple[bytes, Any] = (b"", None)
+
+    def _found(self, x, h):
+        # An energy and forces at one place are one evaluation.
+        key = x.tobytes() + h.tobytes()
+        if key != self._known[0]:
+            self._known = key, sites(np.ascontiguousarray(x), np.diag(h).copy(), self.size, self.depth, CUTOFF)
+        return self._known[1]
+
+    def force(self, x, t, h):
+        return self._found(x, h)[1]
+
+    def potential(self, x, t, h):
+        return self._found(x, h)[0]
+
+    def stress(self, x, t, h):
+        return -self._found(x, h)[2] / np.linalg.det(h)
+
+
+def fluid(name: str, seed: int) -> tuple[CellSystem, np.ndarray]:
+    """Molecules on a simple lattice, turned at random."""
+    shape, n, side, depth, _, _ = FLUIDS[name]
+    rng, m = np.random.default_rng(seed), len(shape)
+    k = int(np.ceil(n ** (1 / 3)))
+    places = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), -1).reshape(-1, 3)[:n] * (side / k)
+    turned = (shape - shape.mean(0)) @ np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
+    x = (places[:, None] + turned).reshape(-1, 3)
+    pairs = np.array([(i, j) for i in range(m) for j in range(i + 1, m)])
+    lengths = np.linalg.norm(shape[pairs[:, 0]] - shape[pairs[:, 1]], axis=1)
+    rows = Distance((pairs + m * np.arange(n)[:, None, None]).reshape(-1, 2), np.tile(lengths, n))
+    masses = np.tile(1.0 + np.arange(m) % 2, n)
+    held = ConstraintSet(rows, x, masses, cell=np.full(3, side))
+    forces = Sites(m, depth)
+    return CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress), x
+
+
+def run_fluid(
+    name: str, barostat: str, thermostat: str, steps: int, *, hotter: float = 1.0, denser: float = 1.0, seed: int = 1
+) -> dict[str, Any]:
+    """Volumes and energies, one in ten steps, the first tenth left out."""
+    _, n, _, _, temperature, pressure = FLUIDS[name]
+    temperature, pressure = temperature * hotter, pressure * denser
+    system, x = fluid(name, seed)
+    steppers = {
+        "Langevin": partial(Langevin, temperature, 1.0, seed),
+        "Nose-Hoover": partial(NoseHooverChain, temperature, period=1.0, momentum="conserved"),
+        "isokinetic": partial(Isokinetic, temperature, momentum="conserved"),
+    }
+    presses = {
+        "Monte Carlo": partial(MonteCarloBarostat, pressure),
+        "rescaling": partial(CellRescaling, pressure, 0.5, 1.0),
+    }
+    press = presses[barostat](every=10, seed=seed, cutoff=CUTOFF)
+    stepper = ConstantPressure(steppers[thermostat](), press)
+    zero = thermostat != "Langevin"
+    state = system.initial_state(x, thermal_velocities(system, x, temperature, seed, zero_momentum=zero))
+    # Sites may overlap at first.
+    state = run(system, state, 0.0005, 2000, stepper=ConstantPressure(Langevin(temperature, 5.0, seed), press))
+    v = thermal_velocities(system, state.positions, temperature, seed, zero_momentum=zero)
+    state = stepper.start(system, system.initial_state(state.positions, v))
+    volumes, energies = [], []
+
+    def note(seen):
+        volumes.append(float(np.linalg.det(seen.cell)))
+        energies.append(float(system.potential(seen.positions, 0.0)))
+
+    state = run(system, state, 0.004, steps, stepper=stepper, observers=[note], every=10)
+    first = len(volumes) // 10
+    return {
+        "fluid": name,
+        "barostat": barostat,
+        "thermostat": thermostat,
+        "temperature": temperature,
+        "pressure": pressure,
+        "steps": steps,
+        "molecules": n,
+        "acceptance": float(press.acceptance(state)[0]),
+        "volumes": volumes[first:],
+        "energies": energies[first:],
+    }
+
+
+# -- statistics -----------------------------------------------------------------------------------------------------
+
+
+def correlation_time(values: np.ndarray) -> float:
+    """Integrated, in samples."""
+    d = values - values.mean()
+    n = len(d)
+    rho = np.fft.irfft(np.abs(np.fft.rfft(d, 2 * n)) ** 2)[:n] / np.arange(n, 0, -1)
+    rho /= rho[0]
+    total = 1.0
+    for k in range(1, n):
+        total += 2 * rho[k]
+        if k > 6 * total:
+            break
+    return max(total, 1.0)
+
+
+def mean_and_error(values: Any) -> tuple[float, float]:
+    values = np.asarray(values)
+    return float(values.mean()), float(values.std() * np.sqrt(correlation_time(values) / len(values)))
+
+
+def compressed(volumes: Any) -> tuple[float, float]:
+    """<dV^2>/<V>, and its error from that of the squares."""
+    volumes = np.asarray(volumes)
+    squares = (volumes - volumes.mean()) ** 2
+    mean, error = mean_and_error(squares)
+    return mean / float(volumes.mean()), error / float(volumes.mean())
+
+
+def slope(one: dict[str, Any], two: dict[str, Any]) -> tuple[float, float, float]:
+    """ln of the ratio of two distributions along H = U + P V or V: the slope found, its error, and the exact one.
+
+    The estimate of greatest likelihood (Shirts, J. Chem. Theory Comput. 9, 909 (2013)); for two pressures along V, for
+    two temperatures along the enthalpy. Samples are thinned to independent ones.
+    """
+    if one["temperature"] == two["temperature"]:
+        values = [np.array(found["volumes"]) for found in (one, two)]
+        exact = -(two["pressure"] - one["pressure"]) / one["temperature"]
+    else:
+        values = [np.array(f["energies"]) + f["pressure"] * np.array(f["volumes"]) for f in (one, two)]
+        exact = 1 / one["temperature"] - 1 / two["temperature"]
+    values = [v[:: int(np.ceil(correlation_time(v)))] for v in values]
+    x = np.concatenate(values)
+    side = np.repeat([0.0, 1.0], [len(v) for v in values])
+    design = np.stack([np.ones_like(x), x - x.mean()], axis=1)
+    beta = np.zeros(2)
+    for _ in range(50):
+        p = 1 / (1 + np.exp(-design @ beta))
+        hessian = design.T @ (design * (p * (1 - p))[:, None])
+        beta += np.linalg.solve(hessian, design.T @ (side - p))
+    return float(beta[1]), float(np.sqrt(np.linalg.inv(hessian)[1, 1])), exact
+
+
+# -- rigid water ----------------------------------------------------------------------------------------------------
+
+WATERS, TEMPERATURE, BAR = 64, 300.0, units.bar
+
+
+def water_system(waters: int = WATERS, cutoff: float = 0.55) -> Any:
+    """TIP3P with a reaction field in OpenMM; positions on a lattice, and the side of the box."""
+    import openmm
+
+    edge = round(waters ** (1 / 3))
+    side = 3.13 * edge
+    system, force, rng, x = openmm.System(), openmm.NonbondedForce(), np.random.default_rng(1), []
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(cutoff)
+    force.setUseDispersionCorrection(False)
+    half = np.radians(104.52 / 2)
+    shape = 0.9572 * np.array([[0, 0, 0], [np.cos(half), np.sin(half), 0], [np.cos(half), -np.sin(half), 0]])
+    for place in np.ndindex(edge, edge, edge):
+        first = system.getNumParticles()
+        for mass, charge, sigma, depth in (
+            (15.9994, -0.834, 0.315061, 0.1521 * 4.184),
+            *[(1.008, 0.417, 1.0, 0.0)] * 2,
+        ):
+            system.addParticle(mass)
+            force.addParticle(charge, sigma, depth)
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            system.addConstraint(first + a, first + b, 0.1 * float(np.linalg.norm(shape[a] - shape[b])))
+            force.addException(first + a, first + b, 0.0, 1.0, 0.0)
+        x.extend(shape @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + 3.13 * np.array(place))
+    system.addForce(force)
+    system.setDefaultPeriodicBoxVectors(*(0.1 * side * np.eye(3)))
+    return system, np.array(x), side
+
+
+def minimised(system: Any, x: np.ndarray) -> np.ndarray:
+    """Positions on their constraints without overlaps."""
+    import openmm
+
+    context = openmm.Context(system, openmm.VerletIntegrator(0.001), openmm.Platform.getPlatformByName("Reference"))
+    context.setPositions(0.1 * x)
+    openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
+    return 10 * np.array(context.getState(positions=True).getPositions(asNumpy=True)._value)
+
+
+class Engine:
+    """OpenMM as a force engine: energy, forces, and the stress of a change of volume by differences."""
+
+    def __init__(self, system: Any) -> None:
+        import openmm
+
+        platform = openmm.Platform.getPlatformByName("CPU")
+        self.context = openmm.Context(
+            system, openmm.VerletIntegrator(0.001), platform, {"Threads": "1", "DeterministicForces": "true"}
+        )
+        self._known: tuple[bytes, Any] = (b"", None)
+        self.calls = 0
+
+    def _found(self, x, h):
+        key = x.tobytes() + h.tobytes()
+        if key != self._known[0]:
+            self.calls += 1
+            self.context.setPeriodicBoxVectors(*(0.1 * h))
+            self.context.setPositions(0.1 * np.asarray(x))
+            state = self.context.getState(energy=True, forces=True)
+            energy = state.getPotentialEnergy()._value * units.kJ / units.mol
+            forces = state.getForces(asNumpy=True)._value * (0.1 * units.kJ / units.mol)
+            self._known = key, (energy, forces)
+        return self._known[1]
+
+    def force(self, x, t, h):
+        return self._found(x, h)[1]
+
+    def potential(self, x, t, h):
+        return self._found(x, h)[0]
+
+    def stress(self, x, t, h):
+        e = 1e-4
+        up, down = (self._found(s * x, s * h)[0] for s in (1 + e, 1 - e))
+        return (up - down) / (6 * e * np.linalg.det(h)) * np.eye(3)
+
+
+def run_water(barostat: str, thermostat: str, steps: int, every: int = 25, seed: int = 1) -> dict[str, Any]:
+    """Densities in g/cm3, one in 25 steps of 2 fs, the first 10 ps left out."""
+    system, x, side = water_system()
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+    density = masses.sum() / units.mol * 1e24
+    thermal, skip = units.kB * TEMPERATURE, 200
+    volumes = []
+    if barostat == "OpenMM":
+        import openmm
+
+        force = openmm.MonteCarloBarostat(1.0, TEMPERATURE, every)
+        force.setRandomNumberSeed(seed)
+        system.addForce(force)
+        integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 1.0, 0.002)
+        integrator.setRandomNumberSeed(seed)
+        platform = openmm.Platform.getPlatformByName("CPU")
+        context = openmm.Context(system, integrator, platform, {"Threads": "1"})
+        context.setPositions(0.1 * x)
+        openmm.LocalEnergyMinimizer.minimize(context, 10, 100)
+        context.setVelocitiesToTemperature(TEMPERATURE, seed)
+        for _ in range(steps // 25):
+            integrator.step(25)
+            volumes.append(1e3 * context.getState().getPeriodicBoxVolume()._value)
+        acceptance = None
+    else:
+        x = minimised(system, x)
+        rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+        for k in reversed(range(len(rows))):
+            system.removeConstraint(k)
+        held = ConstraintSet(
+            Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows]), x, masses, cell=np.full(3, side)
+        )
+        engine = Engine(system)
+        ours = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+        steppers = {
+            "Langevin": partial(Langevin, thermal, 0.001 / units.fs, seed),
+            "isokinetic": partial(Isokinetic, thermal, momentum="conserved"),
+        }
+        presses = {
+            "Monte Carlo": partial(MonteCarloBarostat, 1.0 * BAR),
+            "rescaling": partial(CellRescaling, 1.0 * BAR, 300 * units.fs, 5e-5 / BAR),
+        }
+        press = presses[barostat](every=every, seed=seed, cutoff=5.5)
+        v = thermal_velocities(ours, x, thermal, seed, zero_momentum=True)
+        stepper = ConstantPressure(steppers[thermostat](), press)
+        note = lambda state: volumes.append(float(np.linalg.det(state.cell)))  # noqa: E731
+        state = stepper.start(ours, ours.initial_state(x, v, project=True))
+        state = run(ours, state, 2 * units.fs, steps, stepper=stepper, observers=[note], every=25)
+        acceptance = float(press.acceptance(state)[0])
+    volumes = np.array(volumes[skip:])
+    kappa, error = compressed(volumes)
+    return {
+        "barostat": barostat,
+        "thermostat": thermostat,
+        "molecules": WATERS,
+        "every": every,
+        "picoseconds": steps * 0.002,
+        "acceptance": acceptance,
+        "density": mean_and_error(density / volumes),
+        "compressibility": [kappa / thermal * BAR, error / thermal * BAR],
+        "correlation_ps": correlation_time(volumes) * 0.05,
+    }
+
+
+# -- what a barostat costs --------------------------------------------------------------------------------------
+
+
+def cost(barostat: str, waters: int, turns: int) -> dict[str, Any]:
+    """Processor time of a step with a barostat over that of one without, at the default frequency, in turns."""
+    system, x, side = water_system(waters, 0.55 if waters == WATERS else 0.9)
+    x = minimised(system, x)
+    rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
+    for k in reversed(range(len(rows))):
+        system.removeConstraint(k)
+    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
+    held = ConstraintSet(
+        Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows]), x, masses, cell=np.full(3, side)
+    )
+    engine = Engine(system)
+    ours = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+    thermal = units.kB * TEMPERATURE
+    alone = Langevin(thermal, 0.001 / units.fs, 1)
+    press = MonteCarloBarostat(BAR) if barostat == "Monte Carlo" else CellRescaling(BAR, 300 * units.fs, 5e-5 / BAR)
+    both = ConstantPressure(alone, press)
+    plain = ours.initial_state(x, thermal_velocities(ours, x, thermal, 1), project=True)
+    plain = run(ours, plain, 2 * units.fs, 500, stepper=alone)
+    ratios = []
+    for _ in range(turns):
+        begun = time.process_time()
+        run(ours, plain, 2 * units.fs, 250, stepper=alone, check_every=0)
+        middle = time.process_time()
+        cell = ours.cell
+        run(ours, plain, 2 * units.fs, 250, stepper=both, check_every=0)
+        ratios.append((time.process_time() - middle) / (middle - begun))
+        ours.set_cell(cell, plain.positions)
+    return {"barostat": barostat, "molecules": waters, "turns": turns, "ratio": float(np.median(ratios))}
+
+
+# -- a molecular crystal, a slab ------------------------------------------------------------------------------------
+
+
+def crystal(steps: int) -> dict[str, Any]:
+    """Rigid diatomics as in alpha nitrogen, 108 of them; three lengths of the cell that change by themselves."""
+    basis = np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
+    axes = np.array([[1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    side, bond, thermal = 1.75, 0.33, 0.3
+    places = (np.array(list(np.ndindex(3, 3, 3)))[:, None] + basis).reshape(-1, 3) * side
+    turned = np.tile(axes, (27, 1)) * bond / 2
+    x = np.stack([places - turned, places + turned], axis=1).reshape(-1, 3)
+    held = ConstraintSet(Distance(np.arange(216).reshape(-1, 2)), x, np.ones(216), cell=np.full(3, 3 * side))
+    forces = Sites(2, 1.0)
+    system = CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress)
+    stepper = ConstantPressure(
+        Langevin(thermal, 1.0, 1), CellRescaling(0.5, 0.5, 0.01, kind="anisotropic", every=10, seed=1, cutoff=CUTOFF)
+    )
+    sides = []
+    state = system.initial_state(x, thermal_velocities(system, x, thermal, 1))
+    note = lambda seen: sides.append(np.diag(seen.cell) / 3)  # noqa: E731
+    run(system, stepper.start(system, state), 0.004, steps, stepper=stepper, observers=[note], every=10)
+    kept = np.array(sides)[len(sides) // 5 :]
+    return {"steps": steps, "sides": [mean_and_error(kept[:, k]) for k in range(3)]}
+
+
+def slab(steps: int) -> dict[str, Any]:
+    """Copper (100) by EMT, four layers in a cell without a third direction; the lowest layer slides in its plane."""
+    atoms = fcc100("Cu", (3, 3, 4), vacuum=None, orthogonal=True)
+    atoms.pbc = [True, True, False]
+    atoms.cell[2, 2] = 1.0
+    atoms.calc = EMT()
+    lowest = np.flatnonzero(atoms.positions[:, 2] < 0.1)
+    constrain(atoms, Plane(lowest, [0, 0, 1]))
+    draw_velocities(atoms, TEMPERATURE, 1)
+    flat = atoms.cell.lengths()[0] / 3
+    barostat = MonteCarloBarostat(0.0, kind="lateral", every=5, seed=1)
+    dynamics = ConstrainedLangevin(atoms, 3 * units.fs, TEMPERATURE, 0.01 / units.fs, rng=1, barostat=barostat)
+    sides: list[float] = []
+    dynamics.attach(lambda: sides.append(atoms.cell.lengths()[0] / 3), interval=5)
+    dynamics.run(steps)
+    heights = float(np.ptp(atoms.positions[lowest, 2]))
+    return {
+        "steps": steps,
+        "perfect": flat,
+        "side": mean_and_error(sides[len(sides) // 5 :]),
+        "spread of heights": heights,
+    }
+
+
+RUNS: dict[str, Any] = {
+    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 600_000, 10),
+    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10),
+    "water, rescaling": partial(run_water, "rescaling", "Langevin", 200_000),
+    "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 100_000),
+    **{
+        f"{name}, {b}, {t}": partial(run_fluid, name, b, t, 60_000)
+        for name in FLUIDS
+        for b, t in (("Monte Carlo", "Langevin"), ("rescaling", "Langevin"), ("rescaling", "isokinetic"))
+    },
+    "dumbbells, Monte Carlo, Nose-Hoover": partial(run_fluid, "dumbbells", "Monte Carlo", "Nose-Hoover", 60_000),
+    **{
+        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 60_000, **more, seed=2)
+        for b in ("Monte Carlo", "rescaling")
+        for what, more in (("denser", {"denser": 1.3}), ("hotter", {"hotter": 1.1}))
+    },
+    **{f"cost, {b}, {n} waters": partial(cost, b, n, 20) for b in ("Monte Carlo", "rescaling") for n in (WATERS, 216)},
+    "crystal": partial(crystal, 20_000),
+    "slab": partial(slab, 20_000),
+}
+
+
+def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Means and errors of what was run, with the slopes between pressures and temperatures."""
+    told: dict[str, Any] = {"format": "kcons constant pressure", "environment": environment(), "runs": {}}
+    told["slopes"] = []
+    for name, one in found.items():
+        rest = {key: value for key, value in one.items() if key not in ("volumes", "energies")}
+        if "volumes" in one:
+            kappa = compressed(one["volumes"])
+            rest["volume"], rest["energy"] = mean_and_error(one["volumes"]), mean_and_error(one["energies"])
+            rest["compressibility"] = [value / one["temperature"] for value in kappa]
+        told["runs"][name] = rest
+    for b in ("Monte Carlo", "rescaling"):
+        first = found.get(f"dumbbells, {b}, Langevin")
+        for what in ("denser", "hotter"):
+            other = found.get(f"dumbbells, {b}, Langevin, {what}")
+            if first and other:
+                value, error, exact = slope(first, other)
+                told["slopes"].append({"barostat": b, "to": what, "found": value, "error": error, "exact": exact})
+    return told
+
+
+def main(arguments: list[str]) -> None:
+    """Short runs of a few, or full ones."""
+    if "--full" in arguments:
+        names = [name for name in arguments if name in RUNS] or list(RUNS)
+        found = {}
+        for name in names:
+            found[name] = RUNS[name]()
+            print(name, {k: v for k, v in found[name].items() if k not in ("volumes", "energies")}, flush=True)
+        if len(names) == len(RUNS):
+            json_files.write(RESULTS, summary(found))
+        return
+    print("A fluid of 32 rigid dumbbells at kT = 2, P = 1 (reduced units):")
+    for barostat in ("Monte Carlo", "rescaling"):
+        one = run_fluid("dumbbells", barostat, "Langevin", 600)
+        volume, error = mean_and_error(one["volumes"])
+        print(
+            f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {one['acceptance']:.0%} of trials accepted"
+        )
+    short = crystal(100)
+    print("A crystal of rigid diatomics: sides", ", ".join(f"{side:.4f}" for side, _ in short["sides"]))
+    short = slab(60)
+    print(f"A copper slab at 300 K: {short['side'][0]:.4f} A from row to row, {short['perfect']:.4f} A at rest")
+    print("A step of water at constant pressure:")
+    lines = ConstantPressure(Langevin(0.026, 0.001, 1), MonteCarloBarostat(BAR)).listing().splitlines()
+    print("\n".join(f"  {line}" for line in lines))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

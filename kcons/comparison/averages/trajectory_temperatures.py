@@ -1,0 +1,80 @@
+"""Temperatures of configurations along a trajectory of any engine, with forces that the user names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase.units import kB
+
+from kcons.comparison.test_systems import any_file
+from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
+from kcons.errors import InputError, UnsupportedError
+from kcons.steppers import System
+from kcons.thermostats import Estimate, SplitTemperatures, TemperatureSplit
+
+#: Fewest frames.
+FEWEST = 32
+#: Change of the box, relative, above which the forces are those of another system.
+CHANGED = 1e-3
+
+
+def along(
+    trajectory: Path | str, topology: Path | str, forces: str, frames: Sequence[int], **options: Any
+) -> SplitTemperatures:
+    """Sample frames of a trajectory, each brought onto the constraints first, k_B T in eV.
+
+    Parameters
+    ----------
+    trajectory, topology : path
+        Any that MDAnalysis reads.
+    forces : str
+        As for `kcons compare FILE --forces`.
+    frames : sequence of int
+        Numbers of the frames.
+    **options
+        What `any_file.from_file` takes: constrain, select, rigid_residues, force_field, platform.
+
+    Raises
+    ------
+    InputError
+        Fewer than 32 frames; what `any_file.from_file` raises.
+    UnsupportedError
+        The box changes.
+    """
+    if len(frames) < FEWEST:
+        raise InputError(f"{len(frames)} frames are too few for temperatures; give {FEWEST} or more", item="frames")
+    test_system = any_file.from_file(topology, coordinates=trajectory, forces=forces, **options)
+    motion, potential, lattice = test_system.motion, test_system.potential, test_system.constraint_set.lattice
+    given = {name: value for name, value in options.items() if name not in ("force_field", "platform")}
+    bonds = any_file.plan(topology, coordinates=trajectory, angles="distances", **given).rows.snapshot.topology.bonds
+    tree = spanning_tree(bonds, len(test_system.positions))
+    split = TemperatureSplit(System(motion, potential.forces))
+    universe = any_file.read(topology, trajectory)
+    first = None
+    for number in frames:
+        ts = universe.trajectory[number]
+        box = None if ts.dimensions is None else np.array(ts.dimensions)
+        first = box if first is None else first
+        if box is not None and first is not None and not np.allclose(box, first, rtol=CHANGED):
+            raise UnsupportedError(
+                f"the box of frame {number} is another one than that of the first frame: its forces are not those of "
+                "this system. Temperatures of configurations need a run at constant volume"
+            )
+        x = make_whole(np.array(ts.positions, dtype=np.float64), *tree, lattice)
+        split.add(motion.restore_positions(x))
+    return split.result()
+
+
+def sentences(found: SplitTemperatures) -> list[str]:
+    """The same in kelvin, for a person."""
+    kinds: tuple[tuple[str, Estimate | None], ...] = (
+        ("shifts of whole clusters", found.shift),
+        ("turns of whole clusters", found.turn),
+        ("all other motions", found.internal),
+    )
+    told = [f"{what} {e.value / kB:.1f} ± {e.error / kB:.1f} K" for what, e in kinds if e is not None]
+    lines = [f"temperatures of the configurations, of {found.samples} frames: {', '.join(told)}"]
+    return [*lines, *found.left_out]

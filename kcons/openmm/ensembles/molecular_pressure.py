@@ -1,0 +1,116 @@
+"""The pressure of a Context, from energies of a cell a little larger and smaller."""
+
+from __future__ import annotations
+
+from typing import IO, Any
+
+import numpy as np
+import openmm
+from openmm import app, unit
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.openmm.quantities import masses_of
+
+#: kJ/mol/nm^3 in bar.
+BAR = 16.6053906717
+
+
+def molecular_pressure(context: openmm.Context, temperature: float | None = None, strain: float = 1e-3) -> float:
+    """Pressure in bar, of molecules as points: constraint forces within them have no part.
+
+    The molecules are those that OpenMM's barostats move: joined by bonds and constraints of the System, and by the
+    bonds of no strength that `kcons.openmm.hold` adds for its rows. The state of the Context is as it was afterwards,
+    but for rounding of the energy's derivative in single precision.
+
+    Parameters
+    ----------
+    context : openmm.Context
+        Of a periodic System.
+    temperature : float, optional
+        In kelvin, for N kT/V instead of the present kinetic energy of the centres: the same mean, with less noise.
+    strain : float
+        Change of all lengths.
+
+    Raises
+    ------
+    InputError
+        The System is not periodic.
+    """
+    system = context.getSystem()
+    if not system.usesPeriodicBoundaryConditions():
+        raise InputError("a System without periodic boundaries has no pressure", item="context")
+    state = context.getState(positions=True, velocities=True)
+    x, v = (np.array(a._value) for a in (state.getPositions(asNumpy=True), state.getVelocities(asNumpy=True)))
+    box = np.array([row._value for row in state.getPeriodicBoxVectors()])
+    volume = float(np.linalg.det(box))
+    masses = masses_of(system)
+    label = np.empty(len(x), dtype=np.int64)
+    molecules = context.getMolecules()
+    for number, members in enumerate(molecules):
+        label[list(members)] = number
+    n = len(molecules)
+    # As OpenMM's barostats: the mean of positions, which sites without mass take part in.
+    centres = _sums(x, label, n) / np.bincount(label, minlength=n)[:, None]
+    energies = []
+    groups = context.getIntegrator().getIntegrationForceGroups()
+    try:
+        for h in (strain, -strain):
+            context.setPeriodicBoxVectors(*((1 + h) * box))
+            context.setPositions(x + h * centres[label])
+            energies.append(context.getState(energy=True, groups=groups).getPotentialEnergy()._value)
+    finally:
+        context.setPeriodicBoxVectors(*box)
+        context.setPositions(x)
+    if temperature is None:
+        total = np.bincount(label, masses, n)
+        heavy = total > 0
+        momenta = _sums(masses[:, None] * v, label, n)[heavy]
+        kinetic = float(((momenta**2).sum(axis=1) / total[heavy]).sum())
+    else:
+        kinetic = 3 * n * unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin) * temperature
+    slope = (energies[0] - energies[1]) / (2 * strain)
+    return (kinetic - slope) / (3 * volume) * BAR
+
+
+class PressureReporter:
+    """Pressure and volume of a Simulation: ``simulation.reporters.append(PressureReporter(file, 100))``.
+
+    Parameters
+    ----------
+    file : path or text file
+    reportInterval : int
+    temperature : float, optional
+        As for `molecular_pressure`.
+
+    Attributes
+    ----------
+    values : list of float
+        Pressures in bar.
+    """
+
+    def __init__(self, file: str | IO[str], reportInterval: int, temperature: float | None = None) -> None:
+        self._interval, self._temperature = int(reportInterval), temperature
+        self._own = isinstance(file, str)
+        self._file = open(file, "w") if isinstance(file, str) else file  # noqa: SIM115
+        print('#"Step","Box Volume (nm^3)","Pressure (bar)"', file=self._file)
+        self.values: list[float] = []
+
+    def __del__(self) -> None:
+        if getattr(self, "_own", False):
+            self._file.close()
+
+    def describeNextReport(self, simulation: app.Simulation) -> dict[str, Any]:
+        """As OpenMM asks."""
+        steps = self._interval - simulation.currentStep % self._interval
+        return {"steps": steps, "periodic": None, "include": []}
+
+    def report(self, simulation: app.Simulation, state: openmm.State) -> None:
+        """As OpenMM asks."""
+        self.values.append(molecular_pressure(simulation.context, self._temperature))
+        volume = state.getPeriodicBoxVolume()._value
+        print(f"{simulation.currentStep},{volume:.6f},{self.values[-1]:.6g}", file=self._file, flush=True)
+
+
+def _sums(values: FloatArray, label: Any, n: int) -> FloatArray:
+    return np.stack([np.bincount(label, values[:, k], n) for k in range(3)], axis=1)

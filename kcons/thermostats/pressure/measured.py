@@ -1,0 +1,165 @@
+"""The pressure of a state: by pieces as points, by all atoms, or from energies alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
+from kcons.motion.motion import Motion
+from kcons.steppers import State
+from kcons.thermostats.freedom import positive
+from kcons.thermostats.pressure.barostat import Place
+from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
+from kcons.thermostats.pressure.cell_system import CellSystem
+from kcons.thermostats.pressure.pieces import Pieces, find_pieces, lattice_of
+
+#: Change of all lengths from which the derivative of the energy is taken.
+STRAIN = 1e-4
+
+Virial = Literal["molecular", "atomic", "difference"]
+
+
+def constraint_virial(motion: Motion, x: FloatArray, v: FloatArray, f: FloatArray) -> FloatArray:
+    """sum_i r_i (x) z_i over the rows that hold the system together, symmetric, shape (3, 3).
+
+    z is the instantaneous constraint force, the velocity-dependent part of b included. Rows that depend on
+    differences of positions only enter with these differences, so that the origin does not matter. Rows
+    with a place in space (fixed atoms, surfaces, centres of mass) are external forces, like walls, and
+    have no share.
+
+    References
+    ----------
+    Notes, eqs. 101-104. Atomic virial with constraints: Ciccotti and Ryckaert, Comput. Phys. Rep. 4, 345 (1986).
+    """
+    held = motion.constraint_set
+    lam = motion.multipliers(x, v, f)
+    virial = np.zeros((3, 3))
+    for item, start in zip(held.constraints, held.starts, strict=False):
+        if not (item.holonomic and item.translation_invariant and item.n_rows):
+            continue
+        r = held.gather(item, x)
+        push = lam[start : start + item.n_rows, None, None] * item.gradient(r, 0.0)
+        virial += np.einsum("kai,kaj->ij", r - r[:, :1], push)
+    return 0.5 * (virial + virial.T)
+
+
+def instantaneous_pressure(
+    system: CellSystem,
+    state: State,
+    virial: Virial = "molecular",
+    *,
+    pieces: Pieces | None = None,
+    thermal_energy: float | None = None,
+) -> FloatArray:
+    """The instantaneous pressure tensor, shape (3, 3); its trace over 3 is the pressure.
+
+    Parameters
+    ----------
+    system : CellSystem
+    state : State
+    virial : {'molecular', 'atomic', 'difference'}
+        Of pieces as points, in which constraint forces have no part; of all atoms, with the constraint forces; or of
+        pieces, from energies in a cell a little larger and smaller, which needs no stress and gives the same in all
+        directions. The means are the same; that of pieces has the least noise.
+    pieces : Pieces, optional
+        As `find_pieces` gives them; by default what constraints tie.
+    thermal_energy : float, optional
+        kT for the momenta of pieces, N kT/V instead of their present kinetic energy: the same mean, with less noise,
+        also where total momentum is zero.
+
+    Raises
+    ------
+    InputError
+        An unknown virial.
+    UnsupportedError
+        There is no stress, or a piece is held in space.
+    """
+    if virial not in ("molecular", "atomic", "difference"):
+        raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
+    x, v, _ = system.taken(state)
+    cell = system.cell
+    volume = float(abs(np.linalg.det(cell)))
+    if virial == "atomic":
+        masses = np.where(system.inverse_masses > 0, system.masses[:, None], 0.0)
+        stress = system.stress(x, state.time)
+        f = system.with_forces(state).forces
+        assert f is not None
+        return ((masses * v).T @ v + constraint_virial(system.motion, x, v, f)) / volume - stress
+    if pieces is None:
+        pieces = find_pieces(system, x, np.ones(3, dtype=bool), time=state.time)
+    if thermal_energy is None:
+        u = pieces.centres(v) * pieces.open
+        kinetic = (pieces.mass[:, None] * u).T @ u
+    else:
+        kinetic = positive(thermal_energy, "thermal_energy") * np.diag(pieces.moving).astype(float)
+    if virial == "difference":
+        return kinetic / volume - np.eye(3) * _slope(system, state, pieces, cell) / (3 * volume)
+    stress = system.stress(x, state.time)
+    rise = energy_by_strain(system, pieces, Place(cell, x, 0.0, system.with_forces(state).forces, stress))
+    return (kinetic - 0.5 * (rise + rise.T)) / volume
+
+
+def _slope(system: CellSystem, state: State, pieces: Pieces, cell: FloatArray) -> float:
+    """dU/d ln(length) where the cell is scaled and pieces move by their centres."""
+    lattice, energies = lattice_of(system), []
+    try:
+        for h in (STRAIN, -STRAIN):
+            change = h * np.eye(3)
+            system.set_cell(cell, state.positions)
+            y = state.positions + pieces.moved(state.positions, change, lattice)
+            system.set_cell(cell @ (np.eye(3) + change), y)
+            energies.append(system.energy(y, state.time, state.step))
+    finally:
+        system.set_cell(cell, state.positions)
+    return (energies[0] - energies[1]) / (2 * STRAIN)
+
+
+class PressureObserver:
+    """Pressures and volumes of a run, as an observer of `kcons.run`.
+
+    Parameters
+    ----------
+    system : CellSystem
+    virial, thermal_energy
+        As for `instantaneous_pressure`.
+    pieces : Pieces, optional
+        Those of a barostat: `barostat.pieces(system, positions)`.
+
+    Attributes
+    ----------
+    values : list of ndarray, shape (3, 3)
+    volumes : list of float
+    """
+
+    def __init__(
+        self,
+        system: CellSystem,
+        virial: Virial = "molecular",
+        *,
+        pieces: Pieces | None = None,
+        thermal_energy: float | None = None,
+    ) -> None:
+        self.system, self.virial, self.pieces, self.thermal_energy = system, virial, pieces, thermal_energy
+        self.values: list[FloatArray] = []
+        self.volumes: list[float] = []
+
+    def __call__(self, state: State) -> None:
+        # The state shown cannot be written to, which solvers ask for.
+        own = replace(state.copied(), barostat=None)
+        if self.pieces is None and self.virial != "atomic":
+            self.pieces = find_pieces(self.system, own.positions, np.ones(3, dtype=bool), time=own.time)
+        self.values.append(
+            instantaneous_pressure(
+                self.system, own, self.virial, pieces=self.pieces, thermal_energy=self.thermal_energy
+            )
+        )
+        self.volumes.append(float(abs(np.linalg.det(self.system.cell))))
+
+    @property
+    def mean(self) -> float:
+        """Of the pressure."""
+        return float(np.mean([np.trace(value) / 3 for value in self.values]))

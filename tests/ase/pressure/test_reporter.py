@@ -1,0 +1,67 @@
+"""The pressure along runs in ASE."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import units
+from ase.build import bulk
+from ase.calculators.emt import EMT
+from ase_systems import FS, TEMPERATURE, dumbbells, pressure
+
+from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
+from kcons.constraints import Distance
+from kcons.thermostats.pressure import MonteCarloBarostat
+
+
+def copper():
+    atoms = bulk("Cu", cubic=True) * 2
+    atoms.rattle(0.05, rng=np.random.default_rng(3))
+    atoms.calc = EMT()
+    constrain(atoms, Distance([[0, 1], [2, 3]]))
+    draw_velocities(atoms, 300, 1)
+    return atoms
+
+
+def test_atomic_pressure_is_that_of_ase_with_the_constraint_part():
+    atoms = copper()
+    reporter = PressureReporter(ConstrainedDynamics(atoms, FS), virial="atomic")
+    reporter()
+    assert reporter.mean == pytest.approx(pressure(atoms), rel=1e-9)
+    assert reporter.values[0] == pytest.approx(-atoms.get_stress(voigt=False, include_ideal_gas=True), abs=1e-12)
+
+
+def test_molecular_pressure_by_stress_and_by_differences():
+    atoms = copper()
+    dynamics = ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1)
+    ways = [PressureReporter(dynamics, virial=way) for way in ("molecular", "difference")]
+    for way in ways:
+        dynamics.attach(way, interval=2)
+    before = atoms.cell.array.copy()
+    dynamics.run(6)
+    assert len(ways[0].values) == 4
+    assert ways[0].mean == pytest.approx(ways[1].mean, rel=1e-4)
+    assert np.array_equal(atoms.cell.array, before)
+
+
+def test_a_reporter_changes_no_run(tmp_path):
+    runs = []
+    for watched in (False, True):
+        atoms, _ = dumbbells(20, side=30.0)
+        barostat = MonteCarloBarostat(20 * units.kB * TEMPERATURE / 30**3, every=2, width=0.2)
+        dynamics = ConstrainedLangevin(atoms, 2 * FS, TEMPERATURE, 0.01 / FS, rng=1, barostat=barostat)
+        file = tmp_path / "pressure.txt"
+        if watched:
+            reporter = PressureReporter(dynamics, file, virial="difference", temperature_K=TEMPERATURE)
+            dynamics.attach(reporter, interval=1)
+        dynamics.run(9)
+        runs.append((atoms.cell.array.copy(), atoms.get_positions(), atoms.get_momenta()))
+    for one, other in zip(*runs, strict=True):
+        assert np.array_equal(one, other)
+    lines = file.read_text().splitlines()
+    assert len(lines) == 11
+    time, volume, bar = (float(v) for v in lines[-1].split())
+    assert time == pytest.approx(18.0)
+    assert volume == pytest.approx(atoms.get_volume(), rel=1e-6)
+    assert bar == pytest.approx(20 * units.kB * TEMPERATURE / atoms.get_volume() / units.bar, rel=1e-4)
+    assert len(np.unique(reporter.volumes)) > 1

@@ -1,0 +1,72 @@
+"""Temperatures of configurations of a file: Metropolis samples are as hot as they were drawn, whole or wrapped."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import water_files as files
+from ase import units
+
+from kcons.comparison import Potential, fluid
+from kcons.comparison.averages import trajectory_temperatures
+from kcons.comparison.test_systems import any_file
+from kcons.errors import InputError, UnsupportedError
+
+N, FRAMES = 27, 48
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Water at 400 K by Metropolis moves, each atom wrapped by itself."""
+    folder, chosen = tmp_path_factory.mktemp("water"), fluid.water(N)
+    moved = chosen.shift, chosen.turn
+    x = chosen.forces.metropolis(chosen.positions, chosen.thermal_energy, 1500, 10, 1, *moved)[1]
+    frames = []
+    for k in range(FRAMES):
+        x = chosen.forces.metropolis(x, chosen.thermal_energy, 40, 40, (2, k), *moved)[1]
+        frames.append(x)
+    side = chosen.forces.box
+    files.topology(folder / "t.gro", N, frames[0], side)
+    files.write(folder / "good.trr", np.array(frames) % side, side)
+    return folder
+
+
+@pytest.fixture
+def named(monkeypatch):
+    """The forces that the file was drawn with, by the name of others."""
+    made = any_file.from_file
+
+    def from_file(*where, **options):
+        forces = fluid.water(N).forces
+        return dataclasses.replace(made(*where, **options), potential=Potential(forces.evaluate, "the fluid's"))
+
+    monkeypatch.setattr(any_file, "from_file", from_file)
+
+
+def test_samples_are_as_hot_as_they_were_drawn(folder, named):
+    found = trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", "lj", range(FRAMES), constrain="none")
+    assert (found.shifts, found.turns, found.samples) == (3 * N, 3 * N, FRAMES) and found.internal is None
+    for estimate in (found.shift, found.turn):
+        assert abs(estimate.off(400 * units.kB)) <= 3.5 and estimate.error < 0.1 * estimate.value
+    first, *others = trajectory_temperatures.sentences(found)
+    assert first.startswith(f"temperatures of the configurations, of {FRAMES} frames: shifts of whole clusters ")
+    assert f"{found.turn.value / units.kB:.1f} ± " in first and others == []
+
+
+def test_bad_input(folder, tmp_path):
+    with pytest.raises(InputError, match="31 frames are too few"):
+        trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", "lj", range(31))
+    with pytest.raises(InputError, match="nothing at all"):
+        trajectory_temperatures.along(folder / "good.trr", folder / "t.gro", "nothing at all", range(40))
+
+
+def test_a_box_that_changes(folder, named, tmp_path):
+    atoms = files.mda.Universe(folder / "t.gro", folder / "good.trr").atoms
+    with files.mda.Writer(str(tmp_path / "other.trr"), n_atoms=len(atoms)) as writer:
+        for k, ts in enumerate(atoms.universe.trajectory):
+            ts.dimensions = [*(ts.dimensions[:3] * (1.0 if k < 30 else 1.01)), 90, 90, 90]
+            writer.write(atoms)
+    with pytest.raises(UnsupportedError, match="the box of frame 30 is another one"):
+        trajectory_temperatures.along(tmp_path / "other.trr", folder / "t.gro", "lj", range(FRAMES), constrain="none")

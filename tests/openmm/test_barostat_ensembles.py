@@ -1,0 +1,138 @@
+"""OpenMM's barostats beside our integrators: volumes of rigid ideal gases have their exact distribution.
+
+N is the number of molecules as OpenMM counts them: joined by constraints of the System, by bonds, and by the bonds of
+no strength of `hold(..., join=True)`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import openmm
+import pytest
+from openmm_systems import started, state_of
+from pressure_systems import TRIANGLE, correlation_time, p_value, placed
+from scipy import stats
+
+from kcons.constraints import Distance
+from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
+
+N, SIDE, KT = 30, 6.0, 0.00831446261815324 * 300
+#: In bar, for a mean volume of SIDE^3 with N molecules.
+BAR = 16.6053906717
+ENSEMBLES = {
+    "Langevin": lambda: Langevin(300, 5.0),
+    "NoseHoover": lambda: NoseHoover(300, 5.0, momentum="free"),
+    "Isokinetic": lambda: Isokinetic(300, momentum="free"),
+}
+M = openmm.MonteCarloMembraneBarostat
+
+
+def barostats(pressure):
+    return {
+        "isotropic": openmm.MonteCarloBarostat(pressure, 300, 1),
+        "one axis": openmm.MonteCarloAnisotropicBarostat(openmm.Vec3(1, 1, pressure), 300, False, False, True, 1),
+        "membrane": M(pressure, 0.0, 300, M.XYIsotropic, M.ZFixed, 1),
+    }
+
+
+def gas(sites=False):
+    """Rigid triangles without forces in a periodic box, perhaps with a virtual site each."""
+    system, x = openmm.System(), []
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.1)
+    shape = 0.1 * TRIANGLE
+    for molecule in placed(shape, N, SIDE, 3).reshape(N, 3, 3):
+        first = system.getNumParticles()
+        whole = molecule - SIDE * np.round((molecule - molecule[0]) / SIDE)
+        for mass, place in zip((16.0, 1.0, 2.0), whole, strict=True):
+            system.addParticle(mass)
+            x.append(place)
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            system.addConstraint(first + i, first + j, float(np.linalg.norm(shape[i] - shape[j])))
+        if sites:
+            system.addParticle(0.0)
+            system.setVirtualSite(
+                first + 3, openmm.ThreeParticleAverageSite(first, first + 1, first + 2, 0.5, 0.25, 0.25)
+            )
+            x.append(whole[0])
+    for _ in x:
+        force.addParticle(0.0, 0.1, 0.0)
+    system.addForce(force)
+    system.setDefaultPeriodicBoxVectors(*(SIDE * np.eye(3)))
+    return system, np.array(x)
+
+
+def volumes(system, integrator, x, barostat, count=1200, part=None):
+    barostat.setRandomNumberSeed(7)
+    system.addForce(barostat)
+    integrator.setRandomNumberSeed(5)
+    context = started(system, integrator, x)
+    context.computeVirtualSites()
+    context.setVelocitiesToTemperature(300, 3)
+    if part is not None:
+        context.applyVelocityConstraints(1e-10)
+        part.apply_velocities(context)
+    integrator.step(300)
+    found = []
+    for _ in range(count):
+        integrator.step(1)
+        found.append(context.getState().getPeriodicBoxVolume()._value)
+    return np.array(found), context
+
+
+def judge(found, n, pressure):
+    exact = stats.gamma(n + 1, scale=KT / pressure)
+    assert p_value(found, exact) > 0.01
+    error = exact.std() * np.sqrt(correlation_time(found) / len(found))
+    assert error < 0.05 * exact.mean()
+    assert abs(found.mean() - exact.mean()) < 3.5 * error
+
+
+PRESSURE = (N + 1) * KT / SIDE**3
+
+
+@pytest.mark.parametrize(
+    ("ensemble", "barostat"),
+    [("Langevin", "isotropic"), ("NoseHoover", "one axis"), ("Isokinetic", "membrane")],
+)
+def test_volumes_of_a_rigid_ideal_gas(ensemble, barostat):
+    system, x = gas()
+    integrator = ProjectedIntegrator(0.002, ensemble=ENSEMBLES[ensemble]())
+    found, context = volumes(system, integrator, x, barostats(PRESSURE * BAR)[barostat])
+    judge(found, N, PRESSURE)
+    integrator.check()
+    # By differences, the pressure of an ideal gas is that of its points, at any instant.
+    volume = context.getState().getPeriodicBoxVolume()._value
+    assert molecular_pressure(context, 300) == pytest.approx(N * KT / volume * BAR, rel=1e-6)
+
+
+def test_virtual_sites_move_with_their_molecules():
+    system, x = gas(sites=True)
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0))
+    found, context = volumes(system, integrator, x, barostats(PRESSURE * BAR)["isotropic"], 800)
+    judge(found, N, PRESSURE)
+    y = state_of(context)[0].reshape(N, 4, 3)
+    assert y[:, 3] == pytest.approx(0.5 * y[:, 0] + 0.25 * (y[:, 1] + y[:, 2]), abs=1e-6)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_carried_rows_within_and_across_molecules(joined):
+    """Two molecules with a row between them are one, and N is less by one for each such pair."""
+    system, x = gas()
+    pairs = np.arange(0, 3 * N, 6)
+    if joined:
+        x = x.reshape(N, 3, 3)
+        x[1::2] += (x[0::2, :1] - x[1::2, :1]) + 0.4
+        x = x.reshape(-1, 3)
+        rows = Distance(np.stack([pairs, pairs + 3], axis=1))
+    else:
+        rows = Distance(np.array([[0, 1]]) + pairs[:, None])
+    part = hold(system, rows, x, join=joined)
+    n = N // 2 if joined else N
+    pressure = (n + 1) * KT / SIDE**3
+    integrator = ProjectedIntegrator(0.002, ensemble=Langevin(300, 5.0), parts=[part])
+    found, context = volumes(system, integrator, x, barostats(pressure * BAR)["isotropic"], 800, part)
+    assert len(context.getMolecules()) == n
+    judge(found, n, pressure)
+    part.check(context)

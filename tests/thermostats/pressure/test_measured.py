@@ -1,0 +1,105 @@
+"""Pressures of a state, by pieces, by atoms and by energies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pressure_systems import METHANE, TRIANGLE, gas
+
+from kcons.constraints import Distance
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.errors import InputError, UnsupportedError
+from kcons.motion import Motion
+from kcons.steppers import run
+from kcons.thermostats import Langevin, thermal_velocities
+from kcons.thermostats.pressure import CellSystem, PressureObserver, find_pieces, instantaneous_pressure
+
+SIDE = 12.0
+
+
+def springs(k=0.3):
+    """Harmonic springs between minimum images of atoms 0, m, 2 m ... and their virial: a stress with shear."""
+
+    def ends(x, h, m):
+        d = x[::m][1:] - x[::m][:-1]
+        return d - np.round(d @ np.linalg.inv(h)) @ h
+
+    def functions(m):
+        def potential(x, t, h):
+            return 0.5 * k * (ends(x, h, m) ** 2).sum()
+
+        def force(x, t, h):
+            f, push = np.zeros_like(x), k * ends(x, h, m)
+            f[::m][:-1] += push
+            f[::m][1:] -= push
+            return f
+
+        def stress(x, t, h):
+            d = ends(x, h, m)
+            return k * d.T @ d / abs(np.linalg.det(h))
+
+        return {"force": force, "potential": potential, "stress": stress}
+
+    return functions
+
+
+def started(shape=TRIANGLE, n=12, **functions):
+    system, x = gas(shape, n, SIDE, **(functions or springs()(len(shape))))
+    return system, system.initial_state(x, thermal_velocities(system, x, 1.0, 2))
+
+
+@pytest.mark.parametrize("shape", [TRIANGLE, METHANE], ids=["triangle", "dependent rows"])
+def test_three_ways_to_one_pressure(shape):
+    """Of rigid molecules all agree at any instant: d/dt of sum m r.v about their centres is zero."""
+    system, state = started(shape)
+    state = run(system, state, 0.05, 5, stepper=Langevin(1.0, 1.0, seed=1))
+    molecular, atomic, difference = (
+        instantaneous_pressure(system, state, way) for way in ("molecular", "atomic", "difference")
+    )
+    assert np.trace(atomic) == pytest.approx(np.trace(molecular), abs=1e-12)
+    assert np.trace(difference) == pytest.approx(np.trace(molecular), rel=1e-6)
+    assert abs(atomic - molecular).max() > 1e-4  # in single directions they are equal in the mean only
+    assert molecular == pytest.approx(molecular.T, abs=1e-14)
+    assert system.cell == pytest.approx(SIDE * np.eye(3), abs=0)
+
+
+def test_means_agree():
+    """Along a run at constant volume, of molecules made of two rigid pieces and a spring."""
+    system, state = started()
+    pairs = np.arange(0, 36, 6)
+    pieces = find_pieces(system, state.positions, np.ones(3, bool), np.stack([pairs, pairs + 3], axis=1))
+    assert len(pieces) == 6
+    seen = [PressureObserver(system, pieces=pieces), PressureObserver(system, "atomic")]
+    state = run(system, state, 0.05, 200, stepper=Langevin(1.0, 1.0, seed=1))
+    run(system, state, 0.05, 1200, stepper=Langevin(1.0, 1.0, seed=1), observers=seen, every=6)
+    values = [np.array([np.trace(v) / 3 for v in one.values]) for one in seen]
+    blocks = (values[0] - values[1])[1:].reshape(20, -1).mean(axis=1)
+    error = blocks.std(ddof=1) / np.sqrt(20)
+    assert abs(blocks.mean()) < 3.5 * error
+    assert error < 0.2 * np.abs(values[0] - values[1]).max()
+    assert seen[0].volumes[0] == pytest.approx(SIDE**3)
+
+
+def test_bonds_make_pieces():
+    system, state = started()
+    one = find_pieces(system, state.positions, np.ones(3, bool), [[0, 3]])
+    found = instantaneous_pressure(system, state, pieces=one, thermal_energy=1.0)
+    # One piece less, and the first spring within it.
+    d = state.positions[3] - state.positions[0]
+    d -= SIDE * np.round(d / SIDE)
+    rest = instantaneous_pressure(system, state, thermal_energy=1.0)
+    assert np.trace(found) == pytest.approx(np.trace(rest), abs=1.0)
+    assert np.trace(found) != pytest.approx(np.trace(rest), rel=1e-6)
+
+
+def test_what_is_refused():
+    system, state = started()
+    with pytest.raises(InputError, match="virial"):
+        instantaneous_pressure(system, state, "viral")
+    x = state.positions
+    held = ConstraintSet(Distance([[0, 1]]), x, np.ones(len(x)), cell=np.full(3, SIDE))
+    blind = CellSystem(Motion(held, x), lambda x, t, h: 0 * x, lambda x, t, h: 0.0)
+    with pytest.raises(UnsupportedError, match="stress"):
+        instantaneous_pressure(blind, blind.initial_state(x), thermal_energy=1.0)
+    found = instantaneous_pressure(blind, blind.initial_state(x), "difference", thermal_energy=1.0)
+    assert found == pytest.approx((len(x) - 1) / SIDE**3 * np.eye(3))
