@@ -44,3 +44,9 @@ def test_a_protein_in_water_is_accepted():
     """Expected from the changes of energy; the proposals are few."""
     (row,) = RESULT["dhfr"]["rows"]
     assert row["expected"] >= 0.9 and row["proposals"] == 6 and row["not_reversible"] == 0
+
+
+def test_physical_validation_finds_nothing():
+    judge = RESULT["judge"]
+    assert min(judge["kinetic_p"]) > 1e-3 and max(judge["ensemble_sigma"]) < 3.5
+    assert judge["samples"] > 1000 and 0.5 < min(judge["acceptance"]) < 1
