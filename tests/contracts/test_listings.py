@@ -29,7 +29,15 @@ from kcons.steppers import (
 )
 from kcons.steppers.operations import Fly, Settle, Timed
 from kcons.steppers.stepper import Listed
-from kcons.thermostats import Isokinetic, IsokineticSpheres, Langevin, LangevinRespa, NoseHooverChain
+from kcons.thermostats import (
+    ConstantPressure,
+    Isokinetic,
+    IsokineticSpheres,
+    Langevin,
+    LangevinRespa,
+    MonteCarloBarostat,
+    NoseHooverChain,
+)
 
 ALL = [
     *(Rattle(), Geodesic(3), Suzuki4(), Yoshida4(), KahanLi6(), BlanesMoan4(), BlanesMoan6(), BlanesMoan6a()),
@@ -39,6 +47,7 @@ ALL = [
     *(LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 3}), LangevinRespa(1.0, 0.5, 1, order=4)),
     LangevinRespa(1.0, 0.5, 1, steps={"slow": 1, "fast": 2}, slow_kicks="middle"),
     *(IsokineticSpheres(1.0, 0.5, 1, steps={"a": 1, "b": 2, "c": 4}, order=4), IsokineticSpheres(1.0, 0.5, 1)),
+    ConstantPressure(Langevin(1.0, 0.5, 1), MonteCarloBarostat(1.0)),
     *(NoseHooverChain(1.0, 9.0), NoseHooverChain(1.0, 9.0, stepper=Geodesic(2))),
 ]
 STEPPERS = pytest.mark.parametrize("stepper", ALL, ids=repr)
