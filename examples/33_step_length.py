@@ -49,7 +49,7 @@ from kcons.thermostats import (
 
 KELVIN = 300.0
 #: Time steps in fs with the time in ps that each is run, and time between samples in fs.
-STEPS, INTERVAL = {4.0: 600.0, 2.0: 600.0, 1.0: 120.0, 0.5: 60.0}, 8.0
+STEPS, INTERVAL = {4.0: 600.0, 2.0: 600.0, 1.0: 80.0, 0.5: 40.0}, 8.0
 THERMOSTATS = ("Nose-Hoover", "Langevin")
 
 

@@ -4,7 +4,7 @@ Lengths are in angstrom, times in ps, masses in dalton, as everywhere in MDAnaly
 
 - `loading`: files opened, with errors that name the remedy
 - `topology`: constraints by its selection language
-- `conversions`: Universe, `Atoms` and System, one into the other
+- `conversions`, `converter`: Universe, `Atoms` and System, one into the other; `ag.convert_to("ASE")`
 - `writing`: runs written to files
 - `check`: how well a trajectory kept its constraints
 """
@@ -24,6 +24,7 @@ try:
         to_openmm,
         universe_of,
     )
+    from kcons.mdanalysis.converter import ASEConverter
     from kcons.mdanalysis.loading import load_trajectory, open_universe
     from kcons.mdanalysis.topology import constraints_of, selected, snapshot_of
     from kcons.mdanalysis.writing import ASE_UNITS, OPENMM_UNITS, OpenMMReporter, RunUnits, TrajectoryWriter, write_ase
@@ -33,6 +34,7 @@ except ModuleNotFoundError as error:
 __all__ = [
     "ASE_UNITS",
     "OPENMM_UNITS",
+    "ASEConverter",
     "CheckResult",
     "ConstraintCheck",
     "OpenMMReporter",

@@ -40,8 +40,8 @@ from kcons.thermostats.multistep import autocorrelation_time
 FEWEST = 64
 #: Share of a run that is left out at its start.
 LEFT_OUT = 0.1
-#: Evaluations after which errors of methods are compared.
-CALLS = 100_000
+#: Standard errors up to which there is no bias that a run can see.
+DOUBT = 3.0
 #: Largest inner steps in one step.
 MOST = 64
 
@@ -170,16 +170,10 @@ class Stepped:
         """Evaluations of the expensive forces in a unit of time."""
         return self.evaluations / self.length
 
-    def after(self, calls: float = CALLS) -> float:
-        """Root mean square error of the energy a molecule after so many evaluations: bias, and noise of that length.
-
-        The bias is what is beyond the noise of this run and of the reference.
-        """
-        if self.energy_off is None:
-            return math.nan
-        off, error = self.energy_off
-        bias = max(off * off - error * error, 0.0)
-        return math.sqrt(bias + self.energy[1] ** 2 * self.evaluations / calls)
+    @property
+    def bias(self) -> float:
+        """Largest bias of a temperature of the configurations, relative, beyond what three standard errors explain."""
+        return max((abs(off) - DOUBT * error for off, error in self.kinds.values()), default=0.0)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -434,7 +428,7 @@ def compare(
 def best(runs: Iterable[Stepped]) -> list[Stepped]:
     """Of runs of each method and step the one with the friction that comes out best.
 
-    By the error of the energy after `CALLS` evaluations; without a reference by what an independent sample costs.
+    That is the one of least bias of any temperature; of those without a visible one the one whose samples cost least.
     """
     kept: dict[tuple[str, float], Stepped] = {}
     for run in runs:
@@ -444,7 +438,5 @@ def best(runs: Iterable[Stepped]) -> list[Stepped]:
     return list(kept.values())
 
 
-def _merit(run: Stepped) -> float:
-    if run.status != "ok":
-        return math.inf
-    return run.after() if run.energy_off is not None else run.correlation
+def _merit(run: Stepped) -> tuple[float, float]:
+    return (max(run.bias, 0.0), run.correlation) if run.status == "ok" else (math.inf, math.inf)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kcons.comparison.averages.long_steps import CALLS, METHODS, StepComparison, Stepped, best
+from kcons.comparison.averages.long_steps import METHODS, StepComparison, Stepped, best
 from kcons.comparison.study import report_files
 from kcons.comparison.study.curves import Curve, Panel, draw
 from kcons.comparison.study.tables import Marked, Table, footnotes, numbered, verdict
@@ -42,7 +42,6 @@ def table(runs: Sequence[Stepped], units: Units, title: str = "") -> Table:
         energy,
         "calls for a\nsample",
     ]
-    headings += [f"error after\n{CALLS:,} calls"] if known else []
     notes = numbered(run.note for run in kept)
     rows = []
     for run in kept:
@@ -56,7 +55,6 @@ def table(runs: Sequence[Stepped], units: Units, title: str = "") -> Table:
         cells += [_percent(run, kind) for kind in kinds]
         cells.append(_pair(*(run.energy_off or run.energy), known))
         cells.append(f"{run.correlation:,.0f}")
-        cells += [f"{run.after():.2g}"] if known else []
         rows.append(cells)
     return Table(headings, rows, title=title, grouped=True)
 
@@ -86,12 +84,10 @@ def explanation(runs: Sequence[Stepped]) -> str:
         "calls for a sample: evaluations for one independent sample of the energy.",
     ]
     if any(run.energy_off is not None for run in runs):
-        lines.append(
-            "<U> off by: less Metropolis sampling, a molecule. error: root mean square of bias and noise after so many "
-            "calls; frictions are those of the least error."
-        )
-    else:
-        lines.append("frictions are those of the fewest calls for a sample.")
+        lines.append("<U> off by: less Metropolis sampling, a molecule.")
+    lines.append(
+        "frictions: those of the least bias beyond three standard errors, then of the fewest calls for a sample."
+    )
     return "\n".join(lines)
 
 
@@ -114,7 +110,7 @@ def _panel(runs: Sequence[Stepped], units: Units, kind: str) -> Panel:
         curves.append(Curve(at, off, METHODS[name].title, style))
         for x, run in zip(at, seen, strict=True):
             value, error = 100 * abs(run.kinds[kind][0]), 100 * run.kinds[kind][1]
-            bar = [max(value - error, 0.1 * error), value + error]
+            bar = [max(value - error, min(value, 0.1 * error)), value + error]
             curves.append(Curve([x, x], bar, style={"color": colour, "linewidth": 1.0}))
     heading = KINDS[kind].partition("\n")[0]
     return Panel(curves, f"calls of the expensive forces a {units.long_time}", f"{heading} off by / %", plain="xy")

@@ -33,7 +33,7 @@ def test_table():
     found, text = lines(RUNS)
     shown = {line.split("  ")[0]: line.split() for line in text.splitlines()}
     assert shown["Langevin, one step"][3:] == [
-        "2", "5", "500", "+0.1", "±", "0.2", "-0.2", "±", "0.3", "+0.0001", "±", "0.0003", "300", "4e-05",
+        "2", "5", "500", "+0.1", "±", "0.2", "-0.2", "±", "0.3", "+0.0001", "±", "0.0003", "300",
     ]  # fmt: skip
     assert shown["isokinetic spheres"][2:5] == ["24", "5", "42"]
     assert "+11.0 ± 0.3" in text and "+2.0 ± 1.0" in text and "failed [1]" in text

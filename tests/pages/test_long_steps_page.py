@@ -1,0 +1,93 @@
+"""The page on long time steps shows the committed results, and these reach what they must."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+from committed_pages import page, printed
+
+ROOT = Path(__file__).parents[2]
+RESULT = json.loads((ROOT / "docs" / "results" / "long_steps.json").read_text(encoding="utf-8"))
+SMALL = {(row["spheres"], row["auxiliary"], row["wrong"]): row for row in RESULT["small"]["runs"]}
+WATER = {row["name"]: row for row in RESULT["water"]}
+
+
+def test_page_shows_the_committed_results():
+    for part in printed("31_long_steps.py", "long_steps.json").split("\n\n"):
+        assert part in page("long_steps.md")
+
+
+@pytest.mark.parametrize("key", [key for key in SMALL if not key[2]], ids=lambda key: f"{key[0]} {key[1]}")
+def test_every_choice_of_spheres_agrees_with_metropolis(key):
+    """All six observables within three standard errors, of at most one hundredth."""
+    row = SMALL[key]
+    assert max(map(abs, row["off"])) <= 3
+    known = RESULT["small"]["metropolis"]
+    assert all(error <= 0.02 * abs(value) for value, error in row["averages"])
+    assert len(row["off"]) == len(known) == 6
+
+
+@pytest.mark.parametrize("key", [key for key in SMALL if key[2]], ids=lambda key: f"{key[0]} {key[1]}")
+def test_the_wrong_radius_is_rejected(key):
+    assert max(map(abs, SMALL[key]["off"])) >= 20
+
+
+def test_all_choices_were_made():
+    assert {key[:2] for key in SMALL} >= {("split", n) for n in (0, 1, 2, 4)} | {
+        (kind, 1) for kind in ("axes", "cluster", "global")
+    }
+
+
+def off(name):
+    """Bias of the energy in percent and its standard error."""
+    return WATER[name]["bias"]
+
+
+def test_nothing_explodes_on_spheres():
+    """Up to 64 fs no energy is off by more than 5 %; Langevin dynamics at 24 fs and low friction is by more than 10."""
+    spheres = [row for row in RESULT["water"] if row["bath"] in ("split", "axes", "cluster") and row["ps"] > 40]
+    assert max(row["outer"] for row in spheres) == 64
+    assert all(abs(row["bias"][0]) < 5 for row in spheres)
+    assert off("langevin 5/ps, 24 fs")[0] > 10
+
+
+@pytest.mark.parametrize(("name", "most"), [("split 20/ps, 24 fs", 0.5), ("split 20/ps, 32 fs, auxiliary 0", 1.0)])
+def test_bias_of_split_spheres(name, most):
+    """Of the energy, within one standard error; temperatures of turns say more, see the page."""
+    value, error = off(name)
+    assert abs(value) <= most + error and error <= 0.25
+
+
+def test_halfway_between_slow_kicks_langevin_is_right_at_16_fs():
+    """Energy and both temperatures; at the kicks turns are hotter by a tenth and more."""
+    row, known = WATER["langevin 5/ps, 16 fs, halfway"], RESULT["water"][0]
+    assert abs(row["bias"][0]) <= 2 * row["bias"][1] <= 0.5
+    for kind in ("shift", "turn"):
+        assert abs(row[kind][0] - 1) <= 2.5 * row[kind][1] <= 0.12
+    assert WATER["langevin 5/ps, 16 fs"]["turn"][0] > 1.1
+    assert known["slow_per_turning"] >= 8 * row["slow_per_turning"]
+
+
+def test_baths_cost_little():
+    """At most a tenth of a step with forces of 1 ms."""
+    assert all(value <= 100 for value in RESULT["cost"]["over_constant_energy_us"].values())
+
+
+@pytest.mark.validation
+@pytest.mark.parametrize("kind", ["split", "axes", "cluster"])
+def test_spheres_against_metropolis(kind):
+    """As the example does, shorter; the wrong radius is far off."""
+    spec = importlib.util.spec_from_file_location("long_steps", ROOT / "examples" / "31_long_steps.py")
+    example = importlib.util.module_from_spec(spec)
+    sys.modules["long_steps"] = example
+    spec.loader.exec_module(example)
+    known = example.metropolis(1000, 2000)
+    for wrong in (False, True):
+        found = example.small_run(kind, 1, 64, wrong, 6000)
+        worst = max(abs(a.value - b.value) / math.hypot(a.error, b.error) for a, b in zip(found, known, strict=True))
+        assert (worst > 10) if wrong else (worst <= 3.5)

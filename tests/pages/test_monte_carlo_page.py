@@ -1,0 +1,52 @@
+"""The page on Monte Carlo shows the committed results, and these reach what they must."""
+
+from __future__ import annotations
+
+import json
+
+from committed_pages import FOLDER, page, printed
+
+RESULT = json.loads((FOLDER / "monte_carlo.json").read_text(encoding="utf-8"))
+
+
+def test_the_page_shows_them():
+    assert printed("32_hamiltonian_monte_carlo.py", "monte_carlo.json") in page("monte_carlo.md")
+
+
+def test_rigid_water_makes_long_steps():
+    """Nine tenths accepted at 1.5 fs an evaluation of 512 molecules; a loose Ewald sum spoils it."""
+    rows = {(r["scheme"], r["dt"], r["ewald_tolerance"], r["switched"]): r for r in RESULT["water"]["rows"]}
+    assert RESULT["water"]["molecules"] == 512
+    good = rows["blanes-moan4", 12.0, 1e-5, True]
+    assert good["accepted"] >= 0.9 * good["proposals"] >= 36 and good["fs_per_evaluation"] >= 1.5
+    assert good["expected"] >= 0.9
+    assert rows["rattle", 2.0, 1e-5, True]["expected"] < 0.9
+    assert rows["blanes-moan4", 9.0, 5e-4, True]["spread"] > 10 * rows["blanes-moan4", 9.0, 1e-5, True]["spread"]
+    assert all(row["not_reversible"] == 0 for row in rows.values())
+
+
+def test_single_precision_shows():
+    off = {row["platform"]: row["off"] for row in RESULT["precision"]["rows"]}
+    assert off["OpenCL double"] < off["CPU"] < 1e-3 < 10 * off["OpenCL mixed"] < off["OpenCL single"]
+
+
+def test_chains_take_a_hundredth_of_the_time():
+    """Effective samples a second of processor time: more than 100 times those of mici on 1000 bonds."""
+    rates: dict[tuple[int, str], list[float]] = {}
+    for row in RESULT["chain"]["rows"]:
+        rates.setdefault((row["bonds"], row["package"]), []).append(row["effective"] / row["cpu_seconds"])
+    assert min(rates[1000, "kcons"]) > 100 * max(rates[1000, "mici"])
+    assert len(rates[100, "kcons"]) == len(rates[100, "mici"]) == 3
+    assert min(rates[100, "kcons"]) > max(rates[100, "mici"])
+
+
+def test_a_protein_in_water_is_accepted():
+    """Expected from the changes of energy; the proposals are few."""
+    (row,) = RESULT["dhfr"]["rows"]
+    assert row["expected"] >= 0.9 and row["proposals"] == 6 and row["not_reversible"] == 0
+
+
+def test_physical_validation_finds_nothing():
+    judge = RESULT["judge"]
+    assert min(judge["kinetic_p"]) > 1e-3 and max(judge["ensemble_sigma"]) < 3.5
+    assert judge["samples"] > 1000 and 0.5 < min(judge["acceptance"]) < 1

@@ -1,0 +1,77 @@
+"""The page on step lengths shows the committed results, and these say what the page says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from committed_pages import page, printed
+
+FILE = Path(__file__).parents[2] / "docs" / "results" / "step_length.json"
+RESULT = json.loads(FILE.read_text(encoding="utf-8"))
+
+
+def of_group(group):
+    return [part for part in RESULT["parts"].values() if part["group"] == group]
+
+
+RUNS = {(run["method"], run["step"], round(1000 * run["friction"])): run for run in of_group("rigid water")}
+
+
+def test_page_shows_the_committed_results():
+    assert RESULT["full"]
+    assert printed("33_step_length.py", FILE.name) in page("step_length.md")
+
+
+@pytest.mark.parametrize("run", of_group("velocities"), ids=lambda run: f"{run['step']:g} fs")
+def test_what_velocities_at_the_positions_miss_is_the_step(run):
+    """(frequency dt/2)^2 with measured frequencies, and nothing to fit; turns miss six times as much as shifts."""
+    for (missing, error), frequency in zip(run["missing"], run["frequencies"], strict=True):
+        expected = (0.5 * frequency * run["step"]) ** 2
+        assert abs(missing - expected) <= 0.15 * expected + 3 * error
+    assert 5 < run["missing"][1][0] / run["missing"][0][0] < 9
+
+
+@pytest.mark.parametrize("run", of_group("equipartition"), ids=lambda run: f"{run['thermostat']}, {run['step']:g} fs")
+def test_configurations_agree_with_velocities_in_the_middle(run):
+    """For Verlet; BAOAB has right configurations, and velocities that lack the same everywhere."""
+    for kind in (0, 1):
+        found, error = run["configurations"][kind]
+        other, doubt = run["in the middle"][kind] if run["thermostat"] == "Nose-Hoover" else (1.0, 0.0)
+        assert abs(found - other) <= 3.5 * (error**2 + doubt**2) ** 0.5 + 0.001 * run["step"]
+        assert error < 0.02
+        estimate, doubt = run["with signs"][kind]
+        assert abs(estimate - found) <= 3.5 * doubt
+
+
+def test_equipartition_of_velocities_is_broken_at_the_positions_only():
+    (run,) = (r for r in of_group("equipartition") if r["thermostat"] == "Nose-Hoover" and r["step"] == 4)
+    (moving, _), (turning, doubt) = run["at the positions"]
+    assert turning < 1 - 3 * doubt and turning < moving - 0.02
+
+
+def off(key, kind):
+    return RUNS[key]["kinds"][kind]
+
+
+def test_fine_steps_are_right():
+    for key in (("langevin", 2.0, 5), ("langevin", 4.0, 5)):
+        value, error = RUNS[key]["energy_off"]
+        assert abs(value) <= 3 * error
+        assert all(abs(off(key, kind)[0]) <= 3 * off(key, kind)[1] for kind in ("shift", "turn"))
+
+
+def test_turns_are_the_first_to_go():
+    """Where the energy cannot be told from right yet, they are many standard errors too warm."""
+    for key in (("langevin-respa", 16.0, 20), ("spheres", 24.0, 5)):
+        energy, doubt = RUNS[key]["energy_off"]
+        turn, error = off(key, "turn")
+        assert abs(energy) <= 3 * doubt and turn > 5 * error
+
+
+def test_errors_and_calls_are_told():
+    for run in RUNS.values():
+        assert run["status"] == "ok" and run["samples"] >= 64 and run["evaluations"] > 0
+        assert all(0 < error < 0.05 for _, error in run["kinds"].values())
+    assert {key[0] for key in RUNS} == {"langevin", "langevin-respa", "spheres", "hmc"}
