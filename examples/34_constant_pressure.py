@@ -3,6 +3,7 @@
 python examples/34_constant_pressure.py                 short runs
 python examples/34_constant_pressure.py --full          those of docs/constant_pressure.md: an hour
 python examples/34_constant_pressure.py --full NAME...  some of them
+python examples/34_constant_pressure.py --show FILE     the tables of the page from a file of results
 
 Fluids are in reduced units, of molecules with Lennard-Jones sites: dumbbells, and methane held by all its ten
 distances, of which nine are independent. Water is TIP3P with a reaction field, by OpenMM as a force engine.
@@ -223,6 +224,26 @@ def slope(one: dict[str, Any], two: dict[str, Any]) -> tuple[float, float, float
     return float(beta[1]), float(np.sqrt(np.linalg.inv(hessian)[1, 1])), exact
 
 
+def judged(one: dict[str, Any], two: dict[str, Any]) -> float:
+    """Standard errors by which the package physical_validation finds two ensembles off."""
+    import physical_validation as pv
+
+    names = ("energy", "length", "volume", "temperature", "pressure", "time")
+    factors = {f"{name}_conversion": 1.0 for name in names} | {f"{name}_str": "reduced" for name in names}
+    factors["pressure_conversion"] = 16.6053906717  # its own are kJ/mol, nm and bar
+    unit = pv.data.UnitData(kb=1.0, **factors)
+    data = []
+    for run_ in (one, two):
+        n, u = 2 * run_["molecules"], np.array(run_["energies"])
+        ensemble = pv.data.EnsembleData("NPT", natoms=n, pressure=run_["pressure"], temperature=run_["temperature"])
+        seen = pv.data.ObservableData(
+            potential_energy=u, total_energy=u, kinetic_energy=0 * u, volume=np.array(run_["volumes"])
+        )
+        system = pv.data.SystemData(natoms=n, nconstraints=n // 2, ndof_reduction_tra=0, ndof_reduction_rot=0)
+        data.append(pv.data.SimulationData(units=unit, ensemble=ensemble, observables=seen, system=system, dt=0.04))
+    return float(pv.ensemble.check(*data, total_energy=False, verbosity=0, bootstrap_seed=1)[0])
+
+
 # -- rigid water ----------------------------------------------------------------------------------------------------
 
 WATERS, TEMPERATURE, BAR = 64, 300.0, units.bar
@@ -371,51 +392,63 @@ def run_water(barostat: str, thermostat: str, steps: int, every: int = 25, seed:
 # -- what a barostat costs --------------------------------------------------------------------------------------
 
 
-def cost(barostat: str, waters: int, turns: int) -> dict[str, Any]:
-    """Processor time of a step with a barostat over that of one without, at the default frequency, in turns."""
-    system, x, side = water_system(waters, 0.55 if waters == WATERS else 0.9)
-    x = minimised(system, x)
-    rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-    for k in reversed(range(len(rows))):
-        system.removeConstraint(k)
-    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
-    held = ConstraintSet(
-        Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows]), x, masses, cell=np.full(3, side)
-    )
-    engine = Engine(system)
-    ours = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
-    thermal = units.kB * TEMPERATURE
-    alone = Langevin(thermal, 0.001 / units.fs, 1)
-    press = MonteCarloBarostat(BAR) if barostat == "Monte Carlo" else CellRescaling(BAR, 300 * units.fs, 5e-5 / BAR)
+def cost(barostat: str, molecules: int, turns: int) -> dict[str, Any]:
+    """Processor time of a step with a barostat over that of one without, at the default frequency, in turns.
+
+    Beside the Monte Carlo barostat water, by OpenMM; beside cell rescaling rigid diatomics, whose stress is known.
+    """
+    if barostat == "Monte Carlo":
+        box, x, side = water_system(molecules, 0.55 if molecules == WATERS else 0.9)
+        x = minimised(box, x)
+        rows = [box.getConstraintParameters(k) for k in range(box.getNumConstraints())]
+        for k in reversed(range(len(rows))):
+            box.removeConstraint(k)
+        masses = np.array([box.getParticleMass(k)._value for k in range(box.getNumParticles())])
+        row = Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows])
+        held = ConstraintSet(row, x, masses, cell=np.full(3, side))
+        engine = Engine(box)
+        system = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+        thermal, dt, press = units.kB * TEMPERATURE, 2 * units.fs, MonteCarloBarostat(BAR)
+        alone = Langevin(thermal, 0.001 / units.fs, 1)
+    else:
+        system, x = diatomics(round((molecules / 4) ** (1 / 3)))
+        thermal, dt, press = 0.3, 0.004, CellRescaling(0.5, 0.5, 0.01)
+        alone = Langevin(thermal, 1.0, 1)
     both = ConstantPressure(alone, press)
-    plain = ours.initial_state(x, thermal_velocities(ours, x, thermal, 1), project=True)
-    plain = run(ours, plain, 2 * units.fs, 500, stepper=alone)
+    state = system.initial_state(x, thermal_velocities(system, x, thermal, 1), project=True)
+    state = run(system, state, dt, 300, stepper=alone)
     ratios = []
     for _ in range(turns):
-        begun = time.process_time()
-        run(ours, plain, 2 * units.fs, 250, stepper=alone, check_every=0)
+        cell, begun = system.cell, time.process_time()
+        run(system, state, dt, 250, stepper=alone, check_every=0)
         middle = time.process_time()
-        cell = ours.cell
-        run(ours, plain, 2 * units.fs, 250, stepper=both, check_every=0)
+        run(system, state, dt, 250, stepper=both, check_every=0)
         ratios.append((time.process_time() - middle) / (middle - begun))
-        ours.set_cell(cell, plain.positions)
-    return {"barostat": barostat, "molecules": waters, "turns": turns, "ratio": float(np.median(ratios))}
+        system.set_cell(cell, state.positions)
+    return {"barostat": barostat, "molecules": molecules, "turns": turns, "ratio": float(np.median(ratios))}
 
 
 # -- a molecular crystal, a slab ------------------------------------------------------------------------------------
 
 
-def crystal(steps: int) -> dict[str, Any]:
-    """Rigid diatomics as in alpha nitrogen, 108 of them; three lengths of the cell that change by themselves."""
+def diatomics(cells: int) -> tuple[CellSystem, np.ndarray]:
+    """Rigid diatomics as in alpha nitrogen, four in each of so many cells cubed."""
     basis = np.array([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
     axes = np.array([[1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]) / np.sqrt(3)
-    side, bond, thermal = 1.75, 0.33, 0.3
-    places = (np.array(list(np.ndindex(3, 3, 3)))[:, None] + basis).reshape(-1, 3) * side
-    turned = np.tile(axes, (27, 1)) * bond / 2
+    side, bond = 1.75, 0.33
+    places = (np.array(list(np.ndindex(cells, cells, cells)))[:, None] + basis).reshape(-1, 3) * side
+    turned = np.tile(axes, (cells**3, 1)) * bond / 2
     x = np.stack([places - turned, places + turned], axis=1).reshape(-1, 3)
-    held = ConstraintSet(Distance(np.arange(216).reshape(-1, 2)), x, np.ones(216), cell=np.full(3, 3 * side))
+    rows = Distance(np.arange(len(x)).reshape(-1, 2))
+    held = ConstraintSet(rows, x, np.ones(len(x)), cell=np.full(3, cells * side))
     forces = Sites(2, 1.0)
-    system = CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress)
+    return CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress), x
+
+
+def crystal(steps: int) -> dict[str, Any]:
+    """108 of them; three lengths of the cell that change by themselves."""
+    system, x = diatomics(3)
+    thermal = 0.3
     stepper = ConstantPressure(
         Langevin(thermal, 1.0, 1), CellRescaling(0.5, 0.5, 0.01, kind="anisotropic", every=10, seed=1, cutoff=CUTOFF)
     )
@@ -452,22 +485,27 @@ def slab(steps: int) -> dict[str, Any]:
 
 
 RUNS: dict[str, Any] = {
-    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 600_000, 10),
-    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10),
+    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 600_000, 10, seed=3),
+    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10, seed=3),
+    "water, OpenMM, again": partial(run_water, "OpenMM", "Langevin", 600_000, 10, seed=5),
+    "water, Monte Carlo, again": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10, seed=5),
     "water, rescaling": partial(run_water, "rescaling", "Langevin", 200_000),
     "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 100_000),
     **{
-        f"{name}, {b}, {t}": partial(run_fluid, name, b, t, 60_000)
+        f"{name}, {b}, {t}": partial(
+            run_fluid, name, b, t, 120_000 if (name, t) == ("dumbbells", "Langevin") else 60_000
+        )
         for name in FLUIDS
         for b, t in (("Monte Carlo", "Langevin"), ("rescaling", "Langevin"), ("rescaling", "isokinetic"))
     },
     "dumbbells, Monte Carlo, Nose-Hoover": partial(run_fluid, "dumbbells", "Monte Carlo", "Nose-Hoover", 60_000),
     **{
-        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 60_000, **more, seed=2)
+        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 120_000, **more, seed=2)
         for b in ("Monte Carlo", "rescaling")
         for what, more in (("denser", {"denser": 1.3}), ("hotter", {"hotter": 1.1}))
     },
-    **{f"cost, {b}, {n} waters": partial(cost, b, n, 20) for b in ("Monte Carlo", "rescaling") for n in (WATERS, 216)},
+    **{f"cost, Monte Carlo, {n}": partial(cost, "Monte Carlo", n, 20) for n in (WATERS, 216)},
+    **{f"cost, rescaling, {n}": partial(cost, "rescaling", n, 20) for n in (108, 500)},
     "crystal": partial(crystal, 20_000),
     "slab": partial(slab, 20_000),
 }
@@ -490,12 +528,62 @@ def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
             other = found.get(f"dumbbells, {b}, Langevin, {what}")
             if first and other:
                 value, error, exact = slope(first, other)
-                told["slopes"].append({"barostat": b, "to": what, "found": value, "error": error, "exact": exact})
+                line = {"barostat": b, "to": what, "found": value, "error": error, "exact": exact}
+                told["slopes"].append({**line, "physical_validation": judged(first, other)})
     return told
+
+
+def told(pair: Any, digits: int, scale: float = 1.0) -> str:
+    return f"{scale * pair[0]:.{digits}f} ± {scale * pair[1]:.{digits}f}"
+
+
+def weighted(pairs: list[Any]) -> tuple[float, float]:
+    """One mean of several with errors."""
+    value, error = np.array(pairs).T
+    w = error**-2
+    return float((w * value).sum() / w.sum()), float(w.sum() ** -0.5)
+
+
+def show(path: str) -> None:
+    """Tables for the page."""
+    result = json_files.read(path)
+    runs, slopes = result["runs"], result["slopes"]
+    print("| 64 TIP3P waters | thermostat | ns | density, g/cm³ | κ, 10⁻⁵/bar |\n| --- | --- | --- | --- | --- |")
+    water = [one for name, one in runs.items() if name.startswith("water")]
+    for b in ("OpenMM", "Monte Carlo", "rescaling"):
+        for t in ("Langevin", "isokinetic"):
+            same = [one for one in water if (one["barostat"], one["thermostat"]) == (b, t)]
+            if same:
+                time_ = sum(one["picoseconds"] for one in same) / 1000
+                density, kappa = (weighted([one[key] for one in same]) for key in ("density", "compressibility"))
+                name = "OpenMM's own" if b == "OpenMM" else b
+                print(f"| {name} | {t} | {time_:.1f} | {told(density, 4)} | {told(kappa, 2, 1e5)} |")
+    print("\n| fluid | barostat | thermostat | V/N | U/N | κ |\n| --- | --- | --- | --- | --- | --- |")
+    for name, one in runs.items():
+        if "volume" in one and not name.endswith(("denser", "hotter")):
+            n = one["molecules"]
+            row = told(one["volume"], 3, 1 / n), told(one["energy"], 3, 1 / n), told(one["compressibility"], 2)
+            print(f"| {one['fluid']} | {one['barostat']} | {one['thermostat']} | {' | '.join(row)} |")
+    print("\n| barostat | to | slope found | exact | physical_validation |\n| --- | --- | --- | --- | --- |")
+    for one in slopes:
+        what = "1.3 P, along V" if one["to"] == "denser" else "1.1 T, along U + P V"
+        off, found = one["physical_validation"], told((one["found"], one["error"]), 4)
+        print(f"| {one['barostat']} | {what} | {found} | {one['exact']:.4f} | {off:.1f} σ |")
+    print("\n| barostat | molecules | a step costs more by |\n| --- | --- | --- |")
+    for name, one in runs.items():
+        if name.startswith("cost"):
+            kind = "TIP3P waters, OpenMM" if one["barostat"] == "Monte Carlo" else "rigid diatomics"
+            print(f"| {one['barostat']} | {one['molecules']} {kind} | {one['ratio'] - 1:.1%} |")
+    sides = ", ".join(told(one, 4) for one in runs["crystal"]["sides"])
+    print(f"\nCrystal: {sides}.")
+    print(f"Slab: {told(runs['slab']['side'], 4)} beside {runs['slab']['perfect']:.4f}.")
 
 
 def main(arguments: list[str]) -> None:
     """Short runs of a few, or full ones."""
+    if arguments[:1] == ["--show"]:
+        show(arguments[1])
+        return
     if "--full" in arguments:
         names = [name for name in arguments if name in RUNS] or list(RUNS)
         found = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 from committed_pages import FOLDER, page, printed
 
 RESULT = json.loads((FOLDER / "monte_carlo.json").read_text(encoding="utf-8"))
@@ -11,6 +12,17 @@ RESULT = json.loads((FOLDER / "monte_carlo.json").read_text(encoding="utf-8"))
 
 def test_the_page_shows_them():
     assert printed("32_hamiltonian_monte_carlo.py", "monte_carlo.json") in page("monte_carlo.md")
+
+
+def test_distributions_are_those_of_quadrature_and_of_metropolis():
+    """p above 0.001."""
+    small = RESULT["small"]
+    for row in small["rows"]:
+        away = np.abs(np.array(row["mean"]) - small["exact"]) / row["error"]
+        assert away.max() < 3.5, row["method"]
+        assert min(row["p"]) > 1e-3 and min(row["p_metropolis"]) > 1e-3, row["method"]
+        assert row["independent"] >= 590
+        assert row["rejected"] is None or sum(row["rejected"]) > 20
 
 
 def test_rigid_water_makes_long_steps():

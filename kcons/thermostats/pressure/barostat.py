@@ -118,7 +118,7 @@ class Barostat:
         self,
         pressure: float,
         *,
-        every: int = 25,
+        every: int = 50,
         kind: Kind = "isotropic",
         seed: int = 0,
         tension: float = 0.0,

@@ -1,0 +1,77 @@
+"""The page on constant pressure shows the committed results, and these reach what they must."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from committed_pages import FOLDER, ROOT, page, printed
+
+RESULTS = json.loads((FOLDER / "constant_pressure.json").read_text(encoding="utf-8"))
+RUNS, SLOPES = RESULTS["runs"], RESULTS["slopes"]
+
+
+def of(start, key):
+    """Values with errors of the runs whose names begin so."""
+    pairs = [
+        one[key] for name, one in RUNS.items() if name.startswith(start) and not name.endswith(("denser", "hotter"))
+    ]
+    assert len(pairs) >= 1
+    return np.array(pairs)
+
+
+def one_of(pairs):
+    w = pairs[:, 1] ** -2
+    return (w * pairs[:, 0]).sum() / w.sum(), w.sum() ** -0.5
+
+
+def agree(pairs, most=3.5):
+    mean, _ = one_of(pairs)
+    assert np.all(np.abs(pairs[:, 0] - mean) < most * pairs[:, 1])
+
+
+def test_the_page_shows_them():
+    text = page("constant_pressure.md")
+    for line in printed("34_constant_pressure.py", "constant_pressure.json").split("\n"):
+        assert line in text, line
+
+
+def test_density_of_water_is_that_of_openmm():
+    ours, theirs = (one_of(of(f"water, {name}", "density")) for name in ("Monte Carlo", "OpenMM"))
+    error = np.hypot(ours[1], theirs[1])
+    assert abs(ours[0] - theirs[0]) < 2 * error
+    assert abs(ours[0] / theirs[0] - 1) < 2e-3
+    assert error / theirs[0] < 3e-3
+    agree(of("water", "density"))
+    agree(of("water", "compressibility"))
+
+
+@pytest.mark.parametrize("fluid", ["dumbbells", "methane, 10 distances of rank 9"])
+def test_barostats_and_thermostats_agree(fluid):
+    for key in ("volume", "energy", "compressibility"):
+        agree(of(fluid, key))
+
+
+def test_slopes_between_pressures_and_temperatures():
+    assert len(SLOPES) == 4
+    for line in SLOPES:
+        assert abs(line["found"] - line["exact"]) < 3 * line["error"]
+        assert line["error"] < 0.2 * abs(line["exact"])
+        assert line["physical_validation"] < 3
+
+
+def test_a_barostat_costs_little():
+    assert RUNS["cost, Monte Carlo, 216"]["ratio"] < 1.06
+    assert RUNS["cost, rescaling, 500"]["ratio"] < 1.05
+
+
+@pytest.mark.validation
+def test_a_fluid_anew():
+    """Against the committed volume."""
+    spec = importlib.util.spec_from_file_location("example", ROOT / "examples" / "34_constant_pressure.py")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    found = example.run_fluid("dumbbells", "Monte Carlo", "isokinetic", 20_000, seed=9)
+    agree(np.array([example.mean_and_error(found["volumes"]), one_of(of("dumbbells", "volume"))]))
