@@ -74,4 +74,4 @@ def test_errors_and_calls_are_told():
     for run in RUNS.values():
         assert run["status"] == "ok" and run["samples"] >= 64 and run["evaluations"] > 0
         assert all(0 < error < 0.05 for _, error in run["kinds"].values())
-    assert {key[0] for key in RUNS} == {"langevin", "langevin-respa", "spheres", "hmc"}
+    assert {key[0] for key in RUNS} == {"langevin", "langevin-respa", "langevin-halfway", "spheres", "hmc"}

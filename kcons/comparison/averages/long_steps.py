@@ -85,6 +85,14 @@ def _respa(layers: Layers, step: float, friction: float, seed: int) -> Stepper:
     return LangevinRespa(layers.thermal_energy, friction, seed, steps=_groups(layers, step), substeps=1)
 
 
+def _halfway(layers: Layers, step: float, friction: float, seed: int) -> Stepper:
+    """With slow kicks in the middle of a step, so that states lie halfway between them."""
+    steps = _groups(layers, step)
+    if steps["fast"] == 1:
+        return _langevin(layers, step, friction, seed)
+    return LangevinRespa(layers.thermal_energy, friction, seed, steps=steps, slow_kicks="middle", substeps=1)
+
+
 def _spheres(layers: Layers, step: float, friction: float, seed: int) -> Stepper:
     if layers.inner_steps(step) == 1:
         return IsokineticSpheres(layers.thermal_energy, friction, seed, substeps=1)
@@ -102,6 +110,7 @@ METHODS: Mapping[str, Method] = {
     for method in (
         Method("langevin", "Langevin, one step", _langevin, several=False),
         Method("langevin-respa", "Langevin, several steps", _respa),
+        Method("langevin-halfway", "the same, read between kicks", _halfway),
         Method("spheres", "isokinetic spheres", _spheres),
         Method("hmc", "Hamiltonian Monte Carlo, order 4", _monte_carlo, several=False, frictions=False),
     )

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 STYLES: dict[str, tuple[str, str]] = {
     "langevin": ("#009E73", "s"),
     "langevin-respa": ("#D55E00", "^"),
+    "langevin-halfway": ("#E69F00", "v"),
     "spheres": ("#0072B2", "o"),
     "hmc": ("#CC79A7", "D"),
 }

@@ -22,7 +22,7 @@ def layers():
 
 @pytest.fixture(scope="module")
 def runs(layers):
-    steps = {"langevin": 2, "langevin-respa": 4, "spheres": 4, "hmc": 4}
+    steps = {"langevin": 2, "langevin-respa": 4, "langevin-halfway": 4, "spheres": 4, "hmc": 4}
     return {name: measure(layers, METHODS[name], dt * FS, 0.01 / FS, length=4000 * FS) for name, dt in steps.items()}
 
 
@@ -37,7 +37,7 @@ def test_every_method_is_right_at_a_fine_step(layers, runs):
 
 def test_evaluations_are_counted(runs):
     """One of the expensive forces a step, with several steps cheap ones besides; in Monte Carlo those of its scheme."""
-    for name, per_step in (("langevin", 1), ("langevin-respa", 1), ("spheres", 1)):
+    for name, per_step in (("langevin", 1), ("langevin-respa", 1), ("langevin-halfway", 1), ("spheres", 1)):
         run = runs[name]
         assert run.evaluations == pytest.approx(per_step * run.length / run.step, abs=2)
     assert runs["langevin"].cheap == 0 and runs["hmc"].cheap == 0
