@@ -70,6 +70,19 @@ def test_turns_are_the_first_to_go():
         assert abs(energy) <= 3 * doubt and turn > 5 * error
 
 
+def test_halfway_between_kicks_sixteen_femtoseconds_are_right():
+    """Within three standard errors where the same run read at the kicks is eight and more off."""
+    there = RUNS["langevin-halfway", 16.0, 5]
+    assert abs(there["energy_off"][0]) <= 3 * there["energy_off"][1]
+    for kind in ("shift", "turn"):
+        value, error = there["kinds"][kind]
+        assert abs(value) <= 3 * error and error < 0.01
+    value, error = off(("langevin-respa", 16.0, 5), "turn")
+    assert value > 8 * error
+    assert RUNS["langevin", 2.0, 5]["evaluations"] == pytest.approx(8 * there["evaluations"], rel=0.01)
+    assert off(("langevin-halfway", 24.0, 20), "turn")[0] > 0.1
+
+
 def test_errors_and_calls_are_told():
     for run in RUNS.values():
         assert run["status"] == "ok" and run["samples"] >= 64 and run["evaluations"] > 0

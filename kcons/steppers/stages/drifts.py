@@ -88,6 +88,8 @@ class NonholonomicFlight:
         kicked = v.copy()
         # A kick that the rows take up whole leaves no speed to compare with, only the rounding of the kick.
         before = float(np.abs(kicked[self.atoms]).max())
+        # Impulses that bring positions back know them to rounding, whatever the speed: a wheel may start from rest.
+        rounding = 4 * _EPS * float(np.abs(x0).max()) / abs(h)
         error = np.inf
         for _ in range(_MAX_ITERATIONS):
             np.copyto(v, kicked)
@@ -102,7 +104,7 @@ class NonholonomicFlight:
             miss = (rows @ local - wanted) / size[self.is_velocity]
             speed = max(before, float(np.abs(local).max()), float(np.abs(wanted / size[self.is_velocity]).max()))
             last, error = error, float(np.abs(miss).max())
-            if error <= 4 * _EPS * speed or (error >= last and error <= 1e-13 * speed):
+            if error <= 4 * _EPS * speed or (error >= last and error <= max(1e-13 * speed, rounding)):
                 point.x = out
                 return
             impulses -= respond @ miss

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from stepper_systems import growing_rod, rotor, skate, system_of
 
+from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
     CustomVelocity,
     Distance,
@@ -13,6 +14,8 @@ from kcons.constraints import (
     ImplicitSurface,
     LinearVelocity,
     MovingTarget,
+    Plane,
+    Rolling,
     Sphere,
 )
 from kcons.errors import ConvergenceError
@@ -194,3 +197,19 @@ def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
     x, u = flown(rattle_drift(system.motion, system.inverse_masses), system, state, h)
     middle = 0.5 * (state.positions + x)[2, 0]
     assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.001, 0.0001])
+@pytest.mark.parametrize("slope", [0.0, 0.17])
+def test_a_wheel_starts_to_roll_from_rest(slope, dt) -> None:
+    """Velocities are known to what rounding of the positions leaves of them, also where they vanish."""
+    along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
+    turns = np.radians([0, 120, 240])[:, None]
+    x = up + np.vstack([np.zeros(3), np.cos(turns) * along + np.sin(turns) * up])
+    masses = np.array([0.5, 1.0, 1.0, 1.0])
+    held = [Plane([0], up), Plane([0, 1, 2, 3], [0.0, 1.0, 0.0]), Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]])]
+    motion = Motion(ConstraintSet([*held, Rolling([0], [1], 1.0, along, up)], x, masses), x)
+    weight = masses[:, None] * np.array([0.0, 0.0, -10.0])
+    end = run(System(motion, lambda x, t: weight), State(x, np.zeros_like(x)), dt, 100)
+    rolled = (end.positions[0] - x[0]) @ along
+    assert rolled == pytest.approx(10 * np.sin(slope) * 3.5 / 6.5 * (100 * dt) ** 2 / 2, rel=1e-4, abs=1e-13)

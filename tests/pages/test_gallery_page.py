@@ -1,0 +1,32 @@
+"""The gallery: each script runs, is short, checks what it shows, and has its picture on the page."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+import pytest
+from committed_pages import ROOT, page
+from PIL import Image
+
+SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_script_runs_and_is_on_the_page(script, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path), "8"])
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    runpy.run_path(str(script), run_name="__main__")
+    with Image.open(tmp_path / f"{script.stem}.gif") as drawn:
+        assert 2 <= drawn.n_frames <= 9
+    text = script.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    assert "assert" in text
+    assert f"examples/gallery/{script.name}" in page("gallery.md")
+    assert f"](figures/{script.stem}.gif)" in page("gallery.md")
+    with Image.open(ROOT / "docs" / "figures" / f"{script.stem}.gif") as shown:
+        assert shown.n_frames >= 20
+
+
+def test_all_are_there():
+    assert len(SCRIPTS) >= 5
