@@ -94,9 +94,10 @@ def explanation(runs: Sequence[Stepped]) -> str:
 
 def figure(runs: Sequence[Stepped], units: Units, title: str = "") -> Figure:
     """Size of the bias against evaluations of the expensive forces, with standard errors as bars."""
-    kinds = [kind for kind in KINDS if any(kind in run.kinds for run in runs)]
+    # Runs that were all too short leave an empty diagram.
+    kinds = [kind for kind in KINDS if any(kind in run.kinds for run in runs)] or ["shift"]
     panels = [_panel(runs, units, kind) for kind in kinds]
-    return draw([panels], (4.2 * max(len(panels), 1) + 1.5, 4.6), title=title, legend=2)
+    return draw([panels], (4.2 * len(panels) + 1.5, 4.6), title=title, legend=2)
 
 
 def _panel(runs: Sequence[Stepped], units: Units, kind: str) -> Panel:

@@ -61,3 +61,11 @@ def test_files(tmp_path):
     data = json.loads(paths[0].read_text(encoding="utf-8"))
     assert len(data["runs"]) == 3 and "correlation" not in data["runs"][2]
     assert paths[1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_runs_that_were_all_too_short_are_written(tmp_path):
+    short = Stepped("langevin", 2.0, 0.005, "partial", note="3 samples are too few for an error")
+    comparison = StepComparison("a title", ASE_UNITS, None, [short], {}, {"cpu": "a processor"})
+    paths = report.write(comparison, tmp_path)
+    assert [path.name for path in paths] == ["compare.json", "compare.png"]
+    assert paths[1].stat().st_size > 0
