@@ -37,6 +37,7 @@ from kcons.thermostats import (
     Langevin,
     MonteCarloBarostat,
     NoseHooverChain,
+    autocorrelation_time,
     thermal_velocities,
 )
 
@@ -173,23 +174,11 @@ def run_fluid(
 # -- statistics -----------------------------------------------------------------------------------------------------
 
 
-def correlation_time(values: np.ndarray) -> float:
-    """Integrated, in samples."""
-    d = values - values.mean()
-    n = len(d)
-    rho = np.fft.irfft(np.abs(np.fft.rfft(d, 2 * n)) ** 2)[:n] / np.arange(n, 0, -1)
-    rho /= rho[0]
-    total = 1.0
-    for k in range(1, n):
-        total += 2 * rho[k]
-        if k > 6 * total:
-            break
-    return max(total, 1.0)
-
-
 def mean_and_error(values: Any) -> tuple[float, float]:
     values = np.asarray(values)
-    return float(values.mean()), float(values.std() * np.sqrt(correlation_time(values) / len(values)))
+    if len(values) < 32:  # of short runs no error is known
+        return float(values.mean()), float("nan")
+    return float(values.mean()), float(values.std() * np.sqrt(autocorrelation_time(values) / len(values)))
 
 
 def compressed(volumes: Any) -> tuple[float, float]:
@@ -212,7 +201,7 @@ def slope(one: dict[str, Any], two: dict[str, Any]) -> tuple[float, float, float
     else:
         values = [np.array(f["energies"]) + f["pressure"] * np.array(f["volumes"]) for f in (one, two)]
         exact = 1 / one["temperature"] - 1 / two["temperature"]
-    values = [v[:: int(np.ceil(correlation_time(v)))] for v in values]
+    values = [v[:: int(np.ceil(autocorrelation_time(v)))] for v in values]
     x = np.concatenate(values)
     side = np.repeat([0.0, 1.0], [len(v) for v in values])
     design = np.stack([np.ones_like(x), x - x.mean()], axis=1)
@@ -385,7 +374,7 @@ def run_water(barostat: str, thermostat: str, steps: int, every: int = 25, seed:
         "acceptance": acceptance,
         "density": mean_and_error(density / volumes),
         "compressibility": [kappa / thermal * BAR, error / thermal * BAR],
-        "correlation_ps": correlation_time(volumes) * 0.05,
+        "correlation_ps": autocorrelation_time(volumes) * 0.05,
     }
 
 

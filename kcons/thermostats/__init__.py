@@ -21,7 +21,13 @@ from kcons.thermostats.langevin import Langevin
 from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import Counts, HamiltonianMonteCarlo
 from kcons.thermostats.monte_carlo.replica_exchange import exchange
 from kcons.thermostats.monte_carlo.tuning import Tuned, best_share, tune
-from kcons.thermostats.multistep import ForceGroups, IsokineticSpheres, LangevinRespa, evaluations_per_sample
+from kcons.thermostats.multistep import (
+    ForceGroups,
+    IsokineticSpheres,
+    LangevinRespa,
+    autocorrelation_time,
+    evaluations_per_sample,
+)
 from kcons.thermostats.nose_hoover import NoseHooverChain
 from kcons.thermostats.pressure import (
     CellRescaling,
@@ -54,6 +60,7 @@ __all__ = [
     "SplitTemperatures",
     "TemperatureSplit",
     "Tuned",
+    "autocorrelation_time",
     "best_share",
     "configurational_sample",
     "configurational_temperature",

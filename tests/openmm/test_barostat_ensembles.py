@@ -10,11 +10,12 @@ import numpy as np
 import openmm
 import pytest
 from openmm_systems import started, state_of
-from pressure_systems import TRIANGLE, correlation_time, p_value, placed
+from pressure_systems import TRIANGLE, p_value, placed
 from scipy import stats
 
 from kcons.constraints import Distance
 from kcons.openmm import Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, hold, molecular_pressure
+from kcons.thermostats.multistep import autocorrelation_time
 
 N, SIDE, KT = 30, 6.0, 0.00831446261815324 * 300
 #: In bar, for a mean volume of SIDE^3 with N molecules.
@@ -84,7 +85,7 @@ def volumes(system, integrator, x, barostat, count=1200, part=None):
 def judge(found, n, pressure):
     exact = stats.gamma(n + 1, scale=KT / pressure)
     assert p_value(found, exact) > 0.01
-    error = exact.std() * np.sqrt(correlation_time(found) / len(found))
+    error = exact.std() * np.sqrt(autocorrelation_time(found) / len(found))
     assert error < 0.05 * exact.mean()
     assert abs(found.mean() - exact.mean()) < 3.5 * error
 

@@ -11,6 +11,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.motion import Motion
 from kcons.steppers import State
 from kcons.thermostats import thermal_velocities
+from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import Barostat, CellSystem
 
 Array = NDArray[np.float64]
@@ -67,22 +68,7 @@ def cells_of(system: CellSystem, state: State, barostat: Barostat, trials: int, 
     return cells
 
 
-def correlation_time(values: Array) -> float:
-    """Integrated, in samples: 1 for independent ones."""
-    d = values - values.mean()
-    n = len(d)
-    spectrum = np.abs(np.fft.rfft(d, 2 * n)) ** 2
-    rho = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
-    rho /= rho[0]
-    total = 1.0
-    for k in range(1, n):
-        total += 2 * rho[k]
-        if k > 5 * total:
-            break
-    return max(total, 1.0)
-
-
 def p_value(values: Array, distribution: stats.rv_continuous) -> float:
     """Of a Kolmogorov-Smirnov test on every so many of correlated values."""
-    apart = int(np.ceil(correlation_time(values)))
+    apart = int(np.ceil(autocorrelation_time(values)))
     return float(stats.kstest(values[::apart], distribution.cdf).pvalue)

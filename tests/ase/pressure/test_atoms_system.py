@@ -9,7 +9,7 @@ from ase.build import bulk
 from ase.calculators.emt import EMT
 from ase.constraints import Hookean
 from ase_systems import FS, TEMPERATURE, Field, Free, dumbbells, follow
-from pressure_systems import correlation_time, p_value
+from pressure_systems import p_value
 from scipy import stats
 
 from kcons.ase import (
@@ -22,6 +22,7 @@ from kcons.ase import (
 )
 from kcons.constraints import Distance, FixedAtoms, Plane
 from kcons.errors import InputError, NonFiniteError, UnsupportedError
+from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
 
 KT = units.kB * TEMPERATURE
@@ -53,7 +54,7 @@ def test_volumes_of_a_rigid_ideal_gas(name, which):
     volumes = follow(dyn, atoms.get_volume, 400)[50:]
     exact = stats.gamma(N + 1, scale=KT / PRESSURE)
     assert p_value(volumes, exact) > 0.01
-    error = exact.std() * np.sqrt(correlation_time(volumes) / len(volumes))
+    error = exact.std() * np.sqrt(autocorrelation_time(volumes) / len(volumes))
     assert error < 0.04 * exact.mean()
     assert abs(volumes.mean() - exact.mean()) < 3 * error
     held.engine(atoms).certify(atoms.positions, atoms.get_velocities())
@@ -136,7 +137,7 @@ def test_adsorbates_on_planes_follow_in_the_plane():
     assert atoms.positions[::2, 2] == pytest.approx(heights, abs=1e-12)
     assert atoms.cell[2, 2] == SIDE
     exact = (2 * N + 1) / (2 * N) * SIDE**2
-    assert abs(areas.mean() / exact - 1) < 3 * 0.09 * np.sqrt(correlation_time(areas) / len(areas))
+    assert abs(areas.mean() / exact - 1) < 3 * 0.09 * np.sqrt(autocorrelation_time(areas) / len(areas))
 
 
 def test_fixed_atoms_stay_as_a_wall_where_asked():

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pressure_systems import TRIANGLE, correlation_time, gas, p_value
+from pressure_systems import TRIANGLE, gas, p_value
 from scipy import stats
 from thermostat_systems import dumbbells
 
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, run
 from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain, thermal_velocities
+from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import CellRescaling, ConstantPressure, MonteCarloBarostat
 
 N, SIDE = 40, 12.0
@@ -42,7 +43,7 @@ def test_volumes_between_steps(name):
     volumes = np.linalg.det(np.array(volumes[1:]))
     exact = stats.gamma(N + 1, scale=1 / PRESSURE)
     assert p_value(volumes, exact) > 0.01
-    error = exact.std() * np.sqrt(correlation_time(volumes) / len(volumes))
+    error = exact.std() * np.sqrt(autocorrelation_time(volumes) / len(volumes))
     assert abs(volumes.mean() - exact.mean()) < 3 * error
 
 

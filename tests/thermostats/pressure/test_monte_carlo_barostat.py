@@ -9,7 +9,6 @@ from pressure_systems import (
     METHANE,
     TRIANGLE,
     cells_of,
-    correlation_time,
     gas,
     no_force,
     p_value,
@@ -18,6 +17,7 @@ from pressure_systems import (
 )
 from scipy import stats
 
+from kcons.thermostats.multistep import autocorrelation_time
 from kcons.thermostats.pressure import MonteCarloBarostat
 
 
@@ -30,7 +30,7 @@ def test_volumes_of_a_rigid_ideal_gas(shape):
     volumes = np.linalg.det(cells_of(system, started(system, x, barostat), barostat, 1200))
     exact = stats.gamma(n + 1, scale=side**3 / (n + 1))
     assert p_value(volumes, exact) > 0.01
-    error = exact.std() * np.sqrt(correlation_time(volumes) / len(volumes))
+    error = exact.std() * np.sqrt(autocorrelation_time(volumes) / len(volumes))
     assert abs(volumes.mean() - exact.mean()) < 3 * error
     assert error < 0.01 * exact.mean()
     # It could tell the number of molecules from that of atoms.
