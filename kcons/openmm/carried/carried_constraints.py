@@ -42,6 +42,7 @@ from kcons.openmm.carried.requirements import (
 from kcons.openmm.integrator.part import NEAR, Miss, Part
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
@@ -136,7 +137,7 @@ class CarriedConstraints(Part):
             for force in mine:
                 force.setParticles([])
         part._bind(LIVE[keys[0]], [force.getForceGroup() for force in mine])
-        part.alone = system.getNumConstraints() == 0
+        part._look_at(system)
         return part
 
     def forces(self) -> list[openmm.PythonForce]:
@@ -157,7 +158,11 @@ class CarriedConstraints(Part):
         """Put the forces into the System; before the Context is made."""
         for force in self.forces():
             system.addForce(force)
+        self._look_at(system)
+
+    def _look_at(self, system: openmm.System) -> None:
         self.alone = system.getNumConstraints() == 0
+        self.sited = bool(virtual_sites(system))
 
     # -- what is held ---------------------------------------------------------------------------
 

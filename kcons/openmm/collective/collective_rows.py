@@ -41,6 +41,7 @@ from kcons.openmm.collective.small_algebra import PIVOT, blocks
 from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
 
@@ -157,6 +158,7 @@ class CollectiveRows(GroupRows):
         )
         atoms = [moved_atoms(system, f) for f in forces]
         self._refuse_sites(system, atoms)
+        self.sited = bool(virtual_sites(system))
         #: The particles of each row.
         self.atoms = tuple(tuple(sorted(touched)) for touched in atoms)
         rigid = Rigid(system)
