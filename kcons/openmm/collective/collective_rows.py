@@ -133,8 +133,7 @@ class CollectiveRows(GroupRows):
                 for k, (value, of) in enumerate(zip(values, self._units, strict=True))
             ]
 
-        self._targets = read("target")
-        self._rates = read("rate", unit.picosecond)
+        self._targets, self._rates = read("target"), read("rate", unit.picosecond)
         periods, scales = read("period"), read("scale")
         for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
             if target is None and positions is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.part import Part
@@ -29,10 +29,8 @@ class StepWriter:
     kept : bool
         Whether the applied forces are kept in a variable: where parts evaluate row groups, OpenMM remembers the
         forces of the last groups only.
-    sited : bool
-        Whether parts stand beside virtual sites.
-    divided : bool
-        Whether steps with parts can be made in two executions of the program, up to the forces and with them.
+    sited, divided : bool
+        Whether parts stand beside virtual sites; whether steps can be made in two executions then.
     """
 
     def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
@@ -131,16 +129,10 @@ class StepWriter:
         p, n = self.program, len(self.drifts)
         use(p, "failed", "good_steps", "first_stage")
         use(p, "end_stage", value=n)
-        use(p, "stage", "h")
-        if self._last_drift_apart:
-            use(p, "per_h")
-        if self.divided:
-            use(p, "phase")
+        use(p, "stage", "h", *["per_h"] * self._last_drift_apart, *["phase"] * self.divided)
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
-        use(p, "x_last", "v_last", "stale")
-        if self.kept:
-            use(p, "moved")
+        use(p, "x_last", "v_last", "stale", *["moved"] * self.kept)
 
     def _write_guarded(self) -> None:
         """The same program brings positions, or velocities alone, onto the constraints.
@@ -149,52 +141,47 @@ class StepWriter:
         """
         p = self.program
         if not self.divided:
-            self._let_others_act()
-            with p.when("failed = 0", "after a failure nothing moves"):
-                self._write_up_to_forces()
-                self._write_with_forces()
+            self._write_up_to_forces(self._write_with_forces)
             return
         with p.when("phase != 2", "up to the new positions"):
-            self._let_others_act()
-            with p.when("failed = 0", "after a failure nothing moves"):
-                self._write_up_to_forces()
+            self._write_up_to_forces()
         with p.when("phase != 1", "with the forces there"):
             self._write_with_forces()
         p.let("phase", "select(phase, 3-phase, 0)", "what follows")
 
-    def _let_others_act(self) -> None:
-        with self.program.when("first_stage+failed = 0", "a step, and nothing failed before"):
-            self.program.let_others_act()
-
-    def _write_up_to_forces(self) -> None:
+    def _write_up_to_forces(self, then: Callable[[], None] = lambda: None) -> None:
         p = self.program
-        if self.kept:
-            p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
-            with p.when("moved+stale != 0", "others did"):
-                p.each("x_last", "x", "start here")
-                p.each("force", "f", "applied forces")
-                for part in self.parts:
-                    part.begin(p)
-                    if self.ensemble.stays_tangent:
-                        part.begin_early(p)
-        else:
-            p.each("x_last", "x", "to come back to")
-        p.let("stale", "0", "forces belong to x")
-        p.each("v_last", "v", "to come back to")
-        self.ensemble.open(p)
-        if self.kicks[0]:
-            self._kick("dt*kick_share(first_stage)", tangent=True)
-        p.let("stage", "first_stage", "first drift")
-        if self.halves:
-            with p.when("first_stage = 0", "a step"):
-                p.let("h", "dt*drift_share(0)", "length of the first drift")
-                # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
-                self.ensemble.middle(p, f"v+{self._drift('h')}", self._project)
-                p.let("stage", "1", "what follows")
-        if self._last_drift_apart:
-            self._write_single()
-        else:
-            self._write_loop()
+        with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
+            p.let_others_act()
+        with p.when("failed = 0", "after a failure nothing moves"):
+            if self.kept:
+                p.sum("moved", "(x-x_last)^2", "barostats and setPositions move x between steps")
+                with p.when("moved+stale != 0", "others did"):
+                    p.each("x_last", "x", "start here")
+                    p.each("force", "f", "applied forces")
+                    for part in self.parts:
+                        part.begin(p)
+                        if self.ensemble.stays_tangent:
+                            part.begin_early(p)
+            else:
+                p.each("x_last", "x", "to come back to")
+            p.let("stale", "0", "forces belong to x")
+            p.each("v_last", "v", "to come back to")
+            self.ensemble.open(p)
+            if self.kicks[0]:
+                self._kick("dt*kick_share(first_stage)", tangent=True)
+            p.let("stage", "first_stage", "first drift")
+            if self.halves:
+                with p.when("first_stage = 0", "a step"):
+                    p.let("h", "dt*drift_share(0)", "length of the first drift")
+                    # Multipliers are those of the drifts: what noise has across the constraints is none of theirs.
+                    self.ensemble.middle(p, f"v+{self._drift('h')}", self._project)
+                    p.let("stage", "1", "what follows")
+            if self._last_drift_apart:
+                self._write_single()
+            else:
+                self._write_loop()
+            then()
 
     def _write_with_forces(self) -> None:
         p = self.program
