@@ -196,6 +196,8 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
+            if state.cell is not None:  # a barostat may have changed it before something else failed
+                self.atoms.cell[...] = state.cell
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
