@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import copy
 import pickle
+import subprocess
+import sys
 
 import ase.constraints
 import numpy as np
 import pytest
 from ase import Atoms, units
 from ase.build import molecule, sort
+from ase.calculators.tip3p import TIP3P
 from ase.constraints import (
     FixAtoms,
     FixCartesian,
@@ -25,14 +29,16 @@ from ase_systems import (
     rigid,
 )
 
-from kcons.ase import Constraints, constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, constrain, from_ase_constraints, rigid_water
 from kcons.constraints import (
     Angle,
     Dihedral,
     Distance,
     FixedAtoms,
     ImplicitSurface,
+    Line,
     LinearCombination,
+    Plane,
     Sphere,
 )
 from kcons.errors import (
@@ -137,6 +143,85 @@ def test_constraint_object_round_trip():
     assert isinstance(again, Constraints)
     assert again.todict() == data
     assert held.copy().todict() == data
+
+
+#: What is held, and the object of ASE that holds the same; None where no single one does.
+NATIVE = {
+    "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
+    "FixInternals": [Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+    "FixAtoms": [FixedAtoms([8, 0])],
+    "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
+    "FixedLine": [Line([4, 0], None, [0, 1, 2])],
+    "two directions": [Plane([4], [0, 1, 2]), Plane([5], [0, 1, 1])],
+    "two kinds": [FixedAtoms([8]), Distance([[0, 1]])],
+}
+
+
+@pytest.fixture(scope="module")
+def opened_by_ase(tmp_path_factory):
+    """What ASE makes, in a process that never saw kcons, of files with each of `NATIVE`."""
+    folder = tmp_path_factory.mktemp("native")
+    for name, rows in NATIVE.items():
+        atoms = molecule("CH3CH2OH")
+        constrain(atoms, rows)
+        write(folder / f"{name}.traj", atoms)
+        write(folder / f"{name}.json", atoms)
+    code = """
+import sys
+from pathlib import Path
+from ase.io import read
+for path in sorted(Path(sys.argv[1]).glob("*.*")):
+    try:
+        atoms = read(path)
+        (held,) = atoms.constraints
+        kwargs = held.todict()["kwargs"]
+        if hasattr(held, "bondlengths"):  # which ASE itself does not write
+            kwargs["bondlengths"] = held.bondlengths
+        print(path.name, type(held).__name__, atoms.get_number_of_degrees_of_freedom(), kwargs, sep=";")
+    except ValueError:
+        print(path.name, "refused", 0, {}, sep=";")
+assert "kcons" not in sys.modules
+"""
+    run = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
+    return folder, {line.split(";")[0]: line.split(";")[1:] for line in run.stdout.splitlines()}
+
+
+@pytest.mark.parametrize("name", NATIVE)
+@pytest.mark.parametrize("suffix", ["traj", "json"])
+def test_files_open_without_kcons_where_ase_can_hold_the_same(opened_by_ase, name, suffix):
+    folder, found = opened_by_ase
+    kind, freedom, kwargs = found[f"{name}.{suffix}"]
+    ours = read(folder / f"{name}.{suffix}")
+    assert isinstance(ours.constraints[0], Constraints)
+    if not name.startswith("Fix"):
+        assert kind == "refused"
+        return
+    assert kind == name and int(freedom) == ours.get_number_of_degrees_of_freedom()
+    # The rows of ASE's object are ours again, with the same targets; those of lengths and angles are in the file.
+    twin = ours.copy()
+    if name in ("FixBondLengths", "FixInternals"):
+        twin.positions *= 1.01
+    twin.set_constraint(dict2constraint({"name": kind, "kwargs": ast.literal_eval(kwargs)}))
+    rows = Constraints(from_ase_constraints(twin)).engine(ours).constraint_set
+    expected = ours.constraints[0].engine(ours).constraint_set
+    assert np.sort(rows.target()) == pytest.approx(np.sort(expected.target()), abs=1e-12)
+
+
+def test_a_restart_from_a_file_that_ase_can_open_is_exact(tmp_path):
+    """The rows and targets of kcons stand beside those of ASE, to the last bit."""
+    atoms, held = rigid(2)
+    path = tmp_path / "run.traj"
+    dynamics = ConstrainedDynamics(atoms, units.fs, trajectory=str(path))
+    dynamics.run(2)
+    again = read(path)
+    assert again.constraints[0].todict() == held.todict()
+    assert again.constraints[0].todict()["name"] == "FixBondLengths"
+    forces = again.get_forces(apply_constraint=False)
+    again.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(again, units.fs, forces=forces, time=dynamics.get_time()).run(3)
+    dynamics.run(3)
+    assert np.array_equal(again.positions, atoms.positions)
+    assert np.array_equal(again.get_momenta(), atoms.get_momenta())
 
 
 def test_copies_are_independent():
