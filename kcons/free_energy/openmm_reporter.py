@@ -12,9 +12,9 @@ from openmm import unit
 
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
-from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet, same_rows
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates, same_rows
+from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.free_energy.series import Series
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
