@@ -427,8 +427,7 @@ class Windows:
         found = []
         problems = dict(failed)
         for number, target in enumerate(self._targets):
-            sides: dict[str, MeanForce] = {}
-            seconds = 0.0
+            sides, seconds = dict[str, MeanForce](), 0.0
             for job in self._jobs(number):
                 if not self.file(job).exists():
                     continue
