@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
@@ -70,7 +71,7 @@ class ConstrainedDynamics(MolecularDynamics):
         Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
         come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
-        As for all dynamics of ASE.
+        As for all dynamics of ASE; the log is a `ConstraintLogger`, with the temperature of `get_temperature`.
 
     Raises
     ------
@@ -121,7 +122,11 @@ class ConstrainedDynamics(MolecularDynamics):
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
+        logfile = kwargs.pop("logfile", None)
         super().__init__(atoms, timestep, **kwargs)
+        if logfile:
+            log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
+            self.attach(log, kwargs.get("loginterval", 1))
         if state is not None:
             self._resume(state)
         self._start(self._systems())
@@ -196,6 +201,8 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
+            if state.cell is not None:  # a barostat may have changed it before something else failed
+                self.atoms.cell[...] = state.cell
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)
