@@ -8,6 +8,7 @@ the object with ASE, which makes files that contain it readable.
 - `replicas`, `binding`, `respect`, `constraints_object`: the object, and whether the caller respects it
 - `pressure`: the stress of the constraint forces, cells that change
 - `calculator`, `named_calculators`: forces along the constraints, for optimisers; calculators by name
+- `logger`: ASE's log, with multipliers and the right temperature
 - `dynamics`, `thermostat_dynamics`, `multiple_time_steps`, `monte_carlo`: dynamics with any stepper
 """
 
@@ -17,6 +18,7 @@ try:
     from kcons.ase.calculator import ConstrainedCalculator
     from kcons.ase.constraints_object import Constraints, constrain
     from kcons.ase.dynamics import ConstrainedDynamics
+    from kcons.ase.logger import ConstraintLogger
     from kcons.ase.monte_carlo import ConstrainedMonteCarlo
     from kcons.ase.multiple_time_steps import MultipleTimeSteps
     from kcons.ase.pressure.reporter import PressureReporter
@@ -38,6 +40,7 @@ __all__ = [
     "ConstrainedLangevin",
     "ConstrainedMonteCarlo",
     "ConstrainedNoseHoover",
+    "ConstraintLogger",
     "Constraints",
     "IsokineticDynamics",
     "MultipleTimeSteps",

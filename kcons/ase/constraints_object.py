@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from typing import Any, Literal
 
 import ase.constraints
@@ -15,8 +16,9 @@ import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms
 from kcons.ase.pressure.virial import VOIGT, virial_of
 from kcons.ase.replicas import led_across, tiled, within
-from kcons.ase.respect import Watch, require_on_surface
-from kcons.ase.topology import bonds_of
+from kcons.ase.respect import Watch, require_on_surface, warn_of_displacements
+from kcons.ase.topology import BONDS, bonds_of, named_rows
+from kcons.ase.translation import ase_form
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import numbers
 from kcons.constraints.constraint import IntArray
@@ -269,6 +271,7 @@ class Constraints(FixConstraint):
         """Independent copy with the same targets."""
         # Calculators copy the atoms at every step, so this is quick. Neither the rows nor an engine ever change;
         # each object takes a new engine where it needs one.
+        warn_of_displacements(self.get_indices)
         twin = object.__new__(Constraints)
         twin.__dict__.update(self.__dict__)
         twin._forget()
@@ -284,6 +287,9 @@ class Constraints(FixConstraint):
     def todict(self) -> Callable[[], dict[str, Any]]:  # type: ignore[override]
         """``todict()`` gives {'name', 'kwargs'} for `ase.constraints.dict2constraint`, targets included.
 
+        Where ASE can hold the same by one object of its own, these name that object, so that ASE opens the file without
+        kcons; all that kcons needs stands beside them.
+
         Missing (with a warning) if a row holds a Python function: ASE then writes its files without this
         object instead of failing.
         """
@@ -292,10 +298,7 @@ class Constraints(FixConstraint):
         except InputError as error:
             warnings.warn(f"constraints are left out of the file: {error}", stacklevel=3)
             raise AttributeError(f"todict: {error}") from None
-        kwargs: dict[str, Any] = {"constraints": rows, "degenerate": self.degenerate}
-        if self._repeated is not None:
-            kwargs["repeated"] = [list(self._repeated[0]), self._repeated[1]]
-        return lambda: {"name": REGISTERED_NAME, "kwargs": kwargs}
+        return lambda: _as_data(self, rows)
 
     def __repr__(self) -> str:
         converted = self._binding.motion.conversions if self._binding is not None else ()
@@ -333,6 +336,17 @@ class Constraints(FixConstraint):
         return self.engine(atoms).report(atoms.arrays["positions"], velocities)
 
 
+def _as_data(held: Constraints, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    kwargs: dict[str, Any] = {"constraints": rows, "degenerate": held.degenerate}
+    repeated = held._repeated
+    if repeated is not None:
+        kwargs["repeated"] = [list(repeated[0]), repeated[1]]
+    native = ase_form(held.constraints) if repeated is None else None
+    if native is None:
+        return {"name": REGISTERED_NAME, "kwargs": kwargs}
+    return {**native, REGISTERED_NAME: kwargs}
+
+
 def _listed(constraints: Constraint | Iterable[Constraint | Mapping[str, Any]]) -> tuple[Constraint, ...]:
     """Constraints, those that are given as plain data made anew."""
     if isinstance(constraints, Constraint):
@@ -367,7 +381,7 @@ def _in_place(project: Callable[..., FloatArray], values: FloatArray, *arguments
 
 def constrain(
     atoms: Atoms,
-    constraints: Constraint | Iterable[Constraint],
+    constraints: str | Constraint | Iterable[Constraint],
     *,
     project: bool = False,
     degenerate: Literal["convert", "raise"] = "convert",
@@ -380,8 +394,9 @@ def constrain(
     Parameters
     ----------
     atoms : ase.Atoms
-    constraints : sequence of Constraint
-        Targets left open are taken from the positions.
+    constraints : sequence of Constraint, or 'hbonds', 'allbonds', 'hangles', 'allangles'
+        Targets left open are taken from the positions. A name stands for ``constraints_of(atoms, name)``, which has
+        options; bonds that had to be guessed are kept in ``atoms.info['bonds']``, with a warning.
     project : bool
         Whether to move atoms that are off their explicit targets onto them instead of raising; see
         `Constraints.restore`.
@@ -400,6 +415,9 @@ def constrain(
     UnsupportedError
         Another ASE constraint acts on the same atoms.
     """
+    named = None
+    if isinstance(constraints, str):
+        constraints = named = named_rows(atoms, constraints)
     held = Constraints(constraints, degenerate=degenerate)
     before = list(atoms.constraints)
     atoms.set_constraint([*before, held])
@@ -414,12 +432,29 @@ def constrain(
     except KconsError:
         atoms.set_constraint(before)
         raise
+    if named is not None and named.bonds_guessed:
+        atoms.info[BONDS] = named.topology.bonds
+        warnings.warn(
+            f"{named.bonds_guessed} bonds were guessed from distances and covalent radii; all are now in "
+            "atoms.info['bonds'], and are taken from there from now on",
+            UserWarning,
+            stacklevel=2,
+        )
     return held
 
 
 def _register() -> None:
+    """Let ASE's readers make this object again, also where files name an object of ASE that holds the same."""
     if REGISTERED_NAME not in ase.constraints.__all__:
         ase.constraints.__all__.append(REGISTERED_NAME)
+        of_ase = ase.constraints.dict2constraint
+
+        @wraps(of_ase)
+        def dict2constraint(dct: dict[str, Any]) -> Any:
+            own = dct.get(REGISTERED_NAME)
+            return of_ase(dct) if own is None else of_ase({"name": REGISTERED_NAME, "kwargs": own})
+
+        ase.constraints.dict2constraint = dict2constraint
     setattr(ase.constraints, REGISTERED_NAME, Constraints)
 
 

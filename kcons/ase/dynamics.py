@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from kcons.ase.binding import FORCES_ONLY, Binding, applied_forces, bind
 from kcons.ase.constraints_object import Constraints
+from kcons.ase.logger import ConstraintLogger
 from kcons.ase.respect import START_TOLERANCE, require_on_surface
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
@@ -38,10 +39,10 @@ _FLOAT = np.dtype(np.float64)
 class ConstrainedDynamics(MolecularDynamics):
     """Dynamics at constant energy on the constraints, by any stepper of `kcons.steppers`.
 
-    Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on
-    the atoms hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and
-    what `constraints` adds. Velocities come from the multipliers and never from differences of positions,
-    so that accuracy does not depend on the distance from the origin.
+    Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on the atoms
+    hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and what `constraints`
+    adds. Velocities come from the multipliers, not from differences of positions: the distance from the origin costs no
+    accuracy.
 
     Parameters
     ----------
@@ -52,9 +53,8 @@ class ConstrainedDynamics(MolecularDynamics):
     stepper : Stepper, optional
         `Rattle` by default; of order 4 or 6 where accuracy counts.
     constraints : sequence of Constraint, optional
-        More to hold than what is on the atoms; here also targets that move with time and velocity
-        (nonholonomic) rows, for which ASE has no place. ASE's temperature does not know of these: use
-        `get_temperature` of this object.
+        More than what is on the atoms; here also targets that move with time and velocity (nonholonomic) rows, for
+        which ASE has no place. ASE's temperature does not know of these: use `get_temperature` of this object.
     time : float
         Time at the start, for targets that move.
     forces : array_like, shape (n_atoms, 3), optional
@@ -70,7 +70,7 @@ class ConstrainedDynamics(MolecularDynamics):
         Rates at which velocities die away, in inverse units of ASE's time, for example 0.01/units.fs; see `System`. To
         come to rest; for a temperature use `ConstrainedLangevin`.
     trajectory, logfile, loginterval, **kwargs
-        As for all dynamics of ASE.
+        As for all dynamics of ASE; the log is a `ConstraintLogger`, with the temperature of `get_temperature`.
 
     Raises
     ------
@@ -121,7 +121,11 @@ class ConstrainedDynamics(MolecularDynamics):
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
+        logfile = kwargs.pop("logfile", None)
         super().__init__(atoms, timestep, **kwargs)
+        if logfile:
+            log = self.closelater(ConstraintLogger(self, atoms, logfile, comm=self.comm))
+            self.attach(log, kwargs.get("loginterval", 1))
         if state is not None:
             self._resume(state)
         self._start(self._systems())
@@ -196,6 +200,7 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
+            self.atoms.cell[...] = np.frombuffer(self._cell, count=9).reshape(3, 3)  # which barostats change
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)

@@ -1,10 +1,16 @@
-"""Detection of dynamics classes that do not respect the constraints of their atoms."""
+"""Detection of what does not respect the constraints of its atoms: dynamics classes, finite differences."""
 
 from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from weakref import WeakSet
 
 import numpy as np
 from ase import Atoms
 
+from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
@@ -17,6 +23,10 @@ ABSURD = 0.3
 ABSURD_STEPS = 3
 #: A correction (in Angstrom) below which the residual is not even looked at.
 _SMALL = 0.1
+
+#: Modules of ASE that displace atoms one by one and never ask constraints.
+DISPLACING = ("ase.vibrations.vibrations", "ase.phonons")
+_warned: WeakSet[object] = WeakSet()
 
 ADVICE = (
     "use kcons.ase.ConstrainedDynamics for constant energy, and ase.md.langevin.Langevin(fixcm=False) or "
@@ -145,3 +155,35 @@ def require_on_surface(held: ConstraintSet, x: FloatArray, time: float = 0.0) ->
 def _same(a: FloatArray, b: FloatArray) -> bool:
     # Mostly they differ in the first number already.
     return a.shape == b.shape and (not a.size or a[0, 0] == b[0, 0]) and bool((a == b).all())
+
+
+def warn_of_displacements(held: Callable[[], IntArray]) -> None:
+    """Warn, once for each of them, where `Vibrations` or `Phonons` of ASE displaces held atoms.
+
+    These classes ask constraints for nothing but copies, which they or their calculators make: to be called there.
+    """
+    if not any(name in sys.modules for name in DISPLACING):
+        return
+    frame, depth = sys._getframe(1), 1
+    while frame.f_globals.get("__name__") not in DISPLACING or "self" not in frame.f_locals:
+        if frame.f_back is None:
+            return
+        frame, depth = frame.f_back, depth + 1
+    finite = frame.f_locals["self"]
+    if finite in _warned or getattr(finite.calc, "respects_constraints", False):
+        return
+    _warned.add(finite)
+    moved = np.intersect1d(finite.indices, held())
+    if not len(moved):
+        return
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("ase."):
+        frame, depth = frame.f_back, depth + 1
+    name = type(finite).__name__
+    warnings.warn(
+        f"{name} displaces atom {moved[0]} past its constraints, which it does not ask: what it prints belongs to "
+        "atoms that are free. Take the constraints off the atoms (atoms.set_constraint()) and give it a "
+        f"kcons.ase.ConstrainedCalculator(calculator, constraints), or leave the {len(moved)} held atoms out of its "
+        "indices",
+        UserWarning,
+        stacklevel=depth + 1,
+    )

@@ -27,7 +27,7 @@ from kcons.topology.topology import (
     whole_numbers,
 )
 
-__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "snapshot_of"]
+__all__ = ["atoms_of", "bonds_of", "constraints_of", "mend_elements", "named_rows", "snapshot_of"]
 
 #: Where the bonds of an `Atoms` object are kept: pairs of atoms, in ``atoms.info``.
 BONDS = "bonds"
@@ -51,6 +51,13 @@ def constraints_of(atoms: Atoms, constrain: str | None = "hbonds", **options: Un
     """
     numbers = partial(selected_numbers, n=len(atoms))
     return rows_of(snapshot_of(atoms), Holding(constrain, **options), numbers, _REMEDY)
+
+
+def named_rows(atoms: Atoms, name: str) -> HeldRows:
+    """`constraints_of` without its warning about guessed bonds; the caller says it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"\d+ bonds were guessed")
+        return constraints_of(atoms, name)
 
 
 def snapshot_of(atoms: Atoms) -> Snapshot:

@@ -1,15 +1,14 @@
-"""ASE's own constraints, as constraints of kcons."""
+"""ASE's own constraints, as constraints of kcons, and back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 from ase.geometry import find_mic
 
-from kcons.ase.constraints_object import Constraints
 from kcons.constraints import (
     Angle,
     CenterOfMass,
@@ -48,9 +47,6 @@ def translated(atoms: Atoms, items: Iterable[Any]) -> list[Constraint]:
     """As `from_ase_constraints`, for some constraints of `atoms`."""
     result: list[Constraint] = []
     for item in items:
-        if isinstance(item, Constraints):
-            result.extend(item.constraints)
-            continue
         name = type(item).__name__
         if name not in _TRANSLATORS:
             raise UnsupportedError(
@@ -109,6 +105,7 @@ def _indices(atoms: Atoms, item: Any) -> IntArray:
 
 
 _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
+    "Constraints": lambda atoms, item: list(item.constraints),
     "FixAtoms": lambda atoms, item: [FixedAtoms(_indices(atoms, item))],
     "FixBondLengths": _bond_lengths,
     "FixInternals": _internals,
@@ -119,3 +116,43 @@ _TRANSLATORS: dict[str, Callable[[Atoms, Any], list[Constraint]]] = {
     "FixedPlane": lambda atoms, item: [Plane(_indices(atoms, item), item.dir)],
     "FixedLine": lambda atoms, item: [Line(_indices(atoms, item), None, item.dir)],
 }
+
+
+def ase_form(rows: Sequence[Constraint]) -> dict[str, Any] | None:
+    """One constraint of ASE that holds the same, as `ase.constraints.dict2constraint` takes it; None if there is none.
+
+    Known are distances; distances, angles and dihedrals; fixed atoms; planes, or lines, of one direction; all with
+    targets that are found and rest.
+    """
+    if not rows or not all(isinstance(item.target, np.ndarray) for item in rows):
+        return None
+    families = {item.family for item in rows}
+    if families == {"Distance"}:
+        pairs = [pair for item in rows for pair in item.atoms.tolist()]
+        return _named("FixBondLengths", pairs=pairs, bondlengths=[d for item in rows for d in _targets(item)])
+    if families <= {"Distance", "Angle", "Dihedral"}:
+        parts: dict[str, list[Any]] = {"Distance": [], "Angle": [], "Dihedral": []}
+        for item in rows:
+            values = _targets(item) if item.family == "Distance" else np.degrees(_targets(item)).tolist()
+            parts[item.family] += [list(row) for row in zip(values, item.atoms.tolist(), strict=True)]
+        bonds, angles, dihedrals = parts.values()
+        return _named("FixInternals", bonds=bonds, angles_deg=angles, dihedrals_deg=dihedrals, mic=True)
+    atoms = sorted({atom for item in rows for atom in item.atoms.ravel().tolist()})
+    if families == {"FixedAtoms"}:
+        return _named("FixAtoms", indices=atoms)
+    if families in ({"Plane"}, {"Line"}):
+        normals = np.concatenate([np.asarray(item.coefficients)[:, 0] for item in rows])  # type: ignore[attr-defined]
+        if families == {"Line"}:
+            normals = np.cross(normals[::2], normals[1::2])
+        if len(normals) == len(atoms) and np.all(normals == normals[0]):
+            name = "FixedPlane" if families == {"Plane"} else "FixedLine"
+            return _named(name, indices=atoms, direction=normals[0].tolist())
+    return None
+
+
+def _named(name: str, **kwargs: Any) -> dict[str, Any]:
+    return {"name": name, "kwargs": kwargs}
+
+
+def _targets(item: Constraint) -> list[float]:
+    return [float(value) for value in item.target_at(0.0)]

@@ -391,3 +391,45 @@ def _distinct(numbers: IntArray, limit: int) -> IntArray:
     marked = np.zeros(limit, dtype=bool)
     marked[numbers] = True
     return np.flatnonzero(marked)
+
+
+def rows_like(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
+    """The rows of the set that `wanted` names, whatever they are held at; `name` is what errors call it."""
+    if not wanted.holonomic:
+        raise InputError(
+            f"{name} is the velocity constraint {wanted!r}, which holds no coordinate; name a position constraint",
+            item=name,
+        )
+    found = []
+    for k in range(wanted.n_rows):
+        for start, item in zip(held.starts, held.constraints, strict=False):
+            rows = start + np.flatnonzero(same_rows(item, wanted, k))
+            if len(rows):
+                found.append(int(rows[0]))
+                break
+        else:
+            raise InputError(
+                f"{name}, {wanted.row_name(k)}, is not among the {held.n_rows} rows that are held; hold it, or name a "
+                "constraint that is",
+                item=name,
+                atoms=wanted.atoms[k],
+            )
+    return found
+
+
+def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]:
+    """Which rows of `item` are row k of `wanted`, whatever they are held at, shape (n_rows,)."""
+    same = np.zeros(item.n_rows, dtype=bool)
+    if item.family != wanted.family or item.width != wanted.width:
+        return same
+    if any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions):
+        return same
+    if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
+        return same
+    same = np.all(item.atoms == wanted.atoms[k], axis=1)
+    if wanted.family == "Distance":
+        same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
+    for data in item.per_row:
+        ours, theirs = getattr(item, data), getattr(wanted, data)[k]
+        same &= np.all(ours == theirs, axis=tuple(range(1, ours.ndim)))
+    return same

@@ -8,6 +8,7 @@ import numpy as np
 from ase.md.md import MolecularDynamics
 
 from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
+from kcons.ase.binding import applied_forces
 from kcons.constraints import Constraint
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
@@ -83,7 +84,7 @@ class AseRecorder:
         if isinstance(self.dynamics, ConstrainedDynamics):
             forces = self.dynamics.state.forces
         if forces is None:
-            forces = atoms.get_forces(apply_constraint=False)
+            forces = applied_forces(atoms)
         if isinstance(self.dynamics, IsokineticDynamics):  # known once it runs
             self.series.isokinetic_degrees_of_freedom = self.dynamics.thermostat_degrees_of_freedom
         x, v = atoms.positions, atoms.get_velocities()

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from kcons.constraints.arguments import as_array
 from kcons.constraints.constraint import Constraint, IntArray
-from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.constraint_set import ConstraintSet, rows_like
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -112,7 +112,7 @@ class HeldCoordinates:
         for name, coordinate in coordinates.items():
             if not isinstance(coordinate, Constraint):
                 raise InputError(f"{name!r} is {coordinate!r}, and no kcons constraint", item=name)
-            found = _rows_of(held, coordinate, name)
+            found = rows_like(held, coordinate, name)
             names += [name] if len(found) == 1 else [f"{name}[{k}]" for k in range(len(found))]
             rows += found
         if len(set(rows)) < len(rows):
@@ -321,48 +321,6 @@ def _curvatures(held: ConstraintSet, x: FloatArray, u: FloatArray, time: float) 
         v = u[:, item.atoms].reshape(r.shape)
         parts.append(again.curvature(r, v, time).reshape(many, -1))
     return np.concatenate(parts, axis=1)
-
-
-def _rows_of(held: ConstraintSet, wanted: Constraint, name: str) -> list[int]:
-    """The rows of the set that `wanted` names."""
-    if not wanted.holonomic:
-        raise InputError(
-            f"{name} is the velocity constraint {wanted!r}, which holds no coordinate; name a position constraint",
-            item=name,
-        )
-    found = []
-    for k in range(wanted.n_rows):
-        for start, item in zip(held.starts, held.constraints, strict=False):
-            rows = start + np.flatnonzero(same_rows(item, wanted, k))
-            if len(rows):
-                found.append(int(rows[0]))
-                break
-        else:
-            raise InputError(
-                f"{name}, {wanted.row_name(k)}, is not among the {held.n_rows} rows that are held; hold it, or name a "
-                "constraint that is",
-                item=name,
-                atoms=wanted.atoms[k],
-            )
-    return found
-
-
-def same_rows(item: Constraint, wanted: Constraint, k: int) -> NDArray[np.bool_]:
-    """Which rows of `item` are row k of `wanted`, whatever they are held at, shape (n_rows,)."""
-    same = np.zeros(item.n_rows, dtype=bool)
-    if item.family != wanted.family or item.width != wanted.width:
-        return same
-    if any(getattr(item, f, None) is not getattr(wanted, f, None) for f in wanted.functions):
-        return same
-    if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):
-        return same
-    same = np.all(item.atoms == wanted.atoms[k], axis=1)
-    if wanted.family == "Distance":
-        same |= np.all(item.atoms == wanted.atoms[k, ::-1], axis=1)
-    for data in item.per_row:
-        ours, theirs = getattr(item, data), getattr(wanted, data)[k]
-        same &= np.all(ours == theirs, axis=tuple(range(1, ours.ndim)))
-    return same
 
 
 def _joined_rows(held: ConstraintSet, rows: IntArray) -> IntArray:

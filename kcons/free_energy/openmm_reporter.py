@@ -11,9 +11,10 @@ import openmm
 from openmm import unit
 
 from kcons.constraints import Constraint
-from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.arguments import whole_number
+from kcons.constraints.constraint_set import ConstraintSet, same_rows
 from kcons.errors import InputError
-from kcons.free_energy.held_coordinates import HeldCoordinates, same_rows
+from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.free_energy.series import Series
 from kcons.openmm.carried.callbacks import cell_of
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
@@ -72,12 +73,11 @@ class HeldCoordinatesReporter:
         beside: Iterable[Constraint] = (),
         append: bool = False,
     ) -> None:
-        if reportInterval < 1:
-            raise InputError(f"reportInterval is {reportInterval}; give a number of steps", item="reportInterval")
+        interval = whole_number(reportInterval, "reportInterval")
         names = list(coordinates)
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
-        self._interval = reportInterval
+        self._interval = interval
         self._own = not hasattr(file, "write")
         self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
         self._titled = append

@@ -9,7 +9,7 @@ import pytest
 from ase import Atoms
 from ase.build import molecule
 
-from kcons.ase import constraints_of
+from kcons.ase import constrain, constraints_of
 from kcons.ase.topology import atoms_of, bonds_of, mend_elements, snapshot_of
 from kcons.errors import InputError
 
@@ -95,3 +95,33 @@ def test_sites_without_a_number_have_no_mass():
     assert topology.masses[3] == 0.0 and topology.elements[3] == ""
     atoms.set_masses([16.0, 1.0, 1.0, 2.0])
     assert snapshot_of(atoms).topology.masses[3] == 2.0
+
+
+def test_held_by_name_warns_once_and_keeps_the_bonds():
+    atoms = molecule("CH3CH2OH")
+    with pytest.warns(UserWarning, match="8 bonds were guessed") as caught:
+        held = constrain(atoms, "hbonds")
+    assert len(caught) == 1 and caught[0].filename == __file__
+    assert sum(item.n_rows for item in held.constraints) == 6
+    assert atoms.get_number_of_degrees_of_freedom() == 27 - 6
+    assert np.array_equal(atoms.info["bonds"], bonds_of(molecule("CH3CH2OH")))
+    counts = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in ("hbonds", "allbonds", "hangles", "allangles"):
+            atoms.set_constraint()
+            held = constrain(atoms, name)
+            counts[name] = [(item.family, item.n_rows) for item in held.constraints]
+            assert [item.atoms.tolist() for item in held.constraints] == [
+                item.atoms.tolist() for item in constraints_of(atoms, name)
+            ]
+    assert counts["hbonds"] == [("Distance", 6)] and counts["allbonds"] == [("Distance", 8)]
+    # Four H-C-H of the methyl and methylene groups, and H-O-C.
+    assert counts["hangles"] == [("Distance", 8), ("Angle", 5)]
+
+
+def test_a_name_that_is_none_changes_nothing():
+    atoms = molecule("CH3CH2OH")
+    with pytest.raises(InputError, match=r"cannot constrain 'hbond'.*hangles"):
+        constrain(atoms, "hbond")
+    assert atoms.constraints == [] and "bonds" not in atoms.info

@@ -1,12 +1,20 @@
-"""ASE's constraints as ours, and the search for water."""
+"""ASE's constraints as ours and back, copies and files."""
 
 from __future__ import annotations
 
+import ast
+import copy
+import pickle
+import subprocess
+import sys
+
+import ase.constraints
 import numpy as np
 import pytest
-from ase import units
-from ase.build import molecule
+from ase import Atoms, units
+from ase.build import molecule, sort
 from ase.calculators.lj import LennardJones
+from ase.calculators.tip3p import TIP3P
 from ase.constraints import (
     FixAtoms,
     FixBondLengths,
@@ -18,10 +26,30 @@ from ase.constraints import (
     FixLinearTriatomic,
     FixSubsetCom,
     Hookean,
+    dict2constraint,
 )
+from ase.db import connect
+from ase.io import read, write
+from ase.io.trajectory import Trajectory
 from ase.md.verlet import VelocityVerlet
+from ase_systems import (
+    loose_waters,
+    off,
+    rigid,
+)
 
-from kcons.ase import constrain, from_ase_constraints, rigid_water
+from kcons.ase import ConstrainedDynamics, Constraints, constrain, from_ase_constraints, rigid_water
+from kcons.constraints import (
+    Angle,
+    Dihedral,
+    Distance,
+    FixedAtoms,
+    ImplicitSurface,
+    Line,
+    LinearCombination,
+    Plane,
+    Sphere,
+)
 from kcons.errors import UnsupportedError
 
 
@@ -106,3 +134,289 @@ def test_unknown_ase_constraints_are_named(other):
     atoms.set_constraint(other)
     with pytest.raises(UnsupportedError, match=f"{type(other).__name__}.*Custom"):
         from_ase_constraints(atoms)
+
+
+# -- copies, slices, replicas and files carry rows and targets -------------------------------------
+
+
+# -- copies, slices, files --------------------------------------------------------------------------
+
+
+def targets(atoms) -> np.ndarray:
+    (held,) = atoms.constraints
+    assert isinstance(held, Constraints)
+    return held.engine(atoms).constraint_set.target()
+
+
+def sample() -> Atoms:
+    """Several families with targets that are not those of the present positions to the last bit."""
+    atoms = molecule("CH3CH2OH")
+    rows = [
+        Distance([[0, 1], [1, 2]], [1.5, 1.4]),
+        Angle([0, 1, 2], 1.9),
+        Dihedral([3, 2, 1, 0], 1.1),
+        LinearCombination([4, 5], [[0, 0, 1], [0, 0, -1]]),
+        FixedAtoms([8]),
+    ]
+    constrain(atoms, rows, project=True)
+    atoms.positions[0] += 1e-9
+    return atoms
+
+
+COPIES = {
+    "copy": lambda atoms, folder: atoms.copy(),
+    "constructor": lambda atoms, folder: Atoms(atoms),
+    "deepcopy": lambda atoms, folder: copy.deepcopy(atoms),
+    "pickle": lambda atoms, folder: pickle.loads(pickle.dumps(atoms)),
+    "todict": lambda atoms, folder: Atoms.fromdict(
+        {**atoms.todict(), "constraints": [c.todict() for c in atoms.constraints]}
+    ),
+    "traj": lambda atoms, folder: _through(atoms, folder / "a.traj"),
+    "json": lambda atoms, folder: _through(atoms, folder / "a.json"),
+    "db": lambda atoms, folder: _through_db(atoms, folder / "a.db"),
+    "whole slice": lambda atoms, folder: atoms[:],
+}
+
+
+def _through(atoms, path) -> Atoms:
+    write(path, atoms)
+    return read(path)
+
+
+def _through_db(atoms, path) -> Atoms:
+    with connect(path) as db:
+        db.write(atoms)
+    return connect(path).get_atoms(1)
+
+
+@pytest.mark.parametrize("ours_first", [True, False])
+@pytest.mark.parametrize("way", [way for way in COPIES if way != "todict"])
+def test_found_targets_beside_other_constraints_in_either_order(way, ours_first, tmp_path):
+    atoms = molecule("CH3CH2OH")
+    held = Constraints([Distance([[0, 1], [1, 2]]), Dihedral([3, 0, 1, 2]), FixedAtoms([8])])
+    others = [FixAtoms([7]), FixCartesian([6], (True, False, True))]
+    atoms.set_constraint([held, *others] if ours_first else [*others, held])
+    found = held.engine(atoms).constraint_set.target()
+    again = COPIES[way](atoms, tmp_path)
+    assert [type(c) for c in again.constraints] == [type(c) for c in atoms.constraints]
+    twin = next(c for c in again.constraints if isinstance(c, Constraints))
+    again.positions[:] += 0.1  # the targets are those that were found, not those of the first use
+    again.positions[1] += 0.01
+    assert np.array_equal(twin.engine(again).constraint_set.target(), found)
+    assert again.get_number_of_degrees_of_freedom() == 27 - 3 - 3 - 3 - 2
+
+
+@pytest.mark.parametrize("way", COPIES)
+def test_round_trip_keeps_rows_and_targets(way, tmp_path):
+    atoms = sample()
+    again = COPIES[way](atoms, tmp_path)
+    assert again.constraints[0] is not atoms.constraints[0]
+    assert np.array_equal(targets(again), targets(atoms))
+    assert [c.family for c in again.constraints[0].constraints] == [c.family for c in atoms.constraints[0].constraints]
+    assert again.get_number_of_degrees_of_freedom() == atoms.get_number_of_degrees_of_freedom()
+    momenta = np.random.default_rng(0).normal(size=(9, 3))
+    for a in (atoms, again):
+        a.set_momenta(momenta)
+    assert np.array_equal(atoms.get_momenta(), again.get_momenta())
+
+
+def test_extxyz_drops_the_constraints(tmp_path):
+    atoms = sample()
+    again = _through(atoms, tmp_path / "a.extxyz")
+    assert [type(c).__name__ for c in again.constraints] in ([], ["FixAtoms"])
+    # Targets that were explicit can be given again; positions have 8 digits there.
+    constrain(again, Distance([[0, 1], [1, 2]], [1.5, 1.4]), project=True)
+    assert again.get_distance(0, 1) == pytest.approx(1.5, abs=1e-14)
+
+
+def test_constraint_object_round_trip():
+    held = sample().constraints[0]
+    data = held.todict()
+    assert data["name"] in ase.constraints.__all__
+    again = dict2constraint(data)
+    assert isinstance(again, Constraints)
+    assert again.todict() == data
+    assert held.copy().todict() == data
+
+
+#: What is held, and the object of ASE that holds the same; None where no single one does.
+NATIVE = {
+    "FixBondLengths": [Distance([[0, 1], [1, 2]]), Distance([[0, 3]])],
+    "FixInternals": [Distance([[0, 1]]), Angle([[0, 1, 2]]), Dihedral([[3, 2, 1, 0]])],
+    "FixAtoms": [FixedAtoms([8, 0])],
+    "FixedPlane": [Plane([4, 0, 5], [0, 1, 2])],
+    "FixedLine": [Line([4, 0], None, [0, 1, 2])],
+    "two directions": [Plane([4], [0, 1, 2]), Plane([5], [0, 1, 1])],
+    "two kinds": [FixedAtoms([8]), Distance([[0, 1]])],
+}
+
+
+@pytest.fixture(scope="module")
+def opened_by_ase(tmp_path_factory):
+    """What ASE makes, in a process that never saw kcons, of files with each of `NATIVE`."""
+    folder = tmp_path_factory.mktemp("native")
+    for name, rows in NATIVE.items():
+        atoms = molecule("CH3CH2OH")
+        constrain(atoms, rows)
+        write(folder / f"{name}.traj", atoms)
+        write(folder / f"{name}.json", atoms)
+    code = """
+import sys
+from pathlib import Path
+from ase.io import read
+for path in sorted(Path(sys.argv[1]).glob("*.*")):
+    try:
+        atoms = read(path)
+        (held,) = atoms.constraints
+        kwargs = held.todict()["kwargs"]
+        if hasattr(held, "bondlengths"):  # which ASE itself does not write
+            kwargs["bondlengths"] = held.bondlengths
+        print(path.name, type(held).__name__, atoms.get_number_of_degrees_of_freedom(), kwargs, sep=";")
+    except ValueError:
+        print(path.name, "refused", 0, {}, sep=";")
+assert "kcons" not in sys.modules
+"""
+    run = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True)
+    return folder, {line.split(";")[0]: line.split(";")[1:] for line in run.stdout.splitlines()}
+
+
+@pytest.mark.parametrize("name", NATIVE)
+@pytest.mark.parametrize("suffix", ["traj", "json"])
+def test_files_open_without_kcons_where_ase_can_hold_the_same(opened_by_ase, name, suffix):
+    folder, found = opened_by_ase
+    kind, freedom, kwargs = found[f"{name}.{suffix}"]
+    ours = read(folder / f"{name}.{suffix}")
+    assert isinstance(ours.constraints[0], Constraints)
+    if not name.startswith("Fix"):
+        assert kind == "refused"
+        return
+    assert kind == name and int(freedom) == ours.get_number_of_degrees_of_freedom()
+    # The rows of ASE's object are ours again, with the same targets; those of lengths and angles are in the file.
+    twin = ours.copy()
+    if name in ("FixBondLengths", "FixInternals"):
+        twin.positions *= 1.01
+    twin.set_constraint(dict2constraint({"name": kind, "kwargs": ast.literal_eval(kwargs)}))
+    rows = Constraints(from_ase_constraints(twin)).engine(ours).constraint_set
+    expected = ours.constraints[0].engine(ours).constraint_set
+    assert np.sort(rows.target()) == pytest.approx(np.sort(expected.target()), abs=1e-12)
+
+
+def test_a_restart_from_a_file_that_ase_can_open_is_exact(tmp_path):
+    """The rows and targets of kcons stand beside those of ASE, to the last bit."""
+    atoms, held = rigid(2)
+    path = tmp_path / "run.traj"
+    dynamics = ConstrainedDynamics(atoms, units.fs, trajectory=str(path))
+    dynamics.run(2)
+    again = read(path)
+    assert again.constraints[0].todict() == held.todict()
+    assert again.constraints[0].todict()["name"] == "FixBondLengths"
+    forces = again.get_forces(apply_constraint=False)
+    again.calc = TIP3P(rc=6.0)
+    ConstrainedDynamics(again, units.fs, forces=forces, time=dynamics.get_time()).run(3)
+    dynamics.run(3)
+    assert np.array_equal(again.positions, atoms.positions)
+    assert np.array_equal(again.get_momenta(), atoms.get_momenta())
+
+
+def test_copies_are_independent():
+    atoms, _ = rigid(2)
+    part = atoms.copy()
+    part.constraints[0].index_shuffle(part, [0, 1, 2])
+    assert len(atoms.constraints[0].constraints[0].atoms) == 6
+
+
+def test_trajectory_written_during_dynamics(tmp_path):
+    atoms, _ = rigid(2)
+    with Trajectory(tmp_path / "md.traj", "w", atoms) as file:
+        dyn = VelocityVerlet(atoms, 1 * units.fs)
+        dyn.attach(file.write, interval=5)
+        dyn.run(10)
+    frames = read(tmp_path / "md.traj", index=":")
+    assert len(frames) == 3
+    assert np.array_equal(targets(frames[-1]), targets(atoms))
+
+
+def test_function_rows_are_left_out_of_files_with_a_warning(tmp_path):
+    atoms = Atoms("H2", positions=[[1, 0, 0], [3, 0, 0]])
+    surface = ImplicitSurface([0], lambda r: (r**2).sum(axis=1) - 1, lambda r: 2 * r)
+    constrain(atoms, [surface, Distance([0, 1])])
+    with pytest.warns(UserWarning, match="left out of the file: ImplicitSurface"):
+        write(tmp_path / "a.traj", atoms)
+    assert np.array_equal(read(tmp_path / "a.traj").positions, atoms.positions)
+    with pytest.warns(UserWarning, match="left out"):
+        assert not hasattr(atoms.constraints[0], "todict")
+    assert len(atoms.copy().constraints[0].constraints) == 2
+
+
+def test_slicing_keeps_whole_rows_only():
+    atoms, _ = rigid(3)
+    part = atoms[3:8]
+    assert targets(part).shape == (4,)  # one whole water, and one O-H bond of the next
+    assert np.array_equal(part.constraints[0].constraints[0].atoms, [[0, 1], [0, 2], [1, 2], [3, 4]])
+    assert atoms[[0, 3, 6]].constraints == []
+    assert np.array_equal(targets(atoms[np.arange(9) < 3]), targets(atoms)[:3])
+    assert np.array_equal(targets(atoms[[2, 1, 0]]), targets(atoms)[:3])
+
+
+def test_sort_renumbers():
+    atoms, held = rigid(2)
+    ordered = sort(atoms)
+    assert off(ordered, ordered.constraints[0]) <= 1e-14
+    assert np.array_equal(np.sort(targets(ordered)), np.sort(held.engine(atoms).constraint_set.target()))
+
+
+def test_slice_of_an_unused_object_is_taken_along():
+    atoms = loose_waters(2)
+    atoms.set_constraint(Constraints(rigid_water(atoms)))
+    assert atoms[3:].get_number_of_degrees_of_freedom() == 6
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_repeat(used):
+    atoms = loose_waters(1)
+    atoms.set_cell([4.0, 5.0, 6.0])
+    atoms.pbc = True
+    atoms.set_constraint(Constraints([rigid_water(atoms), FixedAtoms([0])]))
+    if used:
+        atoms.get_number_of_degrees_of_freedom()
+    large = atoms.repeat((2, 1, 3))
+    assert large.get_number_of_degrees_of_freedom() == 6 * (9 - 6)
+    assert off(large, large.constraints[0]) <= 1e-14
+    assert len(large.constraints[0].get_indices()) == 18
+
+
+@pytest.mark.parametrize("used", [True, False])
+@pytest.mark.parametrize("through_file", [False, True])
+def test_repeat_across_the_boundary(used, through_file, tmp_path):
+    cell = np.array([[5.0, 0, 0], [1.0, 5.5, 0], [-0.5, 0.7, 6.0]])
+    atoms = molecule("H2O")
+    atoms.set_cell(cell)
+    atoms.pbc = True
+    atoms.positions -= atoms.positions[0] + [0.1, 0.1, 0.1]
+    atoms.wrap()
+    lengths = atoms.get_all_distances(mic=True)[[0, 0, 1], [1, 2, 2]]
+    assert np.abs(np.diff(atoms.get_scaled_positions(), axis=0)).max() > 0.5
+    atoms.set_constraint(Constraints(rigid_water(atoms)))
+    if used:
+        atoms.get_number_of_degrees_of_freedom()
+    large = atoms.repeat((2, 3, 2))
+    if through_file:
+        large = _through(large, tmp_path / "large.json")
+    assert targets(large) == pytest.approx(np.tile(lengths, 12), abs=1e-12)
+    assert off(large, large.constraints[0]) <= 1e-13
+    assert large.get_number_of_degrees_of_freedom() == 12 * 6
+    rows = large.constraints[0].constraints[0].atoms
+    assert len(np.unique(np.sort(rows, axis=1), axis=0)) == 36
+
+
+def test_repeat_of_a_surface_is_refused():
+    atoms = Atoms("H", positions=[[1, 0, 0]], cell=[4, 4, 4], pbc=True)
+    constrain(atoms, Sphere([0], [0, 0, 0]))
+    with pytest.raises(UnsupportedError, match="place in space"):
+        atoms.repeat(2)
+
+
+def test_repr():
+    atoms, held = rigid(2)
+    assert repr(held) == "Constraints(6 rows on 6 atoms)"
+    assert "Constraints(" in repr(atoms)

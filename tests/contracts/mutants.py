@@ -514,7 +514,7 @@ MUTANTS = [
         "steppers/stages/drifts.py",
         "before = float(np.abs(kicked[self.atoms]).max())",
         "before = 0.0",
-        "tests/steppers/test_coming_to_rest.py::test_a_blade_takes_up_a_kick_from_the_side_whole",
+        "tests/contracts/test_coming_to_rest.py::test_a_blade_takes_up_a_kick_from_the_side_whole",
     ),
     (
         "steppers/operations.py",
@@ -544,13 +544,13 @@ MUTANTS = [
         "steppers/executors/piecewise.py",
         "size = max(start, float(np.abs(push).max(initial=0.0)), float(np.abs(v).max(initial=0.0)))",
         "size = float(np.abs(v).max(initial=0.0))",
-        "tests/steppers/test_coming_to_rest.py::test_a_damped_pendulum_comes_to_rest",
+        "tests/contracts/test_coming_to_rest.py::test_a_damped_pendulum_comes_to_rest",
     ),
     (
         "steppers/executors/piecewise.py",
         "change <= 2 * _EPS * size",
         "change <= 1e8 * _EPS * size",
-        "tests/steppers/test_coming_to_rest.py::test_settled_velocities_are_those_of_the_implicit_equation",
+        "tests/contracts/test_coming_to_rest.py::test_settled_velocities_are_those_of_the_implicit_equation",
     ),
     (
         "steppers/executors/piecewise.py",

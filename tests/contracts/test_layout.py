@@ -105,6 +105,15 @@ def test_each_module_has_its_test_file():
     assert [name for name in modules if not (TESTS / name).with_name(f"test_{name.rpartition('/')[2]}").is_file()] == []
 
 
+def test_each_test_file_mirrors_a_module():
+    """But for those on the whole package, the pages, and modules that stand alone."""
+    found = [path.relative_to(TESTS) for path in TESTS.rglob("test_*.py")]
+    alone = [path for path in found if path.parts[0] not in ("contracts", "pages")]
+    assert len(alone) > 200
+    modules = [PACKAGE / path.with_name(path.name.removeprefix("test_")) for path in alone]
+    assert [module.relative_to(PACKAGE).as_posix() for module in modules if not module.is_file()] == []
+
+
 #: At most: lines of a module, of a function and of a class; parameters but for self, outside of the compiled solvers.
 LINES, FUNCTION, CLASS, PARAMETERS = 500, 100, 300, 11
 #: Folders whose kernels take one argument an array.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "examples" / "notes" / "growth_results.py"
 PAGE = (ROOT / "docs" / "growth.md").read_text(encoding="utf-8")
 

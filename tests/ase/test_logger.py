@@ -1,0 +1,98 @@
+"""Logs of runs: the temperature by all rows, and multipliers by name."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from ase import Atoms, units
+from ase.build import molecule
+from ase.calculators.emt import EMT
+from ase.md.logger import MDLogger
+from ase.md.verlet import VelocityVerlet
+from ase_systems import Free
+
+from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, ConstraintLogger, constrain, draw_velocities
+from kcons.constraints import Angle, Dihedral, Distance
+from kcons.errors import InputError
+from kcons.free_energy import AseRecorder
+
+TORSION = Dihedral([[3, 2, 1, 0]])
+ROWS = [Distance([[0, 1], [1, 2]]), TORSION]
+
+
+def moving() -> Atoms:
+    atoms = molecule("CH3CH2OH")
+    atoms.calc = EMT()
+    draw_velocities(atoms, 300, rng=1)
+    return atoms
+
+
+def columns(log: io.StringIO) -> np.ndarray:
+    return np.array([line.split() for line in log.getvalue().splitlines()[1:]], dtype=float)
+
+
+def test_rows_that_only_the_dynamics_holds_count():
+    """ASE's own logger has 27 degrees of freedom for these atoms, of which 3 are held."""
+    atoms, ours, theirs = moving(), io.StringIO(), io.StringIO()
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS, logfile=ours)
+    dynamics.attach(MDLogger(dynamics, atoms, theirs))
+    dynamics.run(3)
+    expected = 2 * atoms.get_kinetic_energy() / (24 * units.kB)
+    assert columns(ours)[-1, 4] == pytest.approx(expected, abs=0.06)
+    assert columns(theirs)[-1, 4] == pytest.approx(expected * 24 / 27, abs=0.06)
+    assert np.array_equal(columns(ours)[:, :4], columns(theirs)[:, :4])
+    assert ours.getvalue().splitlines()[0] == theirs.getvalue().splitlines()[0]
+
+
+def test_a_thermostat_that_leaves_total_momentum_alone():
+    atoms, log = moving(), io.StringIO()
+    draw_velocities(atoms, 300, rng=1, zero_momentum=True)
+    dynamics = ConstrainedLangevin(
+        atoms, units.fs, 300, 0.01 / units.fs, rng=2, fixcm=True, constraints=ROWS, logfile=log, loginterval=2
+    )
+    dynamics.run(4)
+    assert columns(log)[:, 0] == pytest.approx([0, 0.002, 0.004])
+    assert columns(log)[-1, 4] == pytest.approx(2 * atoms.get_kinetic_energy() / (21 * units.kB), abs=0.06)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_multipliers_by_name(ours):
+    """The same as those that `AseRecorder` keeps, which finds them in another way; in ASE's own dynamics too."""
+    atoms, log = moving(), io.StringIO()
+    if ours:
+        dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS)
+    else:
+        constrain(atoms, ROWS)
+        dynamics = VelocityVerlet(atoms, units.fs)
+    named = {"torsion": TORSION, "bonds": Distance([[1, 0], [2, 1]])}
+    recorder = AseRecorder(dynamics, {"torsion": TORSION})
+    logger = ConstraintLogger(dynamics, atoms, log, named, peratom=True)
+    dynamics.attach(recorder)
+    dynamics.attach(logger)
+    dynamics.run(3)
+    head = log.getvalue().splitlines()[0].split()
+    assert head[-3:] == ["lambda(torsion)", "lambda(bonds[0])", "lambda(bonds[1])"]
+    assert columns(log)[:, 5] == pytest.approx(recorder.series.multiplier[:, 0], rel=1e-5)
+    assert columns(log)[-1, 1] == pytest.approx(atoms.get_total_energy() / 9, abs=1e-4)
+
+
+def test_a_rod_in_tension():
+    """Two atoms that turn about each other: the multiplier is the centripetal force."""
+    atoms, log = Atoms("Ar2", positions=[[0, 0, 0], [2.0, 0, 0]], calculator=Free()), io.StringIO()
+    rod = Distance([[0, 1]])
+    constrain(atoms, rod)
+    atoms.set_velocities([[0, -0.1, 0], [0, 0.1, 0]])
+    ConstraintLogger(None, atoms, log, {"rod": rod})()
+    mass = atoms.get_masses()[0]
+    assert columns(log)[0, -1] == pytest.approx(-mass * 0.1**2 / 1.0, rel=1e-5)
+
+
+def test_what_is_not_held_is_refused():
+    atoms = moving()
+    with pytest.raises(InputError, match=r"carry no constraints.*constrain"):
+        ConstraintLogger(VelocityVerlet(atoms, units.fs), atoms, io.StringIO(), {"torsion": TORSION})
+    dynamics = ConstrainedDynamics(atoms, units.fs, constraints=ROWS)
+    with pytest.raises(InputError, match=r"angle, Angle\(0, 1, 2\), is not among the 3 rows"):
+        ConstraintLogger(dynamics, atoms, io.StringIO(), {"angle": Angle([[0, 1, 2]])})
