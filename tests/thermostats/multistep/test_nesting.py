@@ -142,11 +142,12 @@ def spreads(angle, share, friction=0.05, count=10):
 
 
 def test_where_averages_are_right():
-    """Too wide at the kicks, too narrow halfway, right at about a fifth; near half a period no place is right."""
+    """Too wide at the kicks, too narrow halfway, right at about a fifth; near half a period both are far too wide."""
     found = spreads(1.5, 0.2) - 1
     assert found == pytest.approx(found[::-1], abs=5e-3)
     assert found[0] == pytest.approx(0.088, abs=5e-4) and found[5] == pytest.approx(-0.058, abs=5e-4)
     assert abs(found[2]) < 0.01 < -found[3]
     # Without slow forces every inner step is right at its end.
     assert spreads(1.5, 0.0, count=2) - 1 == pytest.approx([0, 0, 0], abs=1e-12)
-    assert np.isinf(spreads(3.0, 0.2)).all() and spreads(math.pi, -0.2, friction=0.2).min() > 2
+    driven = spreads(math.pi, -0.2, friction=0.2)
+    assert np.isinf(spreads(3.0, 0.2)).all() and min(driven[0], driven[5], driven.mean()) > 4
