@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import numbers, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
-from kcons.free_energy.profiles.pulls import Pulled, pull_free_energy
+from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window
 from kcons.steppers.files import in_one_piece, text
@@ -176,11 +177,17 @@ class Windows:
     ) -> None:
         self.sampler = sampler
         self.settings = settings or Settings()
-        self.both_sides, self.seed = both_sides, seed
+        self.both_sides, self.seed = both_sides, seed_number(seed)
         self.folder = Path(folder)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
-        self.approach: FloatArray = np.broadcast_to(np.asarray(approach, dtype=np.float64), (len(sampler.names),))
+        given = numbers(approach, "approach")
+        if given.shape not in ((), (len(sampler.names),)) or not np.isfinite(given).all():
+            raise InputError(
+                f"approach is {approach!r}; give a finite number, or one for each of {', '.join(sampler.names)}",
+                item="approach",
+            )
+        self.approach: FloatArray = np.broadcast_to(given, (len(sampler.names),))
         self._keep_settings()
 
     def _keep_settings(self) -> None:
@@ -239,8 +246,10 @@ class Windows:
         FreeEnergy
             One failed window does not stop the others; `failed` says why.
         """
-        places = np.array(targets, dtype=np.float64).reshape(-1, len(self.sampler.names))
-        if not len(places) or not np.all(np.isfinite(places)):
+        d = len(self.sampler.names)
+        places = np.array(numbers(targets if isinstance(targets, np.ndarray) else list(targets), "targets"))  # type: ignore[arg-type]
+        places = places[:, None] if places.ndim == 1 and d == 1 else places
+        if places.ndim != 2 or places.shape[1] != d or not len(places) or not np.all(np.isfinite(places)):
             raise InputError("targets must be finite numbers, one row for each window", item="targets")
         first = len(self._targets)
         self._targets += [tuple(row) for row in places.tolist()]
@@ -323,6 +332,7 @@ class Windows:
         InputError
             No steps to pull in; fewer than 5 pulls that did not fail.
         """
+        whole_number(count, "count", FEWEST)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
         ends = np.array([np.atleast_1d(start), np.atleast_1d(end)], dtype=np.float64) / self.sampler.scales

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH
+from kcons.constraints.arguments import ANGLE, LENGTH, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.motion.motion import Motion
+from kcons.thermostats.freedom import positive
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
@@ -82,12 +83,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ("temperature", "timestep", "friction"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"{name} is {getattr(self, name)}; give a positive number", item=name)
+            positive(getattr(self, name), name)
         for name in ("relax", "pull", "equilibration", "production", "every"):
-            value = getattr(self, name)
-            if int(value) != value or value < (name in ("production", "every")):
-                raise InputError(f"{name} is {value}; give a number of steps", item=name)
+            whole_number(getattr(self, name), name, int(name in ("production", "every")))
         if self.thermostat not in ("langevin", "nose-hoover", "isokinetic"):
             raise InputError(
                 f"no thermostat {self.thermostat!r}; there are langevin, nose-hoover, isokinetic", item="thermostat"
