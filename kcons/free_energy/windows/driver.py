@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import numbers, seed_number, whole_number
+from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
@@ -30,7 +30,15 @@ from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window
+from kcons.free_energy.windows.window import (
+    DIRECTIONS,
+    SIDES,
+    Sampler,
+    Settings,
+    Window,
+    approach_of,
+    places_of,
+)
 from kcons.steppers.files import in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
@@ -184,13 +192,7 @@ class Windows:
         self.folder = Path(folder)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
-        given = numbers(approach, "approach")
-        if given.shape not in ((), (len(sampler.names),)) or not np.isfinite(given).all():
-            raise InputError(
-                f"approach is {approach!r}; give a finite number, or one for each of {', '.join(sampler.names)}",
-                item="approach",
-            )
-        self.approach: FloatArray = np.broadcast_to(given, (len(sampler.names),))
+        self.approach = approach_of(approach, sampler.names)
         self._keep_settings()
 
     def _keep_settings(self) -> None:
@@ -249,11 +251,7 @@ class Windows:
         FreeEnergy
             One failed window does not stop the others; `failed` says why.
         """
-        d = len(self.sampler.names)
-        places = np.array(numbers(targets if isinstance(targets, np.ndarray) else list(targets), "targets"))  # type: ignore[arg-type]
-        places = places[:, None] if places.ndim == 1 and d == 1 else places
-        if places.ndim != 2 or places.shape[1] != d or not len(places) or not np.all(np.isfinite(places)):
-            raise InputError("targets must be finite numbers, one row for each window", item="targets")
+        places = places_of(targets, self.sampler.names)
         first = len(self._targets)
         self._targets += [tuple(row) for row in places.tolist()]
         jobs = [job for number in range(first, len(self._targets)) for job in self._jobs(number)]
