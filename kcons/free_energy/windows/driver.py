@@ -30,15 +30,7 @@ from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import (
-    DIRECTIONS,
-    SIDES,
-    Sampler,
-    Settings,
-    Window,
-    approach_of,
-    places_of,
-)
+from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
 from kcons.steppers.files import in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
