@@ -1,6 +1,6 @@
 """OpenMM at 4 fs with all bonds and all angles held: how well the rows stay, and whether the energy drifts.
 
-    python examples/24_openmm_four_femtoseconds.py                   alanine dipeptide for 0.2 ps on the CPU
+    python examples/24_openmm_four_femtoseconds.py                   alanine dipeptide for 4 ps on the CPU
     python examples/24_openmm_four_femtoseconds.py --full --out F    the committed results
     python examples/24_openmm_four_femtoseconds.py --show F          the tables of an earlier run
 

@@ -1,0 +1,140 @@
+"""Motions under constraints of one's own, each beside what theory says: a picture for docs/own_constraints.md.
+
+python examples/37_constraint_figures.py            prints how far each is from its closed form
+python examples/37_constraint_figures.py FOLDER     also writes own_constraints.png there
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Constraint, Custom, CustomVelocity, Distance, Formula, KnifeEdge, Plane, Rolling
+from kcons.steppers import Trajectory
+
+#: Of positions and time.
+Force = Callable[[np.ndarray, float], np.ndarray]
+
+
+def moved(
+    held: list[Constraint], x: np.ndarray, v: np.ndarray, force: Force | None, length: float, steps: int
+) -> tuple[Motion, Trajectory]:
+    motion = Motion(ConstraintSet(held, x, np.ones(len(x))), x)
+    return motion, run(
+        System(motion, force), State(x, motion.project_velocities(x, v)), length / steps, steps, record=5
+    )
+
+
+def skate(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two masses on a blade that turns with the rate 2 on a slope: cycloids across it, and no way down (Bloch 2003)."""
+    pull, rate, half = 1.0, 2.0, 0.1
+    x = np.array([[-half, 0.0, 0.0], [half, 0.0, 0.0]])
+    v = np.array([[pull / rate, -rate * half, 0.0], [pull / rate, rate * half, 0.0]])
+    held = [Distance([[0, 1]]), Plane([0, 1], [0.0, 0.0, 1.0], 0.0), KnifeEdge([0], [1], [0.0, 0.0, 1.0], contact=0.5)]
+    _, path = moved(held, x, v, lambda x, t: np.tile([0.0, -pull, 0.0], (2, 1)), 6.0, steps)
+    turned = rate * path.times
+    exact = np.stack([turned + np.sin(turned) * np.cos(turned), np.sin(turned) ** 2], axis=1) * pull / (2 * rate**2)
+    return path.positions.mean(axis=1)[:, :2], exact
+
+
+def wheel(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """A point on the rim of a wheel that rolls at speed 1: a cycloid."""
+    along, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    turns = np.radians([0, 120, 240])[:, None]  # from the top; the centre of mass is the hub
+    rim = np.cos(turns) * up + np.sin(turns) * along
+    x = np.vstack([up, up + rim])
+    v = along + np.vstack([0 * along, np.cos(turns) * along - np.sin(turns) * up])
+    held = [
+        Plane([0], up, 1.0),
+        Plane([0, 1, 2, 3], [0.0, 1.0, 0.0], 0.0),
+        Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
+        Rolling([0], [1], 1.0, along, up),
+    ]
+    _, path = moved(held, x, v, None, 12.0, steps)
+    t = path.times
+    return path.positions[:, 1, [0, 2]], np.stack([t + np.sin(t), 1 + np.cos(t)], axis=1)
+
+
+def spiral(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """A velocity at 80 degrees from the radius everywhere: a logarithmic spiral, at constant speed."""
+    lean = np.radians(80)
+
+    def coefficients(r: np.ndarray) -> np.ndarray:
+        x, y = r[0, :2] / np.hypot(*r[0, :2])
+        return np.array([[-y * np.cos(lean) - x * np.sin(lean), x * np.cos(lean) - y * np.sin(lean), 0.0]])
+
+    x, v = np.array([[1.0, 0.0, 0.0]]), np.array([[np.cos(lean), np.sin(lean), 0.0]])
+    _, path = moved([Plane([0], [0.0, 0.0, 1.0], 0.0), CustomVelocity(0, coefficients)], x, v, None, 10.0, steps)
+    far = 1 + path.times * np.cos(lean)
+    around = np.log(far) * np.tan(lean)
+    return path.positions[:, 0, :2], far[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
+
+
+def rounded_cube(steps: int) -> tuple[np.ndarray, float]:
+    """Free motion on x^4 + y^4 + z^4 = 1; how far it leaves the surface."""
+    x, v = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.7]])
+    held = Custom([0], lambda r: float(np.sum(r**4)), lambda r: 4 * r**3)
+    motion, path = moved([held], x, v, None, 40.0, steps)
+    return path.positions[:, 0], max(float(np.abs(motion.constraint_set.value(r)).max()) for r in path.positions)
+
+
+def wave(steps: int) -> tuple[Trajectory, float]:
+    """Three beads that a travelling wave lifts; how far they leave it."""
+    x = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    x[:, 2] = 0.3 * np.sin(x[:, 0])
+    held = Formula("z1 - 0.3*sin(x1 - t)", [0, 1, 2])
+    motion, path = moved([held], x, np.zeros((3, 3)), lambda x, t: np.tile([0.0, 0.0, -1.0], (3, 1)), 6.0, steps)
+    pairs = zip(path.positions, path.times, strict=True)
+    return path, max(float(np.abs(motion.constraint_set.value(r, t)).max()) for r, t in pairs)
+
+
+def picture(folder: Path, steps: int = 800) -> None:
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(11, 6), layout="constrained")
+    for place, (title, (found, exact)) in enumerate(
+        {
+            "KnifeEdge: a skate on a slope": skate(steps),
+            "Rolling: a point on the rim": wheel(steps),
+            "CustomVelocity: 80° from the radius": spiral(steps),
+        }.items(),
+        1,
+    ):
+        axes = figure.add_subplot(
+            2, 3, place, title=title, aspect="equal", xlabel="x", ylabel="z" if place == 2 else "y"
+        )
+        axes.plot(*exact.T, color="0.75", linewidth=5, label="closed form")
+        axes.plot(*found.T, color="#0072B2", label="kcons")
+        if place == 3:
+            axes.legend(loc="upper right")
+    path, _ = rounded_cube(4 * steps)
+    axes = figure.add_subplot(2, 3, 4, projection="3d", title="Custom: x⁴ + y⁴ + z⁴ = 1")
+    axes.plot(*path.T, color="#0072B2", linewidth=0.8)
+    axes.set_box_aspect((1, 1, 1))
+    beads, _ = wave(steps)
+    axes = figure.add_subplot(2, 3, (5, 6), title="Formula: beads on a travelling wave", xlabel="x", ylabel="z")
+    along = np.linspace(-2, 8, 200)
+    for k, shade in zip(np.linspace(0, len(beads) - 1, 4).astype(int), ("0.85", "0.7", "0.5", "0.2"), strict=True):
+        axes.plot(along, 0.3 * np.sin(along - beads.times[k]), color=shade, label=f"t = {beads.times[k]:.0f}")
+    for bead in range(3):
+        axes.plot(beads.positions[:, bead, 0], beads.positions[:, bead, 2], color="#D55E00")
+    axes.legend()
+    figure.savefig(folder / "own_constraints.png", dpi=110)
+
+
+def main(arguments: list[str], steps: int = 100) -> None:
+    for name, motion in (("KnifeEdge", skate), ("Rolling", wheel), ("CustomVelocity", spiral)):
+        found, exact = motion(steps)
+        print(f"{name:<15} {np.abs(found - exact).max():.1e} from the closed form")
+    for name, held in (("Custom", rounded_cube), ("Formula", wave)):
+        print(f"{name:<15} {held(steps)[1]:.1e} off the surface at most")
+    if arguments:
+        picture(Path(arguments[0]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
