@@ -28,7 +28,7 @@ TABLES = {
     "coordinate": ("name", "distance", "angle", "dihedral", "from", "to", "windows", "values"),
     "held": ("constrain", "fixed", "distances"),
     "sampling": (*(f.name for f in fields(Settings)), "both_sides", "approach", "seed"),
-    "improve": ("error", "most", "at_once"),
+    "improve": ("error", "most", "at_once", "below"),
     "pulls": ("from", "to", "count", "steps", "both_ways"),
     "workers": ("processes", "scheduler"),
 }
