@@ -11,7 +11,6 @@ torsion's distribution alone, and keeps thermostats without noise ergodic. Its m
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -123,8 +122,11 @@ def closed_forms(full: bool) -> dict[str, object]:
 # -- alanine dipeptide ----------------------------------------------------------------------------------
 
 
-def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[str, object]:
-    """phi in vacuum: windows of held phi, and umbrellas with as many steps put together by MBAR."""
+def alanine(folder: Path, first: int, most: int, production: int, workers: int) -> dict[str, object]:
+    """phi in vacuum: windows of held phi, and umbrellas with as many steps put together by MBAR.
+
+    `first` windows are at equal distances, the others where they are proposed.
+    """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
@@ -138,17 +140,20 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
     sampler = OpenMMWindows(
         pdb.topology, system, pdb.positions, {"phi": Dihedral([[4, 6, 8, 14]])}, platform="Reference"
     )
-    settings = Settings(timestep=2.0, temperature=TEMPERATURE, production=production, every=20)
+    settings = Settings(timestep=STEP, temperature=TEMPERATURE, friction=FRICTION, production=production, every=25)
     held = Windows(sampler, folder / "windows", settings)
-    places = np.linspace(-np.pi, np.pi, windows, endpoint=False)
-    began = time.perf_counter()
-    result = held.run(places, workers=workers, progress=lambda *n: print("windows", *n, flush=True))
-    spent = time.perf_counter() - began
-    profile = result.profile
+    places = np.linspace(-np.pi, np.pi, first, endpoint=False)
+
+    def progress(*n: object) -> None:
+        print("windows", *n, flush=True)
+
+    held.run(places, workers=workers, progress=progress)
+    result = held.improve(0.05, most, workers=workers, progress=progress, at_once=8)
+    profile, windows = result.profile, len(result.windows)
     total = 2 * windows * (settings.pull + settings.equilibration + production)
-    each = total // windows
+    each = total // first
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        series = list(pool.map(umbrella, places, range(windows), [each] * windows, [str(folder)] * windows))
+        series = list(pool.map(umbrella, places, range(first), [each] * first, [str(folder)] * first))
     kT = 0.00831446261815324 * TEMPERATURE
     # MBAR's errors are those of independent samples.
     series = [
@@ -174,7 +179,8 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
     found = {
         "windows": windows,
         "steps of each method": total,
-        "seconds of the windows": spent,
+        "umbrellas": first,
+        "seconds of the windows": sum(w.seconds for w in result.windows),
         "largest difference below 30 kJ/mol": float(np.abs(difference[low]).max()),
         "root mean square difference": float(np.sqrt(np.mean(difference[low] ** 2))),
         "largest error of the windows": float(errors[low].max()),
@@ -191,13 +197,14 @@ def alanine(folder: Path, windows: int, production: int, workers: int) -> dict[s
 
 
 TEMPERATURE, STIFFNESS = 300.0, 150.0  # K, kJ/mol/rad^2
+STEP, FRICTION = 4.0, 1.0  # fs with heavy hydrogens, 1/ps: psi, which is slow, turns fastest
 
 
 def _system(pdb: object) -> object:
     from openmm import app
 
     field = app.ForceField("amber14-all.xml")
-    return field.createSystem(pdb.topology, constraints=app.HBonds, removeCMMotion=False)
+    return field.createSystem(pdb.topology, constraints=app.HBonds, hydrogenMass=3.0, removeCMMotion=False)
 
 
 def umbrella(place: float, number: int, steps: int, folder: str) -> np.ndarray:
@@ -214,7 +221,7 @@ def umbrella(place: float, number: int, steps: int, folder: str) -> np.ndarray:
     bias.addGlobalParameter("place", float(place))
     bias.addTorsion(4, 6, 8, 14, [])
     system.addForce(bias)
-    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, 5.0, 0.002)
+    integrator = openmm.LangevinMiddleIntegrator(TEMPERATURE, FRICTION, STEP / 1000)
     integrator.setRandomNumberSeed(number + 1)
     simulation = app.Simulation(pdb.topology, system, integrator, openmm.Platform.getPlatformByName("Reference"))
     simulation.context.setPositions(pdb.positions)
@@ -234,7 +241,7 @@ def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
-        found = {"alanine dipeptide": alanine(folder, 24, 20_000, 2)}
+        found = {"alanine dipeptide": alanine(folder, 24, 48, 40_000, 1)}
     else:
         found = {"chain": closed_forms("--full" in arguments)}
         if "--full" not in arguments:

@@ -39,10 +39,10 @@ _FLOAT = np.dtype(np.float64)
 class ConstrainedDynamics(MolecularDynamics):
     """Dynamics at constant energy on the constraints, by any stepper of `kcons.steppers`.
 
-    Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on
-    the atoms hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and
-    what `constraints` adds. Velocities come from the multipliers and never from differences of positions,
-    so that accuracy does not depend on the distance from the origin.
+    Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on the atoms
+    hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and what `constraints`
+    adds. Velocities come from the multipliers, not from differences of positions: the distance from the origin costs no
+    accuracy.
 
     Parameters
     ----------
@@ -53,9 +53,8 @@ class ConstrainedDynamics(MolecularDynamics):
     stepper : Stepper, optional
         `Rattle` by default; of order 4 or 6 where accuracy counts.
     constraints : sequence of Constraint, optional
-        More to hold than what is on the atoms; here also targets that move with time and velocity
-        (nonholonomic) rows, for which ASE has no place. ASE's temperature does not know of these: use
-        `get_temperature` of this object.
+        More than what is on the atoms; here also targets that move with time and velocity (nonholonomic) rows, for
+        which ASE has no place. ASE's temperature does not know of these: use `get_temperature` of this object.
     time : float
         Time at the start, for targets that move.
     forces : array_like, shape (n_atoms, 3), optional
@@ -201,6 +200,7 @@ class ConstrainedDynamics(MolecularDynamics):
         except BaseException as error:
             atoms = self.atoms.arrays
             atoms["positions"][...], atoms["momenta"][...] = state.positions, self._momenta
+            self.atoms.cell[...] = np.frombuffer(self._cell, count=9).reshape(3, 3)  # which barostats change
             name_step(error, self.nsteps + 1)
             raise
         self._momenta, v = self._put(after.positions, after.velocities)

@@ -9,6 +9,7 @@ import numpy as np
 from ase import Atoms, units
 
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
+from kcons.constraints.arguments import seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.steppers import State, Stepper
@@ -74,7 +75,7 @@ class ConstrainedMonteCarlo(ThermostattedDynamics):
         **kwargs: Any,
     ) -> None:
         #: Seed of the random numbers.
-        self.seed = int(rng) if isinstance(rng, int | np.integer) else int(np.random.default_rng(rng).integers(2**63))
+        self.seed = seed_from(rng)
         self._options = {"stepper": stepper, "keep": keep, "conserve_momentum": fixcm, "tolerance": tolerance}
         self._steps = steps
         super().__init__(atoms, timestep, self._sampler(temperature_K), **kwargs)

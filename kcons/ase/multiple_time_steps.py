@@ -12,7 +12,7 @@ from ase.calculators.mixing import SumCalculator
 from kcons.ase.binding import FORCES_ONLY
 from kcons.ase.dynamics import name_step
 from kcons.ase.thermostat_dynamics import ThermostattedDynamics
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.thermostats import ForceGroups, IsokineticSpheres, LangevinRespa
@@ -87,9 +87,7 @@ class MultipleTimeSteps(ThermostattedDynamics):
         if bath not in ("langevin", "spheres"):
             raise InputError(f"bath is {bath!r}; choose 'langevin' or 'spheres'", item="bath")
         #: Seed of the noise.
-        self.seed = (
-            int(seed) if isinstance(seed, int | np.integer) else int(np.random.default_rng(seed).integers(2**63))
-        )
+        self.seed = seed_from(seed, "seed")
         own = (
             "order",
             "substeps",

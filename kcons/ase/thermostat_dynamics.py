@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from kcons.ase.dynamics import FAR, ConstrainedDynamics
 from kcons.ase.pressure.atoms_system import AtomsSystem
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import generator_of, seed_from
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
@@ -251,7 +252,7 @@ class ConstrainedLangevin(ThermostattedDynamics):
         **kwargs: Any,
     ) -> None:
         #: Seed of the noise.
-        self.seed = int(rng) if isinstance(rng, int | np.integer) else int(np.random.default_rng(rng).integers(2**63))
+        self.seed = seed_from(rng)
         self._options = {"substeps": substeps, "conserve_momentum": fixcm}
         stepper = self._stepper(temperature_K, friction)
         super().__init__(atoms, timestep, stepper, **kwargs)
@@ -374,7 +375,7 @@ def draw_velocities(
             system,
             atoms.positions,
             thermal,
-            np.random.default_rng(rng),
+            generator_of(rng),
             zero_momentum=zero_momentum,
             kinetic_energy=wanted,
         )

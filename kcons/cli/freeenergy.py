@@ -32,6 +32,7 @@ def _free_energy(chosen: argparse.Namespace) -> int:
 
     from kcons.cli.progress import Bars
     from kcons.free_energy import Windows, read_plan, windows_report
+    from kcons.steppers.files import in_one_piece, text
 
     plan = read_plan(chosen.plan)
     if chosen.scheduler is not None:
@@ -40,9 +41,13 @@ def _free_energy(chosen: argparse.Namespace) -> int:
     if chosen.list:
         steps = plan.settings.pull + plan.settings.equilibration + plan.settings.production
         print(f"{len(plan.targets)} windows of {', '.join(plan.sampler.names)}, {sides} runs of {steps:,} steps each")
+        if plan.pulls:
+            ways = "both ways" if plan.pulls.get("both_ways", True) else "one way"
+            print(f"{plan.pulls.get('count', 20)} pulls {ways} of {plan.pull_steps:,} steps each")
         return 0
     folder: Path = chosen.out or Path(chosen.plan.stem)
     windows = Windows(plan.sampler, folder, plan.settings, **plan.options)
+    pulled = None
     with Bars() as watcher, plan.executor() as executor:
 
         def progress(done: int, total: int, seconds: float) -> None:
@@ -57,7 +62,18 @@ def _free_energy(chosen: argparse.Namespace) -> int:
         found = windows.run(plan.targets, **how)
         if plan.improve and not found.failed:
             found = windows.improve(**plan.improve, **how)
+        if plan.pulls:
+            # A folder belongs to settings, and pulls are slower than the way to a window.
+            settings = replace(plan.settings, pull=plan.pull_steps)
+            pulled = Windows(plan.sampler, folder / "pulls", settings, **plan.options).pull(**plan.pulls, **how)
     degrees = windows.angles
     show(windows_report.table(found, degrees), windows_report.summary(found), console())
-    say_written(windows_report.write(found, folder, degrees))
+    written = windows_report.write(found, folder, degrees)
+    if plan.pulls and pulled is not None:
+        numbers, said = windows_report.of_pulls(found, pulled, plan.pulls["start"], plan.pulls["end"])
+        print(said)
+        written.append(folder / "pulls.json")
+        with in_one_piece(written[-1]) as opened:
+            opened.write(text(numbers).encode())
+    say_written(written)
     return INCOMPLETE if found.failed else 0

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -112,26 +113,93 @@ def check_multipliers(multipliers: FloatArray, n_rows: int) -> None:
         raise InputError(f"multipliers must be a writable float64 array of shape ({n_rows},)", item="multipliers")
 
 
-def check_pairs(pairs: ArrayLike, n_atoms: int) -> IntArray:
-    """Pairs of different atoms, shape (n, 2).
+def check_pairs(pairs: ArrayLike, n_atoms: int | None = None) -> IntArray:
+    """Pairs of different atoms, shape (n, 2), a copy; of a number of atoms that need not be known yet.
 
     Raises
     ------
     InputError
         Another shape; numbers that are no integers; atoms that do not exist.
     """
-    table = np.asarray(pairs)
+    try:
+        table = np.asarray(pairs)
+    except ValueError as error:
+        raise InputError(f"bonds must be pairs of atoms, shape (n, 2): {error}", item="bonds") from None
     if table.size == 0:
         return np.zeros((0, 2), np.int64)
     if table.ndim != 2 or table.shape[1] != 2 or not np.issubdtype(table.dtype, np.integer):
         raise InputError(f"bonds must be pairs of atoms, shape (n, 2), not {table.dtype} {table.shape}", item="bonds")
-    bad = (table < 0).any(axis=1) | (table >= n_atoms).any(axis=1) | (table[:, 0] == table[:, 1])
+    bad = (table < 0).any(axis=1) | (table[:, 0] == table[:, 1])
+    if n_atoms is not None:
+        bad |= (table >= n_atoms).any(axis=1)
     if bad.any():
         i, j = table[int(np.argmax(bad))].tolist()
         raise InputError(
-            f"bonds has the pair ({i}, {j}); give two different atoms of 0 to {n_atoms - 1}", item="bonds", atoms=[i, j]
+            f"bonds has the pair ({i}, {j}); give two different atoms of 0 to "
+            + ("the last" if n_atoms is None else f"{n_atoms - 1}"),
+            item="bonds",
+            atoms=[i, j],
         )
     return table.astype(np.int64)
+
+
+def finite_number(value: Any, item: str) -> float:
+    """`value` as a float.
+
+    Raises
+    ------
+    InputError
+        It has units, is no number, or is not finite.
+    """
+    refuse_units(value, item)
+    try:
+        found = math.nan if np.ndim(value) else float(value)
+    except (TypeError, ValueError):
+        found = math.nan
+    if not math.isfinite(found):
+        raise InputError(f"{item} is {value!r}; give a finite number", item=item)
+    return found
+
+
+def whole_number(value: Any, item: str, least: int = 1, most: int | None = None) -> int:
+    """`value` as an int.
+
+    Raises
+    ------
+    InputError
+        It is no whole number, or below `least` or above `most`.
+    """
+    try:
+        found = int(value)
+        good = bool(found == value) and least <= found and (most is None or found <= most)
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good or isinstance(value, bool):
+        bounds = f", {least} or more" if most is None else f" from {least} to {most}"
+        raise InputError(f"{item} is {value!r}; give a whole number{bounds}", item=item)
+    return found
+
+
+def seed_number(seed: Any) -> int:
+    """A seed as an int; `InputError` for no whole number from 0 to 2^64 - 1."""
+    return whole_number(seed, "seed", 0, 2**64 - 1)
+
+
+def seed_from(rng: Any, item: str = "rng") -> int:
+    """A seed: a whole number itself, or one drawn from a generator; from the operating system for None."""
+    if isinstance(rng, int | np.integer):
+        return seed_number(rng)
+    return int(generator_of(rng, item).integers(2**63))
+
+
+def generator_of(rng: Any, item: str = "rng") -> np.random.Generator:
+    """A generator itself, or one made from a seed; `InputError` for what is neither."""
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{item} is {rng!r}; give a whole number from 0 on, a numpy.random.Generator, or None", item=item
+        ) from error
 
 
 # -- numbers with units -----------------------------------------------------------------------------

@@ -8,7 +8,9 @@ import numpy as np
 from ase.md.md import MolecularDynamics
 
 from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics
-from kcons.constraints import Constraint
+from kcons.ase.binding import applied_forces
+from kcons.ase.topology import bonds_of
+from kcons.constraints import Constraint, Dihedral
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates, Sample
 from kcons.free_energy.series import Series
@@ -56,7 +58,7 @@ class AseRecorder:
         self.coordinates = dict(coordinates)
         self.constraint_forces = constraint_forces
         self._motion = self._engine()
-        self._held = HeldCoordinates(self._motion, self.coordinates, dynamics.atoms.positions, time=dynamics.get_time())
+        self._held = self._coordinates_of(self._motion)
         self.series = Series(self._held.names, self._held.periods)
         self.last: Sample | None = None
 
@@ -73,17 +75,23 @@ class AseRecorder:
             )
         return found[0].engine(atoms)
 
+    def _coordinates_of(self, motion: Motion) -> HeldCoordinates:
+        atoms, time = self.dynamics.atoms, self.dynamics.get_time()
+        turns = any(isinstance(item, Dihedral) for item in self.coordinates.values())
+        bonds = bonds_of(atoms) if turns else None
+        return HeldCoordinates(motion, self.coordinates, atoms.positions, time=time, bonds=bonds)
+
     def __call__(self) -> None:
         atoms, time = self.dynamics.atoms, self.dynamics.get_time()
         motion = self._engine()
         if motion is not self._motion:  # masses, constraints or periodicity were changed
-            self._held = HeldCoordinates(motion, self.coordinates, atoms.positions, time=time)
+            self._held = self._coordinates_of(motion)
             self._motion = motion
         forces = None
         if isinstance(self.dynamics, ConstrainedDynamics):
             forces = self.dynamics.state.forces
         if forces is None:
-            forces = atoms.get_forces(apply_constraint=False)
+            forces = applied_forces(atoms)
         if isinstance(self.dynamics, IsokineticDynamics):  # known once it runs
             self.series.isokinetic_degrees_of_freedom = self.dynamics.thermostat_degrees_of_freedom
         x, v = atoms.positions, atoms.get_velocities()

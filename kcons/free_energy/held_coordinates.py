@@ -15,6 +15,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet, rows_like
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.free_energy.rigid_turns import RigidTurn, leaves_the_rest, rigid_turn
 from kcons.motion.motion import Motion
 
 #: A coordinate of which the other constraints leave less than this share of its Z depends on them.
@@ -40,6 +41,8 @@ class Sample(NamedTuple):
         Half the derivative of ln det Z along each coordinate, the others and all constraints held.
     off : float
         The largest |sigma| of the coordinates.
+    turned : ndarray
+        dU/dq of the rigid turn of a torsion's group; NaN where there is none.
     """
 
     time: float
@@ -49,6 +52,7 @@ class Sample(NamedTuple):
     log_det_z: float
     gradient: FloatArray
     off: float
+    turned: FloatArray
 
 
 class HeldCoordinates:
@@ -67,6 +71,8 @@ class HeldCoordinates:
         Where rank and clusters are found.
     time : float
         Time of `positions`, for targets that move.
+    bonds : array_like of int, shape (n, 2), optional
+        Of the molecules. Torsions about a bond that is in no ring then have `Sample.turned` as well.
 
     Attributes
     ----------
@@ -102,6 +108,7 @@ class HeldCoordinates:
         positions: ArrayLike,
         *,
         time: float = 0.0,
+        bonds: ArrayLike | None = None,
     ) -> None:
         held = motion if isinstance(motion, ConstraintSet) else motion.sources[0]
         x = as_array(positions, (held.n_atoms, 3), "positions")
@@ -139,6 +146,13 @@ class HeldCoordinates:
         self._inverse_masses = 1 / held.masses[self.atoms, None]
         self.motion = Motion(self._others, x[other_atoms], time=time) if len(others) else None
         self._at(x[self.atoms], time)
+        self._turns: list[RigidTurn | None] = [None] * len(self)
+        if bonds is not None:
+            pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
+            for k, row in enumerate(self.rows.tolist()):
+                turn = rigid_turn(_row(held, row), pairs, x)
+                if turn is not None and leaves_the_rest(turn, row, held, others, x, time):
+                    self._turns[k] = turn
 
     def __len__(self) -> int:
         return len(self.names)
@@ -166,9 +180,10 @@ class HeldCoordinates:
             A coordinate has come to depend on the other constraints.
         """
         shape = (self._source.n_atoms, 3)
-        arrays = []
+        arrays, whole = [], []
         for array, item in ((x, "positions"), (v, "velocities"), (f, "forces")):
-            near = as_array(array, shape, item)[self.atoms]
+            whole.append(as_array(array, shape, item))
+            near = whole[-1][self.atoms]
             finite = np.isfinite(near).all(axis=1)
             if not finite.all():
                 atom = int(self.atoms[np.argmin(finite)])
@@ -194,6 +209,7 @@ class HeldCoordinates:
             metric.log_det_z,
             self._change_of_z(bent[1:]),
             float(np.abs(off).max()),
+            np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns]),
         )
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
@@ -321,6 +337,12 @@ def _curvatures(held: ConstraintSet, x: FloatArray, u: FloatArray, time: float) 
         v = u[:, item.atoms].reshape(r.shape)
         parts.append(again.curvature(r, v, time).reshape(many, -1))
     return np.concatenate(parts, axis=1)
+
+
+def _row(held: ConstraintSet, row: int) -> Constraint:
+    """One row of the set."""
+    item = int(np.searchsorted(held.starts, row, side="right")) - 1
+    return held.constraints[item].select([row - int(held.starts[item])])
 
 
 def _joined_rows(held: ConstraintSet, rows: IntArray) -> IntArray:

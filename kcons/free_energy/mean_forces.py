@@ -84,6 +84,9 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
 def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     """dF/dq = <w (lambda + kT G)>/<w>, w = (det Z)^(-1/2), G half the gradient of ln det Z along each coordinate.
 
+    Where the series has `turned` as well, whose weighted mean is the same, the mixture of both that fluctuates least is
+    averaged.
+
     Parameters
     ----------
     series : Series
@@ -118,8 +121,7 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
             "rest (the work of moving ones is Series.work)",
             item=name,
         )
-    force = local_mean_force(kept, kT)
-    mean = weighted_mean(force, kept.weights)
+    mean = weighted_mean(_quietest(kept, local_mean_force(kept, kT)), kept.weights)
     return MeanForce(
         kept.names,
         value[0] + moved.mean(axis=0),
@@ -129,3 +131,15 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
         len(kept),
         mean.n_effective,
     )
+
+
+def _quietest(series: Series, force: FloatArray) -> FloatArray:
+    """f + a (turned - f) of each torsion that could be turned, a by least squares; two estimates of one mean."""
+    mixed = force.copy()
+    for k, turned in enumerate(series.turned.T):
+        difference = turned - force[:, k]
+        spread = np.var(difference)
+        if np.isfinite(spread) and spread > 0:
+            away = difference - difference.mean()
+            mixed[:, k] -= np.mean(away * force[:, k]) / spread * difference
+    return mixed

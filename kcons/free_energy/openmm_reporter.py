@@ -11,6 +11,7 @@ import openmm
 from openmm import unit
 
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint_set import ConstraintSet, same_rows
 from kcons.errors import InputError
 from kcons.free_energy.held_coordinates import HeldCoordinates
@@ -22,6 +23,7 @@ from kcons.openmm.carried.requirements import refuse_virtual_sites, with_massles
 from kcons.openmm.collective.collective_rows import CollectiveRows
 from kcons.openmm.ensembles.isokinetic_ensemble import Isokinetic
 from kcons.openmm.quantities import accepted, masses_of
+from kcons.openmm.topology import bonds_of
 
 
 class HeldCoordinatesReporter:
@@ -72,12 +74,11 @@ class HeldCoordinatesReporter:
         beside: Iterable[Constraint] = (),
         append: bool = False,
     ) -> None:
-        if reportInterval < 1:
-            raise InputError(f"reportInterval is {reportInterval}; give a number of steps", item="reportInterval")
+        interval = whole_number(reportInterval, "reportInterval")
         names = list(coordinates)
         self._coordinates = dict(zip(names, accepted(coordinates.values()), strict=True))
         self._beside = accepted(beside)
-        self._interval = reportInterval
+        self._interval = interval
         self._own = not hasattr(file, "write")
         self._file: TextIO = open(file, "a" if append else "w", encoding="utf-8") if self._own else file  # type: ignore[arg-type, assignment] # noqa: SIM115
         self._titled = append
@@ -149,7 +150,12 @@ class HeldCoordinatesReporter:
             cell=None if box is None else cell_of(box),
             time=time,
         )
-        self._held = HeldCoordinates(self._set, self._coordinates, x, time=time)
+        # A turn of a group must move what is free to move, and nothing that is held in another way.
+        known = all(isinstance(part, CollectiveRows | CarriedConstraints) for part in parts)
+        virtual = np.array([system.isVirtualSite(k) for k in range(len(masses))])
+        free = known and bool(np.all((masses > 0) | virtual))
+        bonds = bonds_of(system, x) if free else None
+        self._held = HeldCoordinates(self._set, self._coordinates, x, time=time, bonds=bonds)
         self.series = Series(self._held.names, self._held.periods)
         if not self._titled:
             titles = [title for name in self._held.names for title in (name, f"multiplier of {name}")]

@@ -16,7 +16,7 @@ from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.state import State, System
 
 #: What a sample has for each coordinate, and once.
-_VECTORS = ("value", "multiplier", "kinetic", "gradient")
+_VECTORS = ("value", "multiplier", "kinetic", "gradient", "turned")
 _NUMBERS = ("time", "log_det_z", "off")
 
 
@@ -31,11 +31,13 @@ class Series:
     isokinetic_degrees_of_freedom : int, optional
         g of an isokinetic run, which gives the velocities (g - 1)/g of their canonical variance; `local_mean_force`
         puts that right. 0 for every other run.
+    seconds : float
+        Processor time that the run took, where it is known.
 
     Attributes
     ----------
     time, log_det_z, off : ndarray, shape (n,)
-    value, multiplier, kinetic, gradient : ndarray, shape (n, d)
+    value, multiplier, kinetic, gradient, turned : ndarray, shape (n, d)
 
     Examples
     --------
@@ -44,8 +46,15 @@ class Series:
     (0, (0, 1))
     """
 
-    def __init__(self, names: Sequence[str], periods: ArrayLike = 0.0, isokinetic_degrees_of_freedom: int = 0) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        periods: ArrayLike = 0.0,
+        isokinetic_degrees_of_freedom: int = 0,
+        seconds: float = 0.0,
+    ) -> None:
         self.names = tuple(names)
+        self.seconds = seconds
         self.isokinetic_degrees_of_freedom = isokinetic_degrees_of_freedom
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
         self._samples: list[Sample] = []
@@ -64,7 +73,7 @@ class Series:
 
     def __getitem__(self, samples: slice) -> Series:
         """Some of the samples."""
-        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom)
+        part = Series(self.names, self.periods, self.isokinetic_degrees_of_freedom, self.seconds)
         part._samples = self._samples[samples]
         return part
 
@@ -109,6 +118,10 @@ class Series:
         return self._vectors("gradient")
 
     @property
+    def turned(self) -> FloatArray:
+        return self._vectors("turned")
+
+    @property
     def weights(self) -> FloatArray:
         """(det Z)^(-1/2) by its largest value, shape (n,): what turns averages into those without the coordinates held.
 
@@ -139,6 +152,7 @@ class Series:
         with in_one_piece(file) as opened:
             arrays |= {"names": np.array(self.names), "periods": self.periods}
             arrays["isokinetic_degrees_of_freedom"] = np.array(self.isokinetic_degrees_of_freedom)
+            arrays["seconds"] = np.array(self.seconds)
             np.savez(opened, **arrays)  # type: ignore[arg-type]
 
     @classmethod
@@ -154,8 +168,10 @@ class Series:
             with open(file, "rb") as opened:
                 data = stored_arrays(opened)
             names = [str(name) for name in data["names"]]
-            series = cls(names, data["periods"], int(data["isokinetic_degrees_of_freedom"]))
+            g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data.get("seconds", 0.0))
+            series = cls(names, data["periods"], g, seconds)
             d = len(series.names)
+            data = {"turned": np.full_like(data["value"], np.nan)} | dict(data)
             columns = [data[f].reshape(-1) for f in _NUMBERS] + [data[f].reshape(-1, d) for f in _VECTORS]
             for row in zip(*columns, strict=True):
                 known: dict[str, Any] = dict(zip((*_NUMBERS, *_VECTORS), row, strict=True))

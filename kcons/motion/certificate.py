@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.errors import CertificateError, InputError
+from kcons.errors import CertificateError
 
 #: Steps from one certificate to the next, if nothing else is asked for ...
 CHECK_EVERY = 1000
@@ -91,9 +92,7 @@ def checked_every(check_every: int | None) -> tuple[int, bool]:
     """
     if check_every is None:
         return CHECK_EVERY, True
-    if check_every < 0:
-        raise InputError(f"check_every is {check_every}; give 0 (never) or more", item="check_every")
-    return int(check_every), False
+    return whole_number(check_every, "check_every", 0), False
 
 
 class Schedule:

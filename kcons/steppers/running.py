@@ -7,9 +7,8 @@ from typing import Any, TypeAlias, overload
 
 import numpy as np
 
-from kcons.constraints.arguments import refuse_units
+from kcons.constraints.arguments import refuse_units, whole_number
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.state import State, System
@@ -154,10 +153,8 @@ def run(
         Whatever a step raises; `error.step` is its number. Observers have then seen all states that they were due, the
         last one less than `every` steps before. Whatever is raised, `error.trajectory` has what was recorded.
     """
-    if steps < 0 or every < 1:
-        raise InputError(f"steps is {steps} and every {every}; give steps >= 0 and every >= 1", item="steps")
-    if record is not None and record < 1:
-        raise InputError(f"record is {record}; give the number of steps from one frame to the next", item="record")
+    steps, every = whole_number(steps, "steps", 0), whole_number(every, "every")
+    record = None if record is None else whole_number(record, "record")
     refuse_units(dt, "dt")
     if stepper is None:
         stepper = Rattle()

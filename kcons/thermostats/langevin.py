@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from kcons.constraints.arguments import refuse_units
+from kcons.constraints.arguments import finite_number, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State, System
@@ -34,16 +34,11 @@ class SeededBath(Listed):
 
     def __init__(self, thermal_energy: float, friction: float, seed: int, substeps: int) -> None:
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
-        refuse_units(friction, "friction")
-        if np.ndim(friction) or not (math.isfinite(friction) and friction >= 0):
+        self.friction = finite_number(friction, "friction")
+        if self.friction < 0:
             raise InputError(f"friction is {friction}; give one number >= 0", item="friction")
-        if int(substeps) != substeps or substeps < 1:
-            raise InputError(f"substeps is {substeps}; give a whole number, 1 or more", item="substeps")
-        if int(seed) != seed or not 0 <= seed < 2**64:
-            raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
-        self.friction = float(friction)
-        self.seed = int(seed)
-        self.substeps = int(substeps)
+        self.seed = seed_number(seed)
+        self.substeps = whole_number(substeps, "substeps")
         self._bits = np.random.Philox(0)
         self._normal = np.random.Generator(self._bits)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Rattle, State, System
@@ -46,22 +47,8 @@ def chain_fractions(chain_order: int, repeats: int) -> tuple[float, ...]:
     """
     if chain_order not in FRACTIONS:
         raise InputError(f"chain_order is {chain_order!r}; give 2, 4 or 6", item="chain_order")
-    if int(repeats) != repeats or repeats < 1:
-        raise InputError(f"repeats is {repeats}; give a whole number, 1 or more", item="repeats")
-    return tuple(share / int(repeats) for share in FRACTIONS[chain_order]) * int(repeats)
-
-
-def chain_length(length: int) -> int:
-    """The number of links.
-
-    Raises
-    ------
-    InputError
-        No whole number above zero.
-    """
-    if int(length) != length or length < 1:
-        raise InputError(f"length is {length}; give a whole number, 1 or more", item="length")
-    return int(length)
+    count = whole_number(repeats, "repeats")
+    return tuple(share / count for share in FRACTIONS[chain_order]) * count
 
 
 class NoseHooverChain(Listed):
@@ -122,7 +109,7 @@ class NoseHooverChain(Listed):
         stepper: Splitting | None = None,
         momentum: Momentum = "auto",
     ) -> None:
-        self.length = chain_length(length)
+        self.length = whole_number(length, "length")
         self.fractions = chain_fractions(chain_order, repeats)
         self.thermal_energy = positive(thermal_energy, "thermal_energy")
         self.period = positive(period, "period")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array
+from kcons.constraints.arguments import as_array, generator_of
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import System
@@ -55,7 +55,7 @@ def thermal_velocities(
     positive(thermal_energy, "thermal_energy")
     if kinetic_energy is not None:
         positive(kinetic_energy, "kinetic_energy")
-    generator = rng if isinstance(rng, np.random.Generator) else np.random.default_rng(rng)
+    generator = generator_of(rng)
     motion = system.motion
     x = as_array(positions, (system.n_atoms, 3), "positions")
     drive = motion.project_velocities(x, np.zeros_like(x), time=time)

@@ -17,7 +17,16 @@ from kcons.constraints import (
     Plane,
     Sphere,
 )
-from kcons.constraints.arguments import as_array, lent, numbers
+from kcons.constraints.arguments import (
+    as_array,
+    check_pairs,
+    finite_number,
+    generator_of,
+    lent,
+    numbers,
+    seed_from,
+    whole_number,
+)
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 from kcons.motion import Motion
@@ -284,3 +293,35 @@ def test_coefficients_of_velocity_rows_cannot_change_what_they_see() -> None:
 
     with pytest.raises(ValueError, match="read-only"):
         held([CustomVelocity([0], tampering)])
+
+
+@pytest.mark.parametrize("value", [None, "3", "x", 2.5, np.nan, np.inf, True, -1, 0, [2], 10**400])
+def test_whole_numbers(value):
+    with pytest.raises(InputError, match=r"steps is .*; give a whole number from 1 to 9") as caught:
+        whole_number(value, "steps", 1, 9)
+    assert caught.value.item == "steps"
+    assert [whole_number(good, "steps") for good in (3, 3.0, np.int32(3))] == [3, 3, 3]
+
+
+@pytest.mark.parametrize("value", [None, "x", np.nan, [1.0], 1j])
+def test_finite_numbers(value):
+    with pytest.raises(InputError, match="keep is"):
+        finite_number(value, "keep")
+    assert finite_number(np.float32(0.5), "keep") == 0.5
+
+
+@pytest.mark.parametrize("rng", ["x", -1, 2.5])
+def test_what_is_neither_a_seed_nor_a_generator(rng):
+    for asked in (seed_from, generator_of):
+        with pytest.raises(InputError):
+            asked(rng)
+    with pytest.raises(InputError, match="0 to"):
+        seed_from(2**64)
+    drawn = [seed_from(np.random.default_rng(3)) for _ in range(2)]
+    assert drawn[0] == drawn[1] and seed_from(None) != seed_from(None) and seed_from(7) == 7
+
+
+@pytest.mark.parametrize("bonds", [[[0, 1], [2]], "ab", [[0.0, 1.5]], [0, 1], [[1, 1]], [[-1, 0]]])
+def test_what_is_no_pair_of_atoms(bonds):
+    with pytest.raises(InputError, match="bonds"):
+        check_pairs(bonds)

@@ -7,10 +7,12 @@ import pytest
 from ase import units
 from ase.build import molecule
 from ase.calculators.lj import LennardJones
+from ase.constraints import Hookean
 from ase.io import read, write
 from ase.md.verlet import VelocityVerlet
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, Constraints, constrain
+from kcons.ase.binding import applied_forces
 from kcons.constraints import Dihedral, Distance, MovingTarget
 from kcons.errors import InputError
 from kcons.free_energy import AseRecorder
@@ -112,3 +114,19 @@ def test_bad_input():
     atoms.set_constraint(Constraints(rows()[1]))
     with pytest.raises(InputError, match=r"turn, Dihedral\(2, 0, 1, 3\), is not among"):
         AseRecorder(VelocityVerlet(atoms, units.fs), {"turn": rows()[0]})
+
+
+def test_forces_that_ase_constraints_add_count():
+    """Also in dynamics of ASE, which ask the atoms for forces."""
+    atoms = methanol()
+    turn, bonds = rows()
+    held = constrain(atoms, [turn, *bonds])
+    atoms.set_constraint([held, Hookean(4, 3, 5.0, rt=1.0)])
+    recorder = AseRecorder(VelocityVerlet(atoms, 0.5 * units.fs), {"turn": turn})
+    recorder()
+    direct = held.engine(atoms).multipliers(atoms.positions, atoms.get_velocities(), applied_forces(atoms))
+    assert recorder.multipliers["turn"] == pytest.approx(direct[0], abs=1e-10)
+    without = held.engine(atoms).multipliers(
+        atoms.positions, atoms.get_velocities(), atoms.get_forces(apply_constraint=False)
+    )
+    assert abs(without[0] - direct[0]) > 0.01

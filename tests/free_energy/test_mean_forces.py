@@ -8,7 +8,7 @@ import pytest
 from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, Formula, Plane
 from kcons.errors import InputError
-from kcons.free_energy import HeldCoordinates, Series, local_mean_force, mean_force, weighted_mean
+from kcons.free_energy import HeldCoordinates, Sample, Series, local_mean_force, mean_force, weighted_mean
 
 KT = 0.8
 SAMPLES = 1000
@@ -193,3 +193,25 @@ def test_bad_input():
         ):
             series.append(sample)
         mean_force(series, KT)
+
+
+def test_of_two_estimates_the_mixture_that_fluctuates_least():
+    """lambda has noise of its own, turned another one; both have the mean 5."""
+    rng = np.random.default_rng(3)
+    common, fast, other = rng.normal(size=(3, 4000))
+    zero, still = np.zeros(1), np.ones(1)
+
+    def found(turned):
+        series = Series(["phi"], 2 * np.pi)
+        for k, (force, turn) in enumerate(zip(5 + common + 10 * fast, turned, strict=True)):
+            series.append(Sample(float(k), still, np.array([force]), zero, 0.0, zero, 0.0, np.array([turn])))
+        return mean_force(series, KT)
+
+    alone = found(np.full(4000, np.nan))
+    assert alone.error[0] == pytest.approx(np.sqrt(101 / 4000), rel=0.05)
+    for size in (0.0, 1.0, 10.0, 100.0):
+        both = found(5 + common + size * other)
+        # Of independent noises a and b is left ab/sqrt(a^2 + b^2).
+        left = 1 + (10 * size) ** 2 / (100 + size**2)
+        assert both.error[0] == pytest.approx(np.sqrt(left / 4000), rel=0.05)
+        assert abs(both.force[0] - 5) < 4 * both.error[0]

@@ -12,6 +12,7 @@ import numpy as np
 
 from kcons.free_energy import Sample, Series
 
+NONE = np.full(1, np.nan)  # no torsion that could be turned
 KT = 2.4943387854459713  # kJ/mol at 300 K
 
 
@@ -56,7 +57,7 @@ class Fake:
         apart = self.shift if window.side == "up" else -self.shift
         for k in range(settings.production // settings.every):
             force = slope(q) + apart + self.noise * rng.normal()
-            series.append(Sample(float(k), np.array([q]), np.array([force]), np.zeros(1), 0.0, np.zeros(1), 0.0))
+            series.append(Sample(float(k), np.array([q]), np.array([force]), np.zeros(1), 0.0, np.zeros(1), 0.0, NONE))
         series.save(file)
 
     def pull(self, window, settings, file):
@@ -68,5 +69,5 @@ class Fake:
         series = Series(self.names)
         for q in (window.start[0], window.target[0]):
             force, log_z = work / (window.target[0] - window.start[0]), np.log(4.0) if q > 0 else 0.0
-            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0))
+            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0, NONE))
         series.save(file)

@@ -15,7 +15,8 @@ from kcons.motion.motion import Motion
 from kcons.thermostats.pressure import CellSystem
 
 _WITHOUT_STRESS = (
-    "the calculator has no stress, which CellRescaling needs; use MonteCarloBarostat, which judges by energies alone"
+    "the calculator has no stress; use MonteCarloBarostat, or virial='difference' of a reporter, which take energies "
+    "alone"
 )
 
 
@@ -72,7 +73,8 @@ class AtomsSystem(CellSystem):
     def _stress(self, x: FloatArray, time: float, cell: FloatArray) -> FloatArray:
         if self._stressless:
             raise UnsupportedError(
-                "forces that constraints of ASE add have no stress; use MonteCarloBarostat, which judges by energies"
+                "forces that constraints of ASE add have no stress; use MonteCarloBarostat, or virial='difference' of "
+                "a reporter, which take energies alone"
             )
         self.atoms.arrays["positions"][...] = x
         try:

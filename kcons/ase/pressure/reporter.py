@@ -83,7 +83,8 @@ class PressureReporter:
     def _system(self) -> tuple[AtomsSystem, Pieces | None]:
         dynamics, motion = self.dynamics, self.dynamics.motion
         if self._known is None or self._known[0] is not motion:
-            system = AtomsSystem(motion, dynamics._force, dynamics._energy, dynamics.atoms, far=FAR)
+            added = dynamics._only_forces
+            system = AtomsSystem(motion, dynamics._force, dynamics._energy, dynamics.atoms, stressless=added, far=FAR)
             barostat, pieces = getattr(dynamics, "barostat", None), None
             if self.virial != "atomic":
                 x = dynamics.atoms.arrays["positions"]

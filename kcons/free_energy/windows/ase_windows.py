@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -93,6 +94,7 @@ class AseWindows:
         return held.found, held.periods
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
+        began = time.process_time()
         held = self._rows()
         atoms = self._prepared(held, window, settings)
         if settings.pull:
@@ -113,6 +115,7 @@ class AseWindows:
         recorder = AseRecorder(dynamics, self.coordinates)
         dynamics.attach(recorder, interval=settings.every)
         dynamics.run(settings.production)
+        recorder.series.seconds = time.process_time() - began
         recorder.series.save(file)
 
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
@@ -135,7 +138,7 @@ class AseWindows:
         motion, x = held.placed(window.start)
         if settings.relax:
 
-            def force(x: FloatArray, time: float) -> FloatArray:
+            def force(x: FloatArray, _: float) -> FloatArray:
                 atoms.positions = x
                 return np.asarray(atoms.get_forces(apply_constraint=False))
 

@@ -54,6 +54,8 @@ class WindowResult:
         Probability of a larger difference between the sides if both were equilibrated; NaN with one side.
     raw : ndarray, shape (d,)
         The plain mean of the multipliers, for comparison.
+    seconds : float
+        Processor time that its runs took, whichever call made them.
     """
 
     number: int
@@ -63,6 +65,7 @@ class WindowResult:
     sides: dict[str, MeanForce]
     hysteresis: float
     raw: FloatArray
+    seconds: float
 
     @property
     def error(self) -> FloatArray:
@@ -424,27 +427,29 @@ class Windows:
         found = []
         problems = dict(failed)
         for number, target in enumerate(self._targets):
-            sides: dict[str, MeanForce] = {}
+            sides, seconds = dict[str, MeanForce](), 0.0
             for job in self._jobs(number):
                 if not self.file(job).exists():
                     continue
                 try:
                     with warnings.catch_warnings():
                         warnings.simplefilter("ignore", UserWarning)  # few independent samples: said of the window
-                        sides[job.side] = mean_force(Series.load(self.file(job)), kT)
+                        series = Series.load(self.file(job))
+                        sides[job.side] = mean_force(series, kT)
+                        seconds += series.seconds
                 except KconsError as error:
                     problems[job.name] = f"{type(error).__name__}: {error}"
             if sides:
-                found.append(_together(number, np.array(target), sides, self.sampler.kJ, self.sampler.scales))
+                found.append(_together(number, np.array(target), sides, self.sampler, seconds))
         found.sort(key=lambda w: w.value.tolist())
         return FreeEnergy(self.sampler.names, self.periods, found, problems)
 
 
 def _together(
-    number: int, target: FloatArray, sides: dict[str, MeanForce], kJ: float, scales: FloatArray
+    number: int, target: FloatArray, sides: dict[str, MeanForce], sampler: Sampler, seconds: float
 ) -> WindowResult:
     """The mean of both sides, and how probable their difference is."""
-    per = kJ / scales
+    per = sampler.kJ / sampler.scales
     forces = np.array([side.force * per for side in sides.values()])
     covariances = np.array([side.covariance * np.outer(per, per) for side in sides.values()])
     chance = math.nan
@@ -452,7 +457,7 @@ def _together(
         chance = agreement(forces[0], covariances[0], forces[1], covariances[1]).p_value
     raw = np.mean([side.raw * per for side in sides.values()], axis=0)
     return WindowResult(
-        number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw
+        number, target, forces.mean(axis=0), covariances.sum(axis=0) / len(sides) ** 2, sides, chance, raw, seconds
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import UnsupportedError
 from kcons.free_energy.openmm_reporter import HeldCoordinatesReporter
+from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import Held, Settings, Window, angles_of, digest_of, scales_of
 from kcons.openmm import CollectiveRows, Isokinetic, Langevin, NoseHoover, ProjectedIntegrator, Row
 from kcons.openmm.carried.callbacks import cell_of
@@ -104,6 +106,7 @@ class OpenMMWindows:
         return held.found, held.periods
 
     def sample(self, window: Window, settings: Settings, file: Path) -> None:
+        began = time.process_time()
         dt = settings.timestep / 1000
         langevin = Langevin(settings.temperature, settings.friction)
         held = self._rows(openmm.XmlSerializer.deserialize(self._system))
@@ -124,7 +127,9 @@ class OpenMMWindows:
         if settings.thermostat != "langevin":
             _without_momentum(simulation.context, held)
         simulation.step(settings.equilibration)
-        self._recorded(simulation, settings.every, settings.production, file)
+        series = self._recorded(simulation, settings.every, settings.production)
+        series.seconds = time.process_time() - began
+        series.save(file)
 
     def pull(self, window: Window, settings: Settings, file: Path) -> None:
         dt = settings.timestep / 1000
@@ -139,7 +144,7 @@ class OpenMMWindows:
         simulation.context.setVelocities(v)
         integrator: Any = simulation.integrator
         integrator.applyVelocityConstraints()
-        self._recorded(simulation, 1, settings.pull, file, start=True)
+        self._recorded(simulation, 1, settings.pull, start=True).save(file)
 
     def _begin(self, simulation: app.Simulation, held: Held, window: Window, settings: Settings) -> None:
         """To the start of a window, relaxed, with velocities."""
@@ -154,7 +159,7 @@ class OpenMMWindows:
         duration = max(settings.pull, 1) * settings.timestep / 1000
         return [(b - a) / duration for a, b in zip(window.start, window.target, strict=True)]
 
-    def _recorded(self, simulation: app.Simulation, every: int, steps: int, file: Path, *, start: bool = False) -> None:
+    def _recorded(self, simulation: app.Simulation, every: int, steps: int, *, start: bool = False) -> Series:
         simulation.currentStep = 0
         reporter = HeldCoordinatesReporter(io.StringIO(), every, self.coordinates)
         if start:
@@ -164,7 +169,7 @@ class OpenMMWindows:
             )
         simulation.reporters.append(reporter)
         simulation.step(steps)
-        reporter.series.save(file)
+        return reporter.series
 
     def _simulation(
         self, targets: Sequence[float], rates: Sequence[float], ensemble: Any, dt: float, window: Window

@@ -29,8 +29,11 @@ TABLES = {
     "held": ("constrain", "fixed", "distances"),
     "sampling": (*(f.name for f in fields(Settings)), "both_sides", "approach", "seed"),
     "improve": ("error", "most", "at_once"),
+    "pulls": ("from", "to", "count", "steps", "both_ways"),
     "workers": ("processes", "scheduler"),
 }
+#: Steps of a pull unless they are given.
+_PULL = 20000
 FAMILIES: dict[str, type[Constraint]] = {"distance": Distance, "angle": Angle, "dihedral": Dihedral}
 
 
@@ -48,6 +51,10 @@ class PlanFile:
         Of `Windows`: both_sides, approach, seed.
     improve : dict or None
         Of `Windows.improve`.
+    pulls : dict or None
+        Of `Windows.pull`: start and end in angstrom and radian, count, both_ways.
+    pull_steps : int
+        Steps of each of these.
     processes : int or None
     scheduler : str or None
         Address of a scheduler of Dask.
@@ -58,6 +65,8 @@ class PlanFile:
     targets: FloatArray
     options: dict[str, Any]
     improve: dict[str, Any] | None
+    pulls: dict[str, Any] | None
+    pull_steps: int
     processes: int | None
     scheduler: str | None
 
@@ -117,12 +126,16 @@ def read_plan(file: str | PathLike[str]) -> PlanFile:
     settings = dict(data.get("sampling", {}))
     options = {key: settings.pop(key) for key in ("both_sides", "approach", "seed") if key in settings}
     workers = data.get("workers", {})
+    targets = np.array(list(product(*values)))
+    pulls = _pulls(data["pulls"], coordinates, targets) if "pulls" in data else None
     return PlanFile(
         _sampler(data, path.parent, coordinates),
         Settings(**settings),
-        np.array(list(product(*values))),
+        targets,
         options,
         data.get("improve"),
+        pulls,
+        data.get("pulls", {}).get("steps", _PULL),
         workers.get("processes"),
         workers.get("scheduler"),
     )
@@ -168,6 +181,26 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
     if places.ndim != 1 or not len(places):
         raise InputError(f"coordinate {name} has no values", item="coordinate")
     return name, item, places if family == "distance" else np.radians(places)
+
+
+def _pulls(entry: Mapping[str, Any], coordinates: Mapping[str, Constraint], targets: FloatArray) -> dict[str, Any]:
+    """Arguments of `Windows.pull`; by default from the first window to the last."""
+    found = {key: entry[key] for key in ("count", "both_ways") if key in entry}
+    for key, argument, place in (("from", "start", targets[0]), ("to", "end", targets[-1])):
+        if key in entry:
+            given = np.atleast_1d(np.array(entry[key], dtype=np.float64))
+            if given.shape != place.shape:
+                raise InputError(
+                    f"{key} of [pulls] has {given.size} values; give one for each of {', '.join(coordinates)}", item=key
+                )
+            lengths = [isinstance(item, Distance) for item in coordinates.values()]
+            place = np.where(lengths, given, np.radians(given))
+        found[argument] = place
+    for key, low in (("count", 5), ("steps", 1)):
+        value = entry.get(key, low)
+        if not isinstance(value, int) or value < low:
+            raise InputError(f"{key} of [pulls] is {value}; give a whole number, {low} or more", item=key)
+    return found
 
 
 def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Constraint]) -> Sampler:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kcons.constraints.target import FloatArray
 from kcons.free_energy.averages import FEW_INDEPENDENT
+from kcons.free_energy.profiles.pulls import Pulled
 from kcons.free_energy.windows.driver import FreeEnergy, WindowResult
 from kcons.steppers.files import in_one_piece, text
 
@@ -95,6 +98,24 @@ def write(found: FreeEnergy, folder: Path, degrees: Sequence[bool]) -> list[Path
         written.append(folder / "profile.png")
         _draw(found, written[-1], degrees[0])
     return written
+
+
+def of_pulls(found: FreeEnergy, pulled: Pulled, start: FloatArray, end: FloatArray) -> tuple[dict[str, Any], str]:
+    """What pulls gave, as plain data and in a sentence; of one coordinate beside the windows between the same ends."""
+    best, name = pulled.best, "Jarzynski" if pulled.bar is None else "BAR"
+    numbers: dict[str, Any] = {"from": start.tolist(), "to": end.tolist()}
+    for key in ("bar", "jarzynski", "jarzynski_backward"):
+        each = getattr(pulled, key)
+        if each is not None:
+            numbers[key] = [each.value, each.error]
+    numbers |= {"dissipated": pulled.dissipated, "overlap": pulled.overlap}
+    said = f"pulls give {best.value:.2f} ± {best.error:.2f} kJ/mol ({name}; {pulled.dissipated:.2g} kJ/mol are lost)"
+    if len(found.names) == 1 and len(found.windows) >= FEWEST:
+        windows = found.profile.difference(float(start[0]), float(end[0]))
+        numbers["windows"] = [windows.value, windows.error]
+        away = (best.value - windows.value) / math.hypot(best.error, windows.error)
+        said += f", windows {windows.value:.2f} ± {windows.error:.2f}: {away:+.1f} standard errors"
+    return numbers, said
 
 
 def _draw(found: FreeEnergy, file: Path, degrees: bool) -> None:

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import IO, Any
 
 import numpy as np
 import openmm
 from openmm import app, unit
 
+from kcons.constraints.arguments import finite_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.quantities import masses_of
+from kcons.thermostats.freedom import positive
 
 #: kJ/mol/nm^3 in bar.
 BAR = 16.6053906717
 
 
-def molecular_pressure(context: openmm.Context, temperature: float | None = None, strain: float = 1e-3) -> float:
+def molecular_pressure(
+    context: openmm.Context, temperature: unit.Quantity | float | None = None, strain: float = 1e-3
+) -> float:
     """Pressure in bar, of molecules as points: constraint forces within them have no part.
 
     The molecules are those that OpenMM's barostats move: joined by bonds and constraints of the System, and by the
@@ -27,16 +33,20 @@ def molecular_pressure(context: openmm.Context, temperature: float | None = None
     ----------
     context : openmm.Context
         Of a periodic System.
-    temperature : float, optional
-        In kelvin, for N kT/V instead of the present kinetic energy of the centres: the same mean, with less noise.
+    temperature : Quantity or float, optional
+        In K if a float, for N kT/V of the N molecules that have a mass, instead of the present kinetic energy of the
+        centres: the same mean, with less noise.
     strain : float
         Change of all lengths.
 
     Raises
     ------
     InputError
-        The System is not periodic.
+        The System is not periodic; a temperature that is not positive, a strain that is none.
     """
+    thermal = None if temperature is None else GAS_CONSTANT * positive(kelvins(temperature), "temperature")
+    if not 0 < finite_number(strain, "strain") < 1:
+        raise InputError(f"strain is {strain}; give a small number above zero, such as 0.001", item="strain")
     system = context.getSystem()
     if not system.usesPeriodicBoundaryConditions():
         raise InputError("a System without periodic boundaries has no pressure", item="context")
@@ -62,13 +72,13 @@ def molecular_pressure(context: openmm.Context, temperature: float | None = None
     finally:
         context.setPeriodicBoxVectors(*box)
         context.setPositions(x)
-    if temperature is None:
-        total = np.bincount(label, masses, n)
-        heavy = total > 0
+    total = np.bincount(label, masses, n)
+    heavy = total > 0
+    if thermal is None:
         momenta = _sums(masses[:, None] * v, label, n)[heavy]
         kinetic = float(((momenta**2).sum(axis=1) / total[heavy]).sum())
     else:
-        kinetic = 3 * n * unit.MOLAR_GAS_CONSTANT_R.value_in_unit(unit.kilojoule_per_mole / unit.kelvin) * temperature
+        kinetic = 3 * int(heavy.sum()) * thermal
     slope = (energies[0] - energies[1]) / (2 * strain)
     return (kinetic - slope) / (3 * volume) * BAR
 
@@ -80,7 +90,7 @@ class PressureReporter:
     ----------
     file : path or text file
     reportInterval : int
-    temperature : float, optional
+    temperature : Quantity or float, optional
         As for `molecular_pressure`.
 
     Attributes
@@ -89,10 +99,16 @@ class PressureReporter:
         Pressures in bar.
     """
 
-    def __init__(self, file: str | IO[str], reportInterval: int, temperature: float | None = None) -> None:
-        self._interval, self._temperature = int(reportInterval), temperature
-        self._own = isinstance(file, str)
-        self._file = open(file, "w") if isinstance(file, str) else file  # noqa: SIM115
+    def __init__(
+        self,
+        file: str | PathLike[str] | IO[str],
+        reportInterval: int,
+        temperature: unit.Quantity | float | None = None,
+    ) -> None:
+        self._interval = whole_number(reportInterval, "reportInterval")
+        self._temperature = None if temperature is None else positive(kelvins(temperature), "temperature")
+        self._own = isinstance(file, str | PathLike)
+        self._file = open(file, "w") if isinstance(file, str | PathLike) else file  # noqa: SIM115
         print('#"Step","Box Volume (nm^3)","Pressure (bar)"', file=self._file)
         self.values: list[float] = []
 

@@ -10,6 +10,7 @@ import numpy as np
 import openmm
 from openmm import app, unit
 
+from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -19,7 +20,7 @@ from kcons.errors import (
     ReversibilityError,
     UnsupportedError,
 )
-from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT
+from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.ensembles.ways_back import WaysBackIntegrator
 from kcons.openmm.integrator.ensemble import ConstantEnergy
 from kcons.openmm.integrator.guard import positions_of, velocities_of
@@ -43,7 +44,6 @@ from kcons.thermostats.monte_carlo.hamiltonian_monte_carlo import (
     SUM,
     UNSOLVED,
     kept_part,
-    seed_number,
     step_range,
     stream,
 )
@@ -122,7 +122,7 @@ class HamiltonianMonteCarlo:
         with np.errstate(divide="ignore"):
             self._weights = np.where(self._masses > 0, 1 / self._masses, 0.0)
         self._held = np.array([math.nan, *[0.0] * (SIZE - 1)])
-        self._expected: tuple[FloatArray, Any, dict[str, float]] | None = None
+        self._expected: tuple[FloatArray, Any] | None = None
         #: Proposals so far.
         self.number = 0
         if restart is not None:
@@ -132,9 +132,7 @@ class HamiltonianMonteCarlo:
 
     def setTemperature(self, temperature: unit.Quantity | float) -> None:
         """Use another temperature (K) from now on."""
-        if isinstance(temperature, unit.Quantity):
-            temperature = temperature.value_in_unit(unit.kelvin)
-        self.thermal_energy = GAS_CONSTANT * positive(temperature, "temperature")
+        self.thermal_energy = GAS_CONSTANT * positive(kelvins(temperature), "temperature")
 
     @property
     def counts(self) -> Counts:
@@ -182,7 +180,7 @@ class HamiltonianMonteCarlo:
         InputError, UnsupportedError
             As for the first step of the integrator.
         """
-        for _ in range(proposals):
+        for _ in range(whole_number(proposals, "proposals", 0)):
             due = [] if self.simulation is None else [r for r in self.simulation.reporters if self._next(r) == 1]
             self._propose()
             for reporter in due:
@@ -336,14 +334,17 @@ class HamiltonianMonteCarlo:
 
     def _note(self) -> None:
         context = self.context
-        self._expected = positions_of(context), _box(context), dict(context.getParameters())
+        self._expected = positions_of(context), self._surroundings()
 
     def _others_acted(self, x: FloatArray) -> bool:
-        """Whether positions, box or parameters are not what this object left."""
+        """Whether positions, box, parameters or forces are not what this object left."""
         known = self._expected
         if known is None:
             return False
-        return not np.array_equal(x, known[0]) or (_box(self.context), dict(self.context.getParameters())) != known[1:]
+        return not np.array_equal(x, known[0]) or self._surroundings() != known[1]
+
+    def _surroundings(self) -> tuple[Any, dict[str, float], int]:
+        return _box(self.context), dict(self.context.getParameters()), self.integrator.refreshed
 
     def _next(self, reporter: Any) -> int:
         told = reporter.describeNextReport(self.simulation)

@@ -9,6 +9,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError, OverdeterminedError, UnsupportedError
 from kcons.openmm.ensembles.conserved_momenta import (
     Momenta,
@@ -29,7 +30,7 @@ from kcons.openmm.quantities import number
 from kcons.steppers.operations import Evaluate, Exchange, Kick, Operation, Project, drifts_of
 from kcons.steppers.splitting import Splitting
 from kcons.thermostats.freedom import positive
-from kcons.thermostats.nose_hoover import HALF, chain_fractions, chain_length
+from kcons.thermostats.nose_hoover import HALF, chain_fractions
 
 #: Time steps times frequency beyond which a chain is unstable: K oscillates at sqrt(2) of it, and 2 is the limit.
 _FASTEST = 1.4
@@ -102,7 +103,7 @@ class NoseHoover(ConstantEnergy):
         self._keep(
             temperature=positive(kelvins(temperature), "temperature"),
             frequency=positive(_per_picosecond(frequency), "frequency"),
-            length=chain_length(length),
+            length=whole_number(length, "length"),
             chain_order=chain_order,
             repeats=int(repeats),
             momentum=momentum,

@@ -10,6 +10,7 @@ import numpy as np
 import openmm
 from openmm import unit
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError, KconsError, UnsupportedError
 from kcons.openmm.integrator.ensemble import ConstantEnergy, Ensemble
 from kcons.openmm.integrator.guard import Guard, find_context, positions_of, velocities_of
@@ -75,6 +76,8 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
     _check_every = 100
     #: ... when checks come later where they would take more than a hundredth of the time.
     spare = True
+    #: How often forces were no longer those that were known.
+    refreshed = 0
     #: What writes the program.
     _writer: type[LeanStepWriter] = LeanStepWriter
 
@@ -160,9 +163,7 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
 
     @check_every.setter
     def check_every(self, steps: int) -> None:
-        if int(steps) != steps or steps < 0:
-            raise InputError(f"check_every is {steps}; give a number of steps, 0 for never", item="check_every")
-        self._check_every, self.spare = int(steps), False
+        self._check_every, self.spare = whole_number(steps, "check_every", 0), False
 
     @property
     def context(self) -> openmm.Context:
@@ -207,6 +208,7 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         Where parts are held, forces are kept from one step to the next. What changes them is seen: positions,
         parameters, boxes, `updateParametersInContext`.
         """
+        self.refreshed += 1
         if self.parts:
             self.program.write("stale", 1.0)
         if "behind" in self.program.numbers:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kcons.constraints.arguments import finite_number, seed_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     ConvergenceError,
@@ -351,19 +352,7 @@ def kept_part(keep: float) -> float:
     InputError
         Not a number in [0, 1).
     """
-    if np.ndim(keep) or not 0 <= keep < 1:
+    part = finite_number(keep, "keep")
+    if not 0 <= part < 1:
         raise InputError(f"keep is {keep!r}; give a number from 0 (new velocities) to less than 1", item="keep")
-    return float(keep)
-
-
-def seed_number(seed: int) -> int:
-    """`seed` as an int.
-
-    Raises
-    ------
-    InputError
-        Not a whole number from 0 to 2^64 - 1.
-    """
-    if int(seed) != seed or not 0 <= seed < 2**64:
-        raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
-    return int(seed)
+    return part

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError
 from kcons.steppers import State
 from kcons.thermostats.freedom import positive
@@ -21,7 +22,8 @@ def exchange(
 
     Configurations change places and velocities are scaled with sqrt(T), which leaves the product of all densities as it
     is. Pairs (0, 1), (2, 3), ... take turns with (1, 2), (3, 4), ... Numbers, clocks and counts stay with their
-    temperatures.
+    temperatures. Each run needs a seed of its own: with the same one all draw the same numbers, and runs that are not
+    independent do not have the product of the densities.
 
     Parameters
     ----------
@@ -46,15 +48,21 @@ def exchange(
         Fewer than two states, not as many temperatures; temperatures that are not positive; a state without a potential
         energy.
     """
+    if not all(isinstance(given, Sequence | np.ndarray) for given in (states, thermal_energies)):
+        raise InputError("give a sequence of states, and of as many temperatures", item="states")
     kt = np.array([positive(value, "thermal_energies") for value in thermal_energies])
     if len(states) < 2 or len(states) != len(kt):
         raise InputError(
             f"{len(states)} states and {len(kt)} temperatures; give one for each, two or more", item="states"
         )
-    if int(number) != number or number < 0:
-        raise InputError(f"number is {number}; give the number of the round, 0 or more", item="number")
+    number = whole_number(number, "number", 0)
     for k, state in enumerate(states):
-        if state.thermostat is None or state.thermostat.shape != (SIZE,) or math.isnan(potential_of(state)):
+        if (
+            not isinstance(state, State)
+            or state.thermostat is None
+            or state.thermostat.shape != (SIZE,)
+            or math.isnan(potential_of(state))
+        ):
             raise InputError(
                 f"state {k} does not know its potential energy; make a step of HamiltonianMonteCarlo with it first",
                 item="states",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from kcons.constraints.arguments import finite_number, whole_number
 from kcons.errors import ConvergenceError, InputError
 from kcons.steppers import State, System
 from kcons.thermostats.freedom import positive
@@ -158,12 +159,12 @@ def wanted_share(wanted: float) -> float:
     InputError
         Not a number between 0 and 1.
     """
-    if np.ndim(wanted) or not 0 < wanted < 1:
+    share = finite_number(wanted, "wanted")
+    if not 0 < share < 1:
         raise InputError(f"wanted is {wanted!r}; give a share between 0 and 1", item="wanted")
-    return float(wanted)
+    return share
 
 
 def check_proposals(proposals: int) -> None:
     """Raise `InputError` for fewer than 20."""
-    if int(proposals) != proposals or proposals < 20:
-        raise InputError(f"proposals is {proposals}; give a whole number, 20 or more", item="proposals")
+    whole_number(proposals, "proposals", 20)

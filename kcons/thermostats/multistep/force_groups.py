@@ -34,8 +34,8 @@ class ForceGroups:
     """
 
     def __init__(self, groups: Mapping[str, ForceFunction]) -> None:
-        if not groups:
-            raise InputError("there are no groups of forces; give at least one", item="groups")
+        if not isinstance(groups, Mapping) or not groups:
+            raise InputError("there are no groups of forces; give a mapping of names to functions", item="groups")
         seen: dict[int, str] = {}
         for name, force in groups.items():
             if not isinstance(name, str) or not name:

@@ -18,9 +18,9 @@ from kcons.thermostats.multistep.force_groups import ForceGroups
 class GroupedForces:
     """Forces by the names of their groups.
 
-    A state carries them, if there are two or more, behind the variables of its thermostat, so that a run that is
-    continued evaluates nothing anew. Where the slowest group, the first, kicks in the middle of steps it carries none,
-    and each step begins with an evaluation of the others.
+    A state carries them, if there are two or more, in the order of their names behind the variables of its thermostat,
+    so that a run that is continued evaluates nothing anew. Where the slowest group, the first, kicks in the middle of
+    steps it carries none, and each step begins with an evaluation of the others.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class GroupedForces:
         elif forces is not None and known:
             assert state.thermostat is not None
             parts = state.thermostat[variables:].reshape(len(names), *x.shape)
-            found.now.update(zip(names, parts, strict=True))
+            found.now.update(zip(sorted(names), parts, strict=True))
         else:
             for group in names:
                 found.evaluate(group, x, state.time, state.step)
@@ -104,4 +104,4 @@ class GroupedForces:
         """What a state carries: the variables of the thermostat, and forces."""
         if len(self.names) == 1 or self.middle:
             return variables
-        return np.concatenate([variables, *(self.now[name].ravel() for name in self.names)])
+        return np.concatenate([variables, *(self.now[name].ravel() for name in sorted(self.names))])

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
+from kcons.constraints.arguments import whole_number
 from kcons.errors import InputError
 from kcons.steppers.operations import Evaluate, Exchange, Fly, Kick, Operation, Project, Turn, drifts_of
 from kcons.thermostats.isokinetic.isokinetic import SCHEMES
@@ -43,10 +44,15 @@ def levels_of(steps: Mapping[str, int] | None) -> tuple[Level, ...]:
         return (Level("", 1),)
     if not isinstance(steps, Mapping) or not steps:
         raise InputError("steps must name each group of forces, as {'slow': 1, 'fast': 4}", item="steps")
+    counts: list[int] = []
     for name, count in steps.items():
-        if isinstance(count, bool) or count != count or int(count) != count or count < 1:
-            raise InputError(f"group {name!r} takes {count} steps; give a whole number, 1 or more", item="steps")
-    levels = sorted((Level(name, int(count)) for name, count in steps.items()), key=lambda level: level.steps)
+        try:
+            counts.append(whole_number(count, "steps"))
+        except InputError:
+            raise InputError(
+                f"group {name!r} takes {count!r} steps; give a whole number, 1 or more", item="steps"
+            ) from None
+    levels = sorted(map(Level, steps, counts), key=lambda level: level.steps)
     if levels[0].steps != 1:
         raise InputError(
             f"group {levels[0].group!r}, the slowest, takes {levels[0].steps} steps; it takes 1, the step itself",

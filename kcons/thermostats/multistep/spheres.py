@@ -14,6 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.steppers import State, System
@@ -101,11 +102,9 @@ class IsokineticSpheres(SeededBath):
             raise InputError(f"friction is {friction}; spheres need a bath, give one number > 0", item="friction")
         if spheres not in KINDS:
             raise InputError(f"spheres is {spheres!r}; choose one of {', '.join(KINDS)}", item="spheres")
-        if isinstance(auxiliary, bool) or int(auxiliary) != auxiliary or auxiliary < 0:
-            raise InputError(f"auxiliary is {auxiliary}; give a whole number, 0 or more", item="auxiliary")
         self.levels: tuple[Level, ...] = levels_of(steps)
         self.spheres: Spheres = spheres
-        self.auxiliary = int(auxiliary)
+        self.auxiliary = whole_number(auxiliary, "auxiliary", 0)
         self.inner_order = order
         flight = inner_flight(order, self.substeps)
         self.middle = middle_of(self.levels, slow_kicks)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import refuse_units
+from kcons.constraints.arguments import check_pairs, finite_number, seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compensated_steps import check_finite
+from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
 from kcons.thermostats.pressure.strains import Kind, Strains
@@ -126,22 +128,24 @@ class Barostat:
         held: Held = "refuse",
         cutoff: float | None = None,
     ) -> None:
-        self.pressure = _finite(pressure, "pressure")
-        self.tension = _finite(tension, "tension")
+        self.pressure = finite_number(pressure, "pressure")
+        self.tension = finite_number(tension, "tension")
         self.strains = Strains.of(kind)
         if self.tension and kind not in ("semi-isotropic", "lateral", "anisotropic"):
             raise InputError(f"kind={kind!r} has no surface tension; use 'semi-isotropic' or 'lateral'", item="tension")
-        if int(every) != every or every < 1:
-            raise InputError(f"every is {every}; give a whole number of steps, 1 or more", item="every")
-        if int(seed) != seed or not 0 <= seed < 2**64:
-            raise InputError(f"seed is {seed}; give a whole number from 0 to 2^64 - 1", item="seed")
         if held not in ("refuse", "stay"):
             raise InputError(f"held is {held!r}; choose 'refuse' or 'stay'", item="held")
-        self.every, self.seed = int(every), int(seed)
-        self.molecules = None if molecules is None else np.array(molecules)
+        self.every, self.seed = whole_number(every, "every"), seed_number(seed)
+        self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
-        self.cutoff = None if cutoff is None else _finite(cutoff, "cutoff")
+        self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
         self._pieces: WeakKeyDictionary[CellSystem, Pieces] = WeakKeyDictionary()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_pieces"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _pieces=WeakKeyDictionary())  # found anew by a copy
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.pressure!r}, every={self.every}, kind={self.strains.kind!r})"
@@ -295,14 +299,3 @@ def _added(x: FloatArray, d: FloatArray, remainder: FloatArray | None) -> tuple[
         return y, None
     part = y - x
     return y, remainder + ((x - (y - part)) + (d - part))
-
-
-def _finite(value: float, item: str) -> float:
-    refuse_units(value, item)
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{item} is {value!r}; give a finite number", item=item)
-    return number

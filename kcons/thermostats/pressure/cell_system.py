@@ -35,7 +35,8 @@ class CellSystem(System):
     Attributes
     ----------
     cell : ndarray, shape (3, 3)
-        Vectors as rows.
+        Vectors as rows; a unit vector normal to the others where it is not periodic, so that a pressure is an energy
+        over an area there.
     periodic : ndarray of bool, shape (3,)
 
     Raises
@@ -73,6 +74,24 @@ class CellSystem(System):
     @property
     def cell(self) -> FloatArray:
         return self._matrix
+
+    @property
+    def volume(self) -> float:
+        """What the pressure acts on.
+
+        Raises
+        ------
+        InputError
+            A vector of the cell is zero.
+        """
+        found = float(abs(np.linalg.det(self.cell)))
+        if not found > 0:
+            raise InputError(
+                "the cell has no volume for a pressure to act on: give its vector along which it is not periodic a "
+                "length",
+                item="cell",
+            )
+        return found
 
     def set_cell(self, cell: FloatArray, positions: FloatArray) -> None:
         """Change the cell; `positions` are those in it.

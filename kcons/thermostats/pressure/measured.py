@@ -74,7 +74,7 @@ def instantaneous_pressure(
     Raises
     ------
     InputError
-        An unknown virial.
+        An unknown virial; a cell without a volume.
     UnsupportedError
         There is no stress, or a piece is held in space.
     """
@@ -82,7 +82,7 @@ def instantaneous_pressure(
         raise InputError(f"virial is {virial!r}; choose 'molecular', 'atomic' or 'difference'", item="virial")
     x, v, _ = system.taken(state)
     cell = system.cell
-    volume = float(abs(np.linalg.det(cell)))
+    volume = system.volume
     if virial == "atomic":
         masses = np.where(system.inverse_masses > 0, system.masses[:, None], 0.0)
         stress = system.stress(x, state.time)
@@ -157,7 +157,7 @@ class PressureObserver:
                 self.system, own, self.virial, pieces=self.pieces, thermal_energy=self.thermal_energy
             )
         )
-        self.volumes.append(float(abs(np.linalg.det(self.system.cell))))
+        self.volumes.append(self.system.volume)
 
     @property
     def mean(self) -> float:

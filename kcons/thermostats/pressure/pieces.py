@@ -21,6 +21,8 @@ Held = Literal["refuse", "stay"]
 
 #: How far each atom is moved to see whether a row knows a place in space, relative to the size of the system.
 TURN = 1e-3
+#: Sine squared of the angle between an axis and what is periodic, below which it lies therein.
+FLAT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,11 +235,14 @@ def lattice_of(system: CellSystem) -> FloatArray:
 
 
 def require_periodic(system: CellSystem, axes: NDArray[np.bool_], kind: str) -> None:
-    """Raise `InputError` where the cell is not periodic along an axis that is to change."""
-    wrong = axes & ~system.periodic
+    """Raise `InputError` where the cell has no volume, or is not periodic along an axis that is to change."""
+    assert system.volume
+    # Axes are those of space, and need not be those of the cell vectors.
+    own, _ = np.linalg.qr(system.cell[system.periodic].T)
+    wrong = axes & (1 - (own**2).sum(axis=1) > FLAT)
     if wrong.any():
         raise InputError(
             f"kind={kind!r} changes the cell along {'xyz'[int(np.argmax(wrong))]}, in which it is not periodic; "
-            "for a slab use kind='lateral', or make the cell periodic",
+            "for a slab in the xy plane use kind='lateral', or make the cell periodic",
             item="kind",
         )

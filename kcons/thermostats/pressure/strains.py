@@ -73,7 +73,7 @@ class Strains:
         InputError
             Unknown.
         """
-        if kind not in GENERATORS:
+        if not isinstance(kind, str) or kind not in GENERATORS:
             raise InputError(f"kind is {kind!r}; choose {', '.join(map(repr, GENERATORS))}", item="kind")
         generators = GENERATORS[kind]
         axes: NDArray[np.bool_] = np.asarray(np.diagonal(generators, axis1=1, axis2=2).sum(axis=0) > 0)

@@ -17,6 +17,7 @@ from kcons.ase import (
     ConstrainedMonteCarlo,
     ConstrainedNoseHoover,
     IsokineticDynamics,
+    MultipleTimeSteps,
     constrain,
     draw_velocities,
 )
@@ -231,6 +232,9 @@ def test_what_has_no_temperature_or_no_cell():
     atoms.pbc = [True, True, False]
     with pytest.raises(InputError, match=r"along z.*'lateral'"):
         MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
+    atoms.cell[2] = 0.0
+    with pytest.raises(InputError, match="no volume"):
+        MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0, kind="lateral"))
     atoms.pbc = False
     with pytest.raises(InputError, match="no periodic cell"):
         MADE["langevin"](atoms, barostat=MonteCarloBarostat(0.0))
@@ -260,3 +264,39 @@ def test_a_user_may_change_the_cell_between_steps():
     dyn.run(1)
     assert abs(atoms.get_volume() / volume - 1) < 0.3
     assert dyn.state.barostat[10] == tried + 1
+
+
+def test_a_step_that_fails_after_a_trial_leaves_the_cell(monkeypatch):
+    """Also where the trial itself was accepted."""
+    atoms, _ = gas()
+    dynamics = MADE["langevin"](atoms, barostat=MonteCarloBarostat(PRESSURE, every=1, width=0.2), check_every=1)
+    cell, x = atoms.cell.array.copy(), atoms.get_positions()
+    tried = []
+
+    def interrupted(*args, **kwargs):
+        tried.append(atoms.cell.array.copy())
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(dynamics._systems().schedule, "made", interrupted)
+        for _ in range(20):
+            with pytest.raises(KeyboardInterrupt):
+                dynamics.run(1)
+            assert np.array_equal(atoms.cell.array, cell) and np.array_equal(atoms.positions, x)
+            dynamics.nsteps += 1  # another trial
+    assert any(not np.array_equal(one, cell) for one in tried)
+
+
+def test_several_time_steps_have_no_barostat():
+    atoms, _ = gas()
+    with pytest.raises(UnsupportedError, match=r"LangevinRespa.*does not know that the cell"):
+        MultipleTimeSteps(
+            atoms,
+            FS,
+            fast=Free(),
+            slow=Free(),
+            temperature_K=TEMPERATURE,
+            friction=0.1,
+            fast_steps=2,
+            barostat=MonteCarloBarostat(0.0),
+        )

@@ -7,10 +7,12 @@ import pytest
 from ase import units
 from ase.build import bulk
 from ase.calculators.emt import EMT
+from ase.constraints import Hookean
 from ase_systems import FS, TEMPERATURE, dumbbells, pressure
 
 from kcons.ase import ConstrainedDynamics, ConstrainedLangevin, PressureReporter, constrain, draw_velocities
 from kcons.constraints import Distance
+from kcons.errors import UnsupportedError
 from kcons.thermostats.pressure import MonteCarloBarostat
 
 
@@ -65,3 +67,16 @@ def test_a_reporter_changes_no_run(tmp_path):
     assert volume == pytest.approx(atoms.get_volume(), rel=1e-6)
     assert bar == pytest.approx(20 * units.kB * TEMPERATURE / atoms.get_volume() / units.bar, rel=1e-4)
     assert len(np.unique(reporter.volumes)) > 1
+
+
+def test_forces_of_ase_constraints_have_no_stress():
+    """They are among the forces and not in the stress of the calculator."""
+    atoms = copper()
+    atoms.set_constraint([*atoms.constraints, Hookean(4, 7, 1.0, rt=1.0)])
+    dynamics = ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1)
+    for virial in ("molecular", "atomic"):
+        with pytest.raises(UnsupportedError, match="no stress"):
+            PressureReporter(dynamics, virial=virial)()
+    reporter = PressureReporter(dynamics, virial="difference")
+    reporter()
+    assert np.isfinite(reporter.mean)

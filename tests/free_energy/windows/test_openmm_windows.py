@@ -37,6 +37,8 @@ def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     assert len(series) == 32 and series.off.max() < 1e-10
     np.testing.assert_allclose(series.value, np.tile([-1.1, 2.0], (32, 1)), atol=1e-10)
     assert np.abs(series.multiplier).max() > 1
+    assert np.isfinite(series.turned).all() and series.turned.std() < series.multiplier.std() / 2
+    assert series.seconds > 0
     # 66 less 12 bonds, 2 torsions and the total momentum.
     assert series.isokinetic_degrees_of_freedom == (49 if thermostat == "isokinetic" else 0)
 

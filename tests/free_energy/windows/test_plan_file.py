@@ -85,6 +85,16 @@ def test_atoms_from_one_and_two_coordinates(folder):
     assert plan.targets[1] == pytest.approx([-np.pi, 1.5])
 
 
+def test_pulls(folder):
+    assert read(folder).pulls is None
+    plan = read(folder, PLAN + "\n[pulls]\nfrom = -60\ncount = 8\nboth_ways = false\nsteps = 300\n")
+    assert plan.pulls["start"] == pytest.approx([-np.pi / 3]) and plan.pulls["end"] == pytest.approx(plan.targets[-1])
+    assert plan.pulls["count"] == 8 and plan.pulls["both_ways"] is False and plan.pull_steps == 300
+    text = PLAN + "\n[[coordinate]]\ndistance = [0, 1]\nvalues = [1.4, 1.5]\n[pulls]\nto = [90.0, 1.6]\n"
+    plan = read(folder, text)
+    assert plan.pulls["end"] == pytest.approx([np.pi / 2, 1.6]) and plan.pull_steps == 20000
+
+
 def test_a_plan_for_openmm(folder):
     pdb = app.PDBFile(str(DATA / "alanine-dipeptide-implicit.pdb"))
     field = app.ForceField("amber14-all.xml", "implicit/gbn2.xml")
@@ -127,6 +137,10 @@ def test_a_plan_for_openmm(folder):
         ("[[coordinate]]", "[coordinate]", r"write \[\[coordinate\]\]"),
         ("temperature = 310", "temperature 310", "is no TOML"),
         ('constrain = "hbonds"', 'constrain = "everything"', "everything"),
+        ("[workers]", "[pulls]\nfrom = [1.0, 2.0]\n[workers]", r"from of \[pulls\] has 2 values.*turn"),
+        ("[workers]", "[pulls]\ncount = 4\n[workers]", r"count of \[pulls\] is 4.*5 or more"),
+        ("[workers]", "[pulls]\nsteps = 0.5\n[workers]", r"steps of \[pulls\] is 0.5"),
+        ("[workers]", "[pull]\ncount = 5\n[workers]", r"unknown key 'pull'; did you mean 'pulls'"),
         (
             "[workers]",
             '[[coordinate]]\nname = "turn"\nangle = [2, 0, 1]\nvalues = [100.0]\n[workers]',

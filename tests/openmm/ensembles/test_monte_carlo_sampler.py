@@ -289,3 +289,23 @@ def test_an_energy_that_is_not_finite_is_an_error():
     context.setPositions(state_of(sampler.context)[0])
     with pytest.raises(NonFiniteError, match="potential energy is nan"):
         HamiltonianMonteCarlo(context, 300, 2, 1).step(1)
+
+
+def test_energies_are_asked_for_again_once_forces_have_changed():
+    """`updateParametersInContext` leaves positions, box and parameters as they are."""
+    system, sampler = waters(steps=1)
+    sampler.step(1)
+    (force,) = (f for f in system.getForces() if isinstance(f, openmm.NonbondedForce))
+    for k in range(force.getNumParticles()):
+        charge, sigma, depth = force.getParticleParameters(k)
+        force.setParticleParameters(k, 0.5 * charge, sigma, depth)
+    force.updateParametersInContext(sampler.context)
+    sampler.step(1)
+    assert abs(sampler.counts.change) < 1
+
+
+@pytest.mark.parametrize("proposals", [-1, 2.5, None])
+def test_numbers_of_proposals(proposals):
+    _, sampler = waters()
+    with pytest.raises(InputError, match="proposals"):
+        sampler.step(proposals)

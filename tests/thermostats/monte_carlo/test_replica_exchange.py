@@ -75,3 +75,10 @@ def test_bad_input():
     ):
         with pytest.raises(InputError, match=words):
             exchange(given, temperatures, 1, number)
+
+
+def test_what_are_no_states_or_temperatures():
+    _, states = ladder()
+    for given in ((states, 0.3), (None, LADDER), ([None] * 3, LADDER)):
+        with pytest.raises(InputError, match="state"):
+            exchange(*given, 5, 0)

@@ -56,3 +56,13 @@ def test_forces_that_are_not_finite():
     held, _ = made(slow=lambda x, t: x / 0.0)
     with np.errstate(all="ignore"), pytest.raises(NonFiniteError, match="non-finite force at step 7"):
         GroupedForces.of(held, State(X, 0 * X, step=7), NAMES, 0, "X")
+
+
+def test_forces_belong_to_their_names_in_whichever_order():
+    """Another run may give the same groups other numbers of steps."""
+    held, _ = made()
+    found, _ = GroupedForces.of(held, State(X, 0 * X), NAMES, 1, "X")
+    state = State(X, 0 * X, forces=found.total(), thermostat=found.closed(np.zeros(1)))
+    again, _ = GroupedForces.of(held, state, NAMES[::-1], 1, "X")
+    for name in NAMES:
+        np.testing.assert_array_equal(again.now[name], found.now[name])

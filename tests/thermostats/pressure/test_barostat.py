@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from pressure_systems import gas, started
@@ -18,11 +21,16 @@ from kcons.thermostats.pressure import CellSystem, MonteCarloBarostat
     [
         ({"every": 0}, "every"),
         ({"every": 2.5}, "every"),
+        ({"every": None}, "every"),
         ({"seed": -1}, "seed"),
+        ({"seed": None}, "seed"),
         ({"kind": "cubic"}, "kind"),
+        ({"kind": ["normal"]}, "kind"),
         ({"tension": np.nan}, "tension"),
         ({"tension": 1.0}, "no surface tension"),
         ({"cutoff": np.inf}, "cutoff"),
+        ({"cutoff": -3.0}, "cutoff"),
+        ({"molecules": [[0, 1], [2]]}, "bonds"),
         ({"held": "maybe"}, "held"),
         ({"width": 0.0}, "width"),
     ],
@@ -91,3 +99,14 @@ def test_angles_of_the_cell_and_atoms_held_in_space():
     barostat = MonteCarloBarostat(1.0, kind="flexible", held="stay")
     with pytest.raises(UnsupportedError, match="angles"):
         barostat.pieces(system, x)
+
+
+def test_copies_know_no_pieces_of_systems():
+    system, x = gas(n=4)
+    barostat = MonteCarloBarostat(0.01, every=3, seed=5, width=0.2)
+    state = started(system, x, barostat)
+    after = barostat.move(system, state, 1.0, 1.0)
+    for again in (pickle.loads(pickle.dumps(barostat)), copy.deepcopy(barostat), copy.copy(barostat)):
+        system.set_cell(state.cell, x)
+        assert repr(again) == repr(barostat)
+        assert np.array_equal(again.move(system, state, 1.0, 1.0).barostat, after.barostat)

@@ -11,7 +11,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
 from kcons.thermostats.pressure import CellSystem
-from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
+from kcons.thermostats.pressure.pieces import find_pieces, lattice_of, require_periodic
 
 ALL = np.ones(3, bool)
 
@@ -116,3 +116,26 @@ def test_a_framework_through_the_cell_is_refused():
     assert len(find_pieces(open_chain, x, ALL)) == 1
     with pytest.raises(UnsupportedError, match="closes upon itself"):
         find_pieces(open_chain, x, ALL, ring)
+
+
+@pytest.mark.parametrize(
+    ("cell", "pbc", "fits"),
+    [
+        ([[0, 0, 9.0], [9, 0, 0], [0, 9, 0]], (True, True, False), False),
+        ([[0, 0, 9.0], [9, 0, 0], [0, 9, 0]], (False, True, True), True),
+        ([[9.0, 0, 0], [2, 9, 0], [1, 3, 9]], (True, True, False), True),
+        ([[9.0, 0, 1], [0, 9, 0], [0, 0, 9]], (True, True, False), False),
+        ([[9.0, 0, 1], [0, 9, 0], [0, 0, 9]], True, True),
+    ],
+    ids=["turned", "turned, z open", "skewed", "tilted", "tilted, periodic"],
+)
+def test_what_is_periodic_along_an_axis_of_space(cell, pbc, fits):
+    """Cells change along axes of space, whichever vectors lie there."""
+    x = np.zeros((1, 3))
+    system = CellSystem(Motion(ConstraintSet([], x, np.ones(1), cell=cell, pbc=pbc), x))
+    axes = np.array([True, True, False])
+    if fits:
+        require_periodic(system, axes, "lateral")
+    else:
+        with pytest.raises(InputError, match="not periodic"):
+            require_periodic(system, axes, "lateral")

@@ -1,0 +1,122 @@
+"""Torsions turned as rigid groups: a second estimate of the mean force, without the noise of bonds and angles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from kcons.constraints.constraint import Constraint, IntArray
+from kcons.constraints.constraint_set import ConstraintSet
+from kcons.constraints.target import FloatArray
+
+#: A trial turn in radian, what it may change of other rows, and by which factor a bond may change before it is broken.
+_TRIAL, _SAME, _BROKEN = 0.3, 1e-8, 1.5
+
+
+class RigidTurn(NamedTuple):
+    """All atoms beyond the middle bond of a torsion, turned about it.
+
+    Such a turn changes no bond and no angle, and has no divergence, so that dF/dphi is the weighted mean of the torque
+    against it (Ciccotti, Lelievre and Vanden-Eijnden, Commun. Pure Appl. Math. 61, 371, 2008, for any such field).
+
+    Attributes
+    ----------
+    axis : ndarray of int, shape (2,)
+        A turn about the line from the first to the second by a positive angle makes the torsion larger.
+    group : ndarray of int, shape (n,)
+        The atoms that move.
+    bonds : ndarray of int, shape (b, 2)
+        Those of the group and to the axis.
+    lengths : ndarray, shape (b,)
+    """
+
+    axis: IntArray
+    group: IntArray
+    bonds: IntArray
+    lengths: FloatArray
+
+    def turned(self, x: FloatArray, angle: float) -> FloatArray:
+        """Positions with the group turned, shape (n_atoms, 3)."""
+        e = self._direction(x)
+        r = x[self.group] - x[self.axis[1]]
+        result = x.copy()
+        result[self.group] += np.sin(angle) * np.cross(e, r) + (1 - np.cos(angle)) * (np.outer(r @ e, e) - r)
+        return result
+
+    def force(self, x: FloatArray, f: FloatArray) -> float:
+        """dU/dphi of the turn; NaN where a bond of the group is broken, by a box for example."""
+        apart = np.linalg.norm(x[self.bonds[:, 0]] - x[self.bonds[:, 1]], axis=1)
+        if (apart > _BROKEN * self.lengths).any():
+            return float("nan")
+        r = x[self.group] - x[self.axis[1]]
+        return -float(self._direction(x) @ np.cross(r, f[self.group]).sum(axis=0))
+
+    def _direction(self, x: FloatArray) -> FloatArray:
+        e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
+        return e / np.linalg.norm(e)
+
+
+def rigid_turn(coordinate: Constraint, bonds: IntArray, x: FloatArray) -> RigidTurn | None:
+    """The smaller group of one torsion; None of another coordinate, or where the middle bond is missing or in a ring.
+
+    Parameters
+    ----------
+    coordinate : Constraint
+        One row.
+    bonds : ndarray of int, shape (n, 2)
+    x : ndarray, shape (n_atoms, 3)
+    """
+    if coordinate.family != "Dihedral":
+        return None
+    i, j, k, m = coordinate.atoms[0].tolist()
+    middle = ((bonds == [j, k]) | (bonds == [k, j])).all(axis=1)
+    if not middle.any():
+        return None
+    a, b = bonds[~middle].T
+    part = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(x), len(x))), directed=False)[1]
+    if part[j] == part[k] or part[i] != part[j] or part[m] != part[k]:
+        return None
+    beyond = [(np.flatnonzero(part == part[near]), far, near) for near, far in ((k, j), (j, k))]
+    atoms, far, near = min(beyond, key=lambda side: len(side[0]))
+    own = bonds[~middle & (part[bonds[:, 0]] == part[near])]
+    lengths = np.linalg.norm(x[own[:, 0]] - x[own[:, 1]], axis=1)
+    return RigidTurn(np.array([far, near]), atoms[atoms != near], own, lengths)
+
+
+def leaves_the_rest(
+    turn: RigidTurn, row: int, everything: ConstraintSet, others: IntArray, x: FloatArray, time: float = 0.0
+) -> bool:
+    """Whether a turn changes its coordinate by its angle, no other row of the set, and not det(A M^-1 A^T) of `others`.
+
+    Parameters
+    ----------
+    turn : RigidTurn
+    row : int
+        Of the coordinate in `everything`.
+    everything : ConstraintSet
+    others : ndarray of int
+        The other rows of the clusters of the coordinates.
+    x : ndarray, shape (n_atoms, 3)
+    time : float
+    """
+    there = turn.turned(x, _TRIAL)
+    change = everything.measure(there, time) - everything.measure(x, time)
+    change[row] -= _TRIAL
+    periods = np.concatenate([np.full(c.n_rows, c.period or np.inf) for c in everything.constraints])
+    change -= np.where(np.isfinite(periods), periods, 0.0) * np.round(change / periods)
+    if not np.abs(change).max() < _SAME:
+        return False
+    part, atoms = everything.subset(others)
+    before, after = (_volume(part, place[atoms]) for place in (x, there))
+    return bool(np.isfinite(before) and abs(after - before) < _SAME)
+
+
+def _volume(rows: ConstraintSet, x: FloatArray) -> float:
+    """ln det(A M^-1 A^T); minus infinity where rows depend on each other."""
+    if not rows.n_rows:
+        return 0.0
+    a = rows.jacobian(x).toarray() / np.sqrt(np.repeat(rows.masses, 3))
+    return float(np.linalg.slogdet(a @ a.T)[1])

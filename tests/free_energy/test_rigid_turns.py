@@ -1,0 +1,104 @@
+"""Torsions turned as rigid groups: the force is that of the turn, and no turn is used that changes anything else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kcons import ConstraintSet
+from kcons.constraints import Angle, Dihedral, Distance
+from kcons.free_energy import HeldCoordinates
+from kcons.free_energy.rigid_turns import leaves_the_rest, rigid_turn
+
+#: A chain of five atoms with a branch at the third.
+X = np.array([[0.0, 0.1, 0.2], [1.1, 0.0, -0.1], [1.6, 1.2, 0.1], [2.7, 1.3, 0.9], [3.1, 0.4, 1.9], [1.0, 2.1, -0.4]])
+MASSES = np.array([1.0, 12.0, 14.0, 16.0, 12.0, 1.5])
+BONDS = np.array([[0, 1], [2, 1], [2, 3], [3, 4], [2, 5]])
+PHI = Dihedral([[0, 1, 2, 3]])
+
+
+def energy(x):
+    apart = np.linalg.norm(x[:, None] - x[None], axis=2)[np.triu_indices(6, 1)]
+    return np.sum(apart**3) + x[:, 0] @ x[:, 1]
+
+
+def gradient(x):
+    steps = 1e-5 * np.eye(18).reshape(18, 6, 3)
+    return np.array([(energy(x + s) - energy(x - s)) / 2e-5 for s in steps]).reshape(6, 3)
+
+
+@pytest.mark.parametrize("bonds", [BONDS, np.vstack([BONDS, [[4, 5]]])], ids=["chain", "a ring beyond"])
+def test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy(bonds):
+    turn = rigid_turn(PHI, bonds, X)
+    assert turn.group.tolist() == [0] and turn.axis.tolist() == [2, 1]
+    before = PHI.measure(X[PHI.atoms], 0.0)[0]
+    for angle in (0.4, -0.2):
+        there = turn.turned(X, angle)
+        assert PHI.measure(there[PHI.atoms], 0.0)[0] - before == pytest.approx(angle, abs=1e-12)
+        np.testing.assert_allclose(
+            np.linalg.norm(np.subtract(*there[BONDS.T]), axis=1), np.linalg.norm(np.subtract(*X[BONDS.T]), axis=1)
+        )
+    slope = (energy(turn.turned(X, 1e-4)) - energy(turn.turned(X, -1e-4))) / 2e-4
+    assert turn.force(X, -gradient(X)) == pytest.approx(slope, rel=1e-6)
+
+
+def test_no_divergence():
+    """Where other atoms of the axis move, it changes; those of the group feel a rotation, which has none."""
+    turn = rigid_turn(Dihedral([[1, 2, 3, 4]]), BONDS, X)
+    assert turn.group.tolist() == [4]
+
+    def field(x):
+        return (turn.turned(x, 1e-5) - turn.turned(x, -1e-5)).ravel() / 2e-5
+
+    steps = 1e-4 * np.eye(18).reshape(18, 6, 3)
+    assert sum((field(X + s) - field(X - s))[k] / 2e-4 for k, s in enumerate(steps)) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_what_cannot_be_turned():
+    ring = np.vstack([BONDS, [[0, 3]]])
+    assert rigid_turn(PHI, ring, X) is None
+    assert rigid_turn(PHI, BONDS[[0, 2, 3]], X) is None
+    assert rigid_turn(Dihedral([[3, 1, 2, 0]]), BONDS, X) is None
+    assert rigid_turn(Angle([[0, 1, 2]]), BONDS, X) is None
+
+
+@pytest.mark.parametrize(
+    ("beside", "turns"),
+    [
+        ([], True),
+        ([Distance([[0, 1], [1, 2], [2, 3], [2, 5]])], True),
+        ([Distance([[0, 1], [1, 2], [2, 3], [0, 2]])], False),
+        ([Angle([[0, 1, 2]]), Distance([[4, 5]])], True),
+        ([Distance([[0, 4]])], False),
+        ([Dihedral([[0, 1, 2, 5]])], False),
+    ],
+    ids=[
+        "alone",
+        "bonds",
+        "the measure of the others changes",
+        "an angle and a distance beyond",
+        "a distance across",
+        "another torsion about the axis",
+    ],
+)
+def test_other_rows_must_not_change(beside, turns):
+    held = HeldCoordinates(ConstraintSet([*beside, PHI], X, MASSES), {"phi": PHI}, X, bonds=BONDS)
+    f = -gradient(X)
+    sample = held.sample(X, np.zeros((6, 3)), f)
+    turn = rigid_turn(PHI, BONDS, X)
+    assert sample.turned[0] == (pytest.approx(turn.force(X, f)) if turns else pytest.approx(np.nan, nan_ok=True))
+
+
+def test_rows_that_depend_on_each_other():
+    twice = ConstraintSet([Distance([[0, 1]]), Distance([[0, 1]]), PHI], X, MASSES)
+    turn = rigid_turn(PHI, BONDS, X)
+    assert leaves_the_rest(turn, 2, twice, np.array([0]), X)
+    assert not leaves_the_rest(turn, 2, twice, np.array([0, 1]), X)
+
+
+def test_a_molecule_across_a_box_is_not_turned():
+    held = HeldCoordinates(ConstraintSet([PHI], X, MASSES), {"phi": PHI}, X, bonds=BONDS)
+    there = X.copy()
+    there[0] += 10.0
+    assert np.isnan(held.sample(there, np.zeros((6, 3)), np.ones((6, 3))).turned[0])
+    assert np.isnan(HeldCoordinates(ConstraintSet([PHI], X, MASSES), {"phi": PHI}, X).sample(X, X, X).turned[0])
