@@ -5,7 +5,7 @@
     python examples/31_long_steps.py --cost            processor time of baths and bookkeeping, into docs/results
     python examples/31_long_steps.py --show FILE       the tables of a file of results
 
-Water under slow forces that are evaluated rarely: examples/37_long_steps_water.py.
+Water under slow forces that are evaluated rarely: examples/39_long_steps_water.py.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ WATER = {row["name"]: row for row in RESULT["water"]}
 
 def test_page_shows_the_committed_results():
     small, cost = printed("31_long_steps.py", "long_steps.json").split("\n\n")
-    for part in (small, cost, printed("37_long_steps_water.py", "long_steps.json")):
+    for part in (small, cost, printed("39_long_steps_water.py", "long_steps.json")):
         assert part in page("long_steps.md")
 
 

@@ -1,9 +1,9 @@
 """Rigid water in long steps: slow forces evaluated rarely, under Langevin dynamics and on isokinetic spheres.
 
-    python examples/37_long_steps_water.py                   seconds: one method, some steps of 8 waters
-    python examples/37_long_steps_water.py --full FOLDER     64 rigid TIP3P waters, hours; goes on where it was stopped
-    python examples/37_long_steps_water.py --collect FOLDER  what its runs have shown so far, into docs/results
-    python examples/37_long_steps_water.py --show FILE       the table of a file of results
+    python examples/39_long_steps_water.py                   seconds: one method, some steps of 8 waters
+    python examples/39_long_steps_water.py --full FOLDER     64 rigid TIP3P waters, hours; goes on where it was stopped
+    python examples/39_long_steps_water.py --collect FOLDER  what its runs have shown so far, into docs/results
+    python examples/39_long_steps_water.py --show FILE       the table of a file of results
 
 The fast forces are those between molecules whose oxygens are near, switched off from 4 to 6 angstrom; the slow ones are
 what particle-mesh Ewald is more. Inner steps are 4 fs.
