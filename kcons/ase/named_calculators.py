@@ -7,6 +7,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
+
 from kcons.errors import InputError, UnsupportedError
 
 
@@ -49,3 +51,28 @@ def named_calculator(name: str, settings: Mapping[str, Any] | None = None) -> An
             "those of ASE by name, and MODULE:NAME",
             item="calculator",
         ) from error
+
+
+def described(calculator: Any) -> list[Any]:
+    """What tells a calculator from others: its kind, its parameters, and the calculators that it is made of.
+
+    Plain data, the same in each process. What a calculator does not give as parameters, such as the weights of a model,
+    is not in it.
+    """
+    parts = getattr(getattr(calculator, "mixer", calculator), "calcs", ())
+    kind = type(calculator)
+    parameters = _plain(getattr(calculator, "parameters", {}))
+    return [f"{kind.__module__}.{kind.__qualname__}", parameters, [described(part) for part in parts]]
+
+
+def _plain(value: Any) -> Any:
+    """As data of JSON; of other objects their kind."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(value[key]) for key in sorted(value, key=str)}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return type(value).__qualname__

@@ -23,6 +23,7 @@ _MODULES = {
     "work_precision": ("answer", "fronts", "measure", "recommendation", "report"),
 }
 _NAMES = {
+    "averages.fitted_forces": ("FittedForces",),
     "averages.step_zero": ("extrapolate",),
     "hard_cases.rings": ("ring",),
     "methods.methods": ("METHODS", "CoreStepper"),

@@ -112,7 +112,7 @@ class HeldCoordinates:
     ) -> None:
         held = motion if isinstance(motion, ConstraintSet) else motion.sources[0]
         x = as_array(positions, (held.n_atoms, 3), "positions")
-        if not coordinates:
+        if not isinstance(coordinates, Mapping) or not coordinates or not all(isinstance(k, str) for k in coordinates):
             raise InputError("no coordinates are named; give a mapping of names to constraints", item="coordinates")
         names: list[str] = []
         rows: list[int] = []

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.free_energy.averages import weighted_mean
 from kcons.free_energy.series import Series
+from kcons.thermostats.freedom import positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +71,7 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
     InputError
         `kT` that is not positive, or g = 1.
     """
-    if not kT > 0 or not np.isfinite(kT):
-        raise InputError(f"kT is {kT}; give a positive energy", item="kT")
-    force = series.multiplier + kT * series.gradient
+    force = series.multiplier + positive(kT, "kT") * series.gradient
     g = series.isokinetic_degrees_of_freedom
     if g == 1:
         raise InputError(
@@ -106,7 +106,7 @@ def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:
     Sprik and Ciccotti, J. Chem. Phys. 109, 7737 (1998), for one coordinate; den Otter and Briels, Mol. Phys. 98, 773
     (2000), for several; the page on free energies has the derivation with other constraints.
     """
-    if discard < 0 or discard >= len(series):
+    if not 0 <= whole_number(discard, "discard", 0) < len(series):
         raise InputError(f"{discard} of {len(series)} samples are to be discarded; keep some", item="discard")
     kept = series[discard:]
     value = kept.value

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
+from ase.calculators.mixing import SumCalculator
 
-from kcons.ase.named_calculators import named_calculator
+from kcons.ase.named_calculators import described, named_calculator
 from kcons.errors import InputError
 
 
@@ -24,3 +28,20 @@ def test_what_there_is_not_is_said(name, settings):
         name, settings = "math:sqrt", {"x": 1}
     with pytest.raises(InputError, match=rf"no calculator '{name}' with these settings.*gfn2, gfn1"):
         named_calculator(name, settings)
+
+
+def test_what_tells_calculators_from_each_other():
+    made = [
+        LennardJones(epsilon=0.1),
+        LennardJones(epsilon=0.2),
+        EMT(),
+        SumCalculator([EMT(), LennardJones(epsilon=0.1)]),
+        SumCalculator([EMT(), LennardJones(epsilon=0.2)]),
+    ]
+    texts = [json.dumps(described(calculator)) for calculator in made]
+    assert len(set(texts)) == len(made)
+    same = LennardJones(epsilon=np.float64(0.1))
+    same.parameters["beside"] = {"b": object, "a": np.arange(2)}
+    other = LennardJones(epsilon=0.1)
+    other.parameters["beside"] = {"a": [0, 1], "b": object}
+    assert described(same) == described(other)

@@ -173,7 +173,7 @@ def test_bad_input():
     series = series_of(
         {"r": Distance([[0, 1]])}, [FixedAtoms([0]), Plane([1], (0, 0, 1))], np.ones(2), ring(1.7, 20), spring
     )
-    for kT in (0.0, -1.0, np.nan):
+    for kT in (0.0, -1.0, np.nan, "x"):
         with pytest.raises(InputError, match="kT is"):
             mean_force(series, kT)
     series.isokinetic_degrees_of_freedom = 1

@@ -34,8 +34,9 @@ def agree(pairs, most=3.5):
 
 def test_the_page_shows_them():
     text = page("constant_pressure.md")
-    for line in printed("34_constant_pressure.py", "constant_pressure.json").split("\n"):
-        assert line in text, line
+    for script in ("34_constant_pressure.py", "38_constant_pressure_water.py"):
+        for line in printed(script, "constant_pressure.json").split("\n"):
+            assert line in text, line
 
 
 def test_density_of_water_is_that_of_openmm():

@@ -18,7 +18,8 @@ WATER = {row["name"]: row for row in RESULT["water"]}
 
 
 def test_page_shows_the_committed_results():
-    for part in printed("31_long_steps.py", "long_steps.json").split("\n\n"):
+    small, cost = printed("31_long_steps.py", "long_steps.json").split("\n\n")
+    for part in (small, cost, printed("39_long_steps_water.py", "long_steps.json")):
         assert part in page("long_steps.md")
 
 

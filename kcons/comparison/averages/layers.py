@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from ase.units import kB
@@ -48,6 +48,8 @@ class Layers:
         That energies are divided by.
     reference : Estimate, optional
         The mean energy, where it is known.
+    observables : mapping of str to callable
+        What else to average: positions, shape (n_atoms, 3), to a number.
     """
 
     title: str
@@ -63,6 +65,7 @@ class Layers:
     units: Units = ASE_UNITS
     molecules: int = 1
     reference: Estimate | None = None
+    observables: Mapping[str, Callable[[FloatArray], float]] = field(default_factory=dict)
 
     def inner_steps(self, step: float) -> int:
         """How many steps of the cheap forces go into one of `step`."""

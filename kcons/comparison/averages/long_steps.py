@@ -154,6 +154,8 @@ class Stepped:
         The same less the reference, with the error of both.
     correlation : float
         Statistical inefficiency of the energy, in evaluations of the expensive forces for an independent sample.
+    observed : mapping of str to (float, float, float)
+        Means of the observables of the layers with standard errors, and evaluations for an independent sample.
     seconds : float
         Processor time.
     """
@@ -171,6 +173,7 @@ class Stepped:
     energy: tuple[float, float] = (math.nan, math.nan)
     energy_off: tuple[float, float] | None = None
     correlation: float = math.nan
+    observed: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     accepted: float | None = None
     seconds: float = 0.0
 
@@ -260,6 +263,7 @@ class _Run:
         self.watched = System(layers.motion, lambda x, t: slow.watched(x)[1])
         self.split = TemperatureSplit(self.watched, seed=seed)
         self.energies: list[float] = []
+        self.seen: dict[str, list[float]] = {name: [] for name in layers.observables}
         self.time = self.length = self.seconds = 0.0
         self.before = (0, 0)
 
@@ -302,6 +306,8 @@ class _Run:
             raise ArithmeticError("the energy is not finite")
         self.split.add(x)
         self.energies.append(energy)
+        for name, observable in self.layers.observables.items():
+            self.seen[name].append(float(observable(x)))
 
     def told(self) -> dict[str, Any]:
         slow, fast = self.layers.slow.evaluations - self.before[0], self.layers.fast.evaluations - self.before[1]
@@ -327,6 +333,7 @@ class _Run:
             "energy": (energy.value / per, energy.error / per),
             "energy_off": off,
             "correlation": autocorrelation_time(self.energies) * calls,
+            "observed": {name: (*mean(seen), autocorrelation_time(seen) * calls) for name, seen in self.seen.items()},
         }
 
 

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, logsumexp
 
-from kcons.constraints.arguments import FloatArray, IntArray, numbers
+from kcons.constraints.arguments import FloatArray, IntArray, generator_of, numbers
 from kcons.errors import InputError
 from kcons.free_energy.averages import FEW_INDEPENDENT, pymbar
 from kcons.thermostats import Estimate
+from kcons.thermostats.freedom import positive
 
 #: Fewest pulls in a direction; samples of the bootstrap; overlap below which pulls tell little of each other.
 FEWEST, _SAMPLES, _OVERLAP = 5, 500, 0.03
@@ -106,7 +107,7 @@ def pull_free_energy(
         Fewer than 10 forward pulls count and there are none back, or pulls both ways overlap by less than 3 percent.
     """
     ahead = _works(forward, "forward", thermal_energy)
-    rng = np.random.default_rng(seed)
+    rng = generator_of(seed, "seed")
     drawn = ahead[rng.integers(len(ahead), size=(_SAMPLES, len(ahead)))]
     jarzynski, cumulant = _both(ahead, drawn)
     effective = _effective(ahead)
@@ -217,21 +218,19 @@ def work_profile(
     def along(chosen: IntArray | slice) -> FloatArray:
         return np.asarray(logsumexp(weights[chosen, 0], axis=0) - logsumexp(weights[chosen] - reduced[chosen], axis=0))
 
-    rng, n = np.random.default_rng(seed), len(reduced)
+    rng, n = generator_of(seed, "seed"), len(reduced)
     sampled = np.array([along(rng.integers(n, size=n)) for _ in range(_SAMPLES)])
     return thermal_energy * along(slice(None)), thermal_energy * sampled.std(axis=0, ddof=1)
 
 
 def _works(works: ArrayLike, item: str, thermal_energy: float) -> FloatArray:
     """Works over kT."""
-    if not (thermal_energy > 0 and math.isfinite(thermal_energy)):
-        raise InputError(f"kT is {thermal_energy}; give a positive number", item="thermal_energy")
     values = numbers(works, item)
     if values.ndim != 1 or len(values) < FEWEST:
         raise InputError(f"{item} has works of shape {values.shape}; give {FEWEST} pulls or more", item=item)
     if not np.isfinite(values).all():
         raise InputError(f"work {int(np.argmin(np.isfinite(values)))} of {item} is not finite; leave it out", item=item)
-    return values / thermal_energy
+    return values / positive(thermal_energy, "thermal_energy")
 
 
 def _both(works: FloatArray, drawn: FloatArray) -> tuple[Estimate, Estimate]:

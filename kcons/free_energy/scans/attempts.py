@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 from ase import Atoms
 
+from kcons.ase.named_calculators import described
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, OccupiedError, UnreadableError
@@ -89,7 +90,7 @@ class Attempts:
             "positions": atoms.positions.tolist(),
             "cell": atoms.cell.array.tolist(),
             "pbc": atoms.pbc.tolist(),
-            "calculator": type(atoms.calc).__name__,
+            "calculator": described(atoms.calc),
             "coordinates": [item.with_target(None).todict() for item in grid.coordinates],
             "values": [axis.tolist() for axis in grid.values],
             "held": [item.todict() for item in held],

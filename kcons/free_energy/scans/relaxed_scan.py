@@ -25,6 +25,7 @@ from kcons.ase.constraints_object import Constraints
 from kcons.ase.topology import bonds_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CalculatorError,
@@ -40,6 +41,7 @@ from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
+from kcons.thermostats.freedom import positive
 
 #: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
 LOWER = 2.7e-4
@@ -182,16 +184,22 @@ def scan(
     KconsError
         The first failure, where no point at all could be relaxed.
     """
-    items = [coordinates] if isinstance(coordinates, Constraint) else list(coordinates)
+    items = _constraints(coordinates, "coordinates")
     lists = [values] if isinstance(coordinates, Constraint) else list(values)  # type: ignore[arg-type]
     grid = Grid(items, lists)  # type: ignore[arg-type]
-    for value, item in ((fmax, "fmax"), (evaluations, "evaluations")):
-        if not value > 0:
-            raise InputError(f"{item} is {value}; give a positive number", item=item)
-    surface = _Surface(atoms, grid, [held] if isinstance(held, Constraint) else list(held))
+    fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
+    surface = _Surface(atoms, grid, _constraints(held, "held"))
     settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
     attempts = Attempts(None if folder is None else Path(folder), atoms, grid, surface.held, settings)
     return _Wavefront(surface, grid, attempts, settings, progress).run()
+
+
+def _constraints(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
+    found = [given] if isinstance(given, Constraint) else list(given) if isinstance(given, Iterable) else [given]
+    for entry in found:
+        if not isinstance(entry, Constraint):
+            raise InputError(f"{item} has {entry!r}; give constraints of kcons.constraints", item=item)
+    return found
 
 
 class _Surface:

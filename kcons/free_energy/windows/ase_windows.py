@@ -18,6 +18,7 @@ from kcons.ase import (
     draw_velocities,
     from_ase_constraints,
 )
+from kcons.ase.named_calculators import described
 from kcons.ase.topology import bonds_of
 from kcons.constraints import Constraint
 from kcons.constraints.target import FloatArray
@@ -70,7 +71,8 @@ class AseWindows:
             if isinstance(calculator, partial)
             else (calculator,)
         )
-        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:]]
+        # Not all that makes a calculator what it is need be among its parameters, nor among these arguments.
+        maker = [getattr(made[0], "__qualname__", type(made[0]).__qualname__), *made[1:], described(calculator())]
         frame = [self.atoms.numbers, self.atoms.positions, self.atoms.cell.array, self.atoms.pbc]
         frame.append(self.atoms.get_masses())
         self.digest = digest_of(frame, maker, self.held, list(self.coordinates.values()))

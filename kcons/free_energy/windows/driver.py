@@ -21,15 +21,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kcons.constraints.arguments import seed_number, whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, KconsError, OccupiedError
 from kcons.free_energy.averages import agreement
 from kcons.free_energy.mean_forces import MeanForce, mean_force
 from kcons.free_energy.profiles.mean_force_surface import Surface, fit_surface
 from kcons.free_energy.profiles.profile import Profile, integrate
-from kcons.free_energy.profiles.pulls import Pulled, pull_free_energy
+from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
-from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window
+from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
 from kcons.steppers.files import in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
@@ -179,11 +180,11 @@ class Windows:
     ) -> None:
         self.sampler = sampler
         self.settings = settings or Settings()
-        self.both_sides, self.seed = both_sides, seed
+        self.both_sides, self.seed = both_sides, seed_number(seed)
         self.folder = Path(folder)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
-        self.approach: FloatArray = np.broadcast_to(np.asarray(approach, dtype=np.float64), (len(sampler.names),))
+        self.approach = approach_of(approach, sampler.names)
         self._keep_settings()
 
     def _keep_settings(self) -> None:
@@ -242,9 +243,7 @@ class Windows:
         FreeEnergy
             One failed window does not stop the others; `failed` says why.
         """
-        places = np.array(targets, dtype=np.float64).reshape(-1, len(self.sampler.names))
-        if not len(places) or not np.all(np.isfinite(places)):
-            raise InputError("targets must be finite numbers, one row for each window", item="targets")
+        places = places_of(targets, self.sampler.names)
         first = len(self._targets)
         self._targets += [tuple(row) for row in places.tolist()]
         jobs = [job for number in range(first, len(self._targets)) for job in self._jobs(number)]
@@ -327,6 +326,7 @@ class Windows:
         InputError
             No steps to pull in; fewer than 5 pulls that did not fail.
         """
+        whole_number(count, "count", FEWEST)
         if not self.settings.pull:
             raise InputError("settings.pull is 0; give the steps of a pull", item="pull")
         ends = np.array([np.atleast_1d(start), np.atleast_1d(end)], dtype=np.float64) / self.sampler.scales

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint, Distance, MovingTarget
-from kcons.constraints.arguments import ANGLE, LENGTH
+from kcons.constraints.arguments import ANGLE, LENGTH, numbers, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
 from kcons.errors import InfeasibleError, InputError, UnsupportedError
 from kcons.free_energy.held_coordinates import HeldCoordinates
 from kcons.motion.motion import Motion
+from kcons.thermostats.freedom import positive
 
 Thermostat = Literal["langevin", "nose-hoover", "isokinetic"]
 
@@ -82,12 +83,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ("temperature", "timestep", "friction"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"{name} is {getattr(self, name)}; give a positive number", item=name)
+            positive(getattr(self, name), name)
         for name in ("relax", "pull", "equilibration", "production", "every"):
-            value = getattr(self, name)
-            if int(value) != value or value < (name in ("production", "every")):
-                raise InputError(f"{name} is {value}; give a number of steps", item=name)
+            whole_number(getattr(self, name), name, int(name in ("production", "every")))
         if self.thermostat not in ("langevin", "nose-hoover", "isokinetic"):
             raise InputError(
                 f"no thermostat {self.thermostat!r}; there are langevin, nose-hoover, isokinetic", item="thermostat"
@@ -157,6 +155,25 @@ def digest_of(*parts: Any) -> str:
         else:
             found.update(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
     return found.hexdigest()[:16]
+
+
+def places_of(targets: ArrayLike | Iterable[Sequence[float]], names: Sequence[str]) -> FloatArray:
+    """Values of the coordinates, one row for each window, shape (n, d)."""
+    places = np.array(numbers(targets if isinstance(targets, np.ndarray) else list(targets), "targets"))  # type: ignore[arg-type]
+    places = places[:, None] if places.ndim == len(names) == 1 else places
+    if places.ndim != 2 or places.shape[1] != len(names) or not len(places) or not np.all(np.isfinite(places)):
+        raise InputError("targets must be finite numbers, one row for each window", item="targets")
+    return places
+
+
+def approach_of(approach: ArrayLike, names: Sequence[str]) -> FloatArray:
+    """From how far away each coordinate is pulled, shape (d,)."""
+    given = numbers(approach, "approach")
+    if given.shape not in ((), (len(names),)) or not np.isfinite(given).all():
+        raise InputError(
+            f"approach is {approach!r}; give a finite number, or one for each of {', '.join(names)}", item="approach"
+        )
+    return np.broadcast_to(given, (len(names),))
 
 
 @dataclass

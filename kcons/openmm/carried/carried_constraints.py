@@ -19,7 +19,6 @@ from kcons.motion.motion import Motion
 from kcons.motion.report import Report
 from kcons.openmm.carried.callbacks import (
     LIVE,
-    LOW_SCALE,
     PHASES,
     PREFIX,
     SPEED_SCALE,
@@ -28,7 +27,8 @@ from kcons.openmm.carried.callbacks import (
     cell_of,
     force_name,
 )
-from kcons.openmm.carried.passage import CARRY_SCALE, hands_over_all
+from kcons.openmm.carried.carried_program import CarriedProgram
+from kcons.openmm.carried.passage import hands_over_all
 from kcons.openmm.carried.requirements import (
     free_groups,
     refuse_agents,
@@ -39,14 +39,14 @@ from kcons.openmm.carried.requirements import (
     warned_of_rounding,
     with_massless_atoms,
 )
-from kcons.openmm.integrator.part import NEAR, Miss, Part
+from kcons.openmm.integrator.part import NEAR, Miss
 from kcons.openmm.integrator.precision import Precision
-from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import accepted, masses_of, nanometers
 from kcons.openmm.topology import bonds_of
 
 
-class CarriedConstraints(Part):
+class CarriedConstraints(CarriedProgram):
     """Rows of kcons on the particles of an OpenMM System, for `ProjectedIntegrator(parts=[...])`.
 
     Most often made by `hold`, which also moves constraints of the System that share atoms with the rows.
@@ -79,8 +79,6 @@ class CarriedConstraints(Part):
     `CarriedConstraints.of` then finds them.
     """
 
-    evaluates = True
-    lands_last = True
     _told = False
     #: Sizes of the gradients, where velocities were looked at first.
     _slopes: FloatArray | None = None
@@ -136,7 +134,7 @@ class CarriedConstraints(Part):
             for force in mine:
                 force.setParticles([])
         part._bind(LIVE[keys[0]], [force.getForceGroup() for force in mine])
-        part.alone = system.getNumConstraints() == 0
+        part._look_at(system)
         return part
 
     def forces(self) -> list[openmm.PythonForce]:
@@ -157,7 +155,11 @@ class CarriedConstraints(Part):
         """Put the forces into the System; before the Context is made."""
         for force in self.forces():
             system.addForce(force)
+        self._look_at(system)
+
+    def _look_at(self, system: openmm.System) -> None:
         self.alone = system.getNumConstraints() == 0
+        self.sited = bool(virtual_sites(system))
 
     # -- what is held ---------------------------------------------------------------------------
 
@@ -185,77 +187,6 @@ class CarriedConstraints(Part):
         fixed = int(np.count_nonzero(self.motion.masses[self.atoms] == 0))
         return self.motion.rank - 3 * fixed
 
-    # -- the program ----------------------------------------------------------------------------
-
-    def declare(self, program: Program) -> None:
-        self._engine.follow(program.integrator, self.lean)
-        #: Where a step may end without a projection, the solve for positions must tell of failures itself.
-        self._early = self.lean or getattr(program.integrator, "scheme", None) is None
-
-    def take_precision(self, program: Program, precision: Precision) -> None:
-        """Refuse single precision; what passes through OpenMM is known now."""
-        refuse_single_precision(precision)
-        self._engine.take_precision(precision)
-        if f"rest{self.code}" in program.settings:
-            program.set(f"rest{self.code}", float(self._engine.carries_rest))
-
-    def begin_early(self, program: Program) -> None:
-        """Where x is not where the last step ended, and velocities are projected before the first drift."""
-        self.remember(program)
-
-    def _guard(self, program: Program, phase: str, words: str) -> None:
-        group = self._groups[phase]
-        program.let("failed", f"select(energy{group}, {self.code}, failed)", words)
-
-    def begin_run(self) -> None:
-        self._engine.begin_run()
-
-    def remember(self, program: Program) -> None:
-        words = "carried rows: positions whose gradients are taken"
-        if not self.lean or self._engine.timed:
-            self._guard(program, "remember", words)
-            return
-        with program.when("looked+moving != 0", "x need not be where the last drift ended"):
-            self._guard(program, "remember", words)
-
-    def land(self, program: Program, h: str) -> None:
-        change = f"f{self._groups['land']}"
-        if self._early:
-            self._guard(program, "land", "carried rows: solve for positions")
-            force, change = change, program.vector(f"change{self.code}", "what brings carried particles onto the rows")
-            program.each(change, force, "from the evaluation that tells of failures")
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*{change}", "carried rows: onto them")
-
-    def land_alone(self, program: Program, u: str, h: str) -> None:
-        """The drift with velocity u and its impulse, where nothing else acts on x: x and v change."""
-        group = self._groups["land"]
-        program.each("x", f"x+{h}*{u}", "move freely (drift)")
-        self._guard(program, "land", "carried rows: solve for positions")
-        # Force and energy come from one evaluation, for this moves no x.
-        program.each("v", f"{u}+{1 / CARRY_SCALE!r}*f{group}/{h}", "the constraint forces act on v as well")
-        program.each("x", f"x+{1 / CARRY_SCALE!r}*f{group}", "carried rows: onto them")
-
-    def project(self, program: Program) -> None:
-        change = f"f{self._groups['project']}"
-        # Thermostats stir more than rounding does.
-        rest = self._engine.carries_rest
-        program.each("xu", "x", "to come back to")
-        program.each("x", f"x+{1 / SPEED_SCALE!r}*v", "carries v, exactly as far as it can be told from x")
-        self._guard(program, "project", "carried rows: solve for velocities")
-        carried = f"(x-xu)*{SPEED_SCALE!r}"
-        if rest:
-            program.setting(f"rest{self.code}", "1 where the rest of v matters: forces are double", 1.0)
-            program.vector("v_low", "what of v was too small to be carried together with x")
-            program.each("v_low", f"select({change}, v-{carried}, 0)", "the rest of v")
-        program.each("v", f"select({change}, {carried}+{1 / CARRY_SCALE!r}*{change}, v)", "tangent to the carried rows")
-        if rest:
-            with program.when(f"rest{self.code} != 0", "all digits"):
-                program.each("x", f"xu+{LOW_SCALE!r}*v_low", "carries the rest")
-                self._guard(program, "project", "carried rows: the same for the rest")
-                back = 1 / (CARRY_SCALE * SPEED_SCALE * LOW_SCALE)
-                program.each("v", f"v+v_low+{back!r}*{change}", "tangent, all of it")
-        program.each("x", "xu", "back")
-
     # -- in a context ---------------------------------------------------------------------------
 
     def check(self, context: openmm.Context, velocities: bool = True) -> None:
@@ -270,7 +201,7 @@ class CarriedConstraints(Part):
         """
         system, precision = context.getSystem(), Precision.of(context)
         refuse_single_precision(precision)
-        self._check_system(system, precision)
+        _check_system(system, self._engine, precision, alone=self.alone)
         refuse_agents(system, self.motion.constraint_set, context.getMolecules)
         x, v, time = self._state(context)
         self._tell_of_rounding(x)
@@ -368,28 +299,6 @@ class CarriedConstraints(Part):
         v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
         return x, v, state.getTime().value_in_unit(unit.picosecond)
 
-    def _check_system(self, system: openmm.System, precision: Precision) -> None:
-        engine = self._engine
-        forces = {force.getName(): force for force in system.getForces()}
-        missing = {force_name(phase, engine.key) for phase in PHASES} - set(forces)
-        if missing:
-            raise InputError(
-                "the System has no forces that carry the rows; call add_to(system), or hold(system, ...), before "
-                "the Context is made",
-                item="system",
-            )
-        refuse_some_particles(forces[force_name(PHASES[0], engine.key)], precision)
-        now = masses_of(system)
-        if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
-            raise InputError("masses have changed since the rows were built; build them again", item="masses")
-        refuse_virtual_sites(system, engine.atoms, now)
-        if self.alone and system.getNumConstraints():
-            raise InputError(
-                "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
-                item="system",
-            )
-        refuse_shared_atoms(system, set(engine.atoms.tolist()))
-
     # -- results --------------------------------------------------------------------------------
 
     def multipliers(self, context: openmm.Context) -> FloatArray:
@@ -431,3 +340,26 @@ class CarriedConstraints(Part):
 
     def __repr__(self) -> str:
         return f"<CarriedConstraints: {self.motion.constraint_set.n_rows} rows on {len(self.atoms)} particles>"
+
+
+def _check_system(system: openmm.System, engine: Engine, precision: Precision, *, alone: bool) -> None:
+    """Raise where the System is not the one that the rows were built for; `alone` if it had no constraints."""
+    forces = {force.getName(): force for force in system.getForces()}
+    missing = {force_name(phase, engine.key) for phase in PHASES} - set(forces)
+    if missing:
+        raise InputError(
+            "the System has no forces that carry the rows; call add_to(system), or hold(system, ...), before "
+            "the Context is made",
+            item="system",
+        )
+    refuse_some_particles(forces[force_name(PHASES[0], engine.key)], precision)
+    now = masses_of(system)
+    if len(now) != len(engine.masses) or np.any(now[engine.atoms] != engine.masses[engine.atoms]):
+        raise InputError("masses have changed since the rows were built; build them again", item="masses")
+    refuse_virtual_sites(system, engine.atoms, now)
+    if alone and system.getNumConstraints():
+        raise InputError(
+            "the System got constraints after the rows were added to it; add the rows, by hold or add_to, last",
+            item="system",
+        )
+    refuse_shared_atoms(system, set(engine.atoms.tolist()))

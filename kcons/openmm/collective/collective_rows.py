@@ -41,6 +41,7 @@ from kcons.openmm.collective.small_algebra import PIVOT, blocks
 from kcons.openmm.integrator.part import Miss
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.program import Program
+from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
 
@@ -132,8 +133,7 @@ class CollectiveRows(GroupRows):
                 for k, (value, of) in enumerate(zip(values, self._units, strict=True))
             ]
 
-        self._targets = read("target")
-        self._rates = read("rate", unit.picosecond)
+        self._targets, self._rates = read("target"), read("rate", unit.picosecond)
         periods, scales = read("period"), read("scale")
         for k, (target, rate, scale) in enumerate(zip(self._targets, self._rates, scales, strict=True)):
             if target is None and positions is None:
@@ -157,6 +157,7 @@ class CollectiveRows(GroupRows):
         )
         atoms = [moved_atoms(system, f) for f in forces]
         self._refuse_sites(system, atoms)
+        self.sited = bool(virtual_sites(system))
         #: The particles of each row.
         self.atoms = tuple(tuple(sorted(touched)) for touched in atoms)
         rigid = Rigid(system)

@@ -45,7 +45,7 @@ class LeanStepWriter(StepWriter):
 
     def write(self) -> None:
         plain = type(self.ensemble) is ConstantEnergy
-        self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle)
+        self.lean = plain and bool(self.parts) and isinstance(self.scheme, Rattle) and not self.sited
         #: Without parts: the kick that ends a step is made with that which begins the next.
         self.joined = self.ensemble.adds_up and not self.parts and isinstance(self.scheme, Rattle)
         owing = self.ensemble.owes and not self.parts

@@ -116,6 +116,8 @@ class Part(ABC):
         whole drift then.
     stays_finite : bool
         Whether x is still a place where forces can be computed after a failure; set-up is faster then.
+    sited : bool
+        Whether the System is known to have virtual sites: they are placed before the applied forces are computed.
     """
 
     code: int = 0
@@ -127,6 +129,7 @@ class Part(ABC):
     lean: bool = False
     alone: bool = False
     stays_finite: bool = False
+    sited: bool = False
 
     @property
     def driven(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from kcons.openmm.integrator.ensemble import Ensemble
 from kcons.openmm.integrator.part import Part
@@ -29,6 +29,8 @@ class StepWriter:
     kept : bool
         Whether the applied forces are kept in a variable: where parts evaluate row groups, OpenMM remembers the
         forces of the last groups only.
+    sited, divided : bool
+        Whether parts stand beside virtual sites; whether steps can be made in two executions then.
     """
 
     def __init__(self, program: Program, scheme: Splitting | None, parts: Sequence[Part], ensemble: Ensemble) -> None:
@@ -38,6 +40,8 @@ class StepWriter:
         self.halves = any(isinstance(operation, Exchange) for operation in self.operations)
         self.alone = len(self.drifts) + 1
         self.kept = scheme is not None and any(part.evaluates for part in self.parts)
+        self.sited = scheme is not None and any(part.sited for part in self.parts)
+        self.divided = self.sited and self._last_drift_apart
 
     def write(self) -> None:
         p = self.program
@@ -71,7 +75,7 @@ class StepWriter:
     @property
     def phases(self) -> int:
         """Executions of the program that a step takes where virtual sites are placed at the end of each only."""
-        return 2 if self.halves else len(self.drifts) + 1
+        return 2 if self.halves or self.parts else len(self.drifts) + 1
 
     def _write_plain_single(self) -> None:
         p, kicks = self.program, self.kicks
@@ -125,20 +129,27 @@ class StepWriter:
         p, n = self.program, len(self.drifts)
         use(p, "failed", "good_steps", "first_stage")
         use(p, "end_stage", value=n)
-        use(p, "stage", "h")
-        if self._last_drift_apart:
-            use(p, "per_h")
+        use(p, "stage", "h", *["per_h"] * self._last_drift_apart, *["phase"] * self.divided)
         p.table("drift_share", [*self.drifts, 0.0, 1.0], "length of drift k as a fraction of the step")
         p.table("kick_share", [*self.kicks, 0.0, 0.0], "length of the kick before drift k as a fraction of the step")
-        use(p, "x_last", "v_last", "stale")
-        if self.kept:
-            use(p, "moved")
+        use(p, "x_last", "v_last", "stale", *["moved"] * self.kept)
 
     def _write_guarded(self) -> None:
         """The same program brings positions, or velocities alone, onto the constraints.
 
         It starts at the last stage of the tables then, a drift without kicks, or behind it.
         """
+        p = self.program
+        if not self.divided:
+            self._write_up_to_forces(self._write_with_forces)
+            return
+        with p.when("phase != 2", "up to the new positions"):
+            self._write_up_to_forces()
+        with p.when("phase != 1", "with the forces there"):
+            self._write_with_forces()
+        p.let("phase", "select(phase, 3-phase, 0)", "what follows")
+
+    def _write_up_to_forces(self, then: Callable[[], None] = lambda: None) -> None:
         p = self.program
         with p.when("first_stage+failed = 0", "a step, and nothing failed before"):
             p.let_others_act()
@@ -170,27 +181,31 @@ class StepWriter:
                 self._write_single()
             else:
                 self._write_loop()
-            if self.scheme is None:
-                # The leapfrog has velocities of half a step ago, which belong to no x.
-                with p.when("first_stage*step(0.5-failed) != 0", "constraints alone"):
+            then()
+
+    def _write_with_forces(self) -> None:
+        p = self.program
+        if self.scheme is None:
+            # The leapfrog has velocities of half a step ago, which belong to no x.
+            with p.when("first_stage*step(0.5-failed) != 0", "constraints alone"):
+                self._project()
+            with p.when("failed = 0", "the step is good"):
+                p.let("good_steps", "good_steps+1", "count it")
+        else:
+            with p.when("failed = 0", "all solves converged"):
+                if self._last_drift_apart:
+                    self._kick_after("per_h*(x-xu)")
+                if not self._ends_tangent:
                     self._project()
-                with p.when("failed = 0", "the step is good"):
-                    p.let("good_steps", "good_steps+1", "count it")
-            else:
-                with p.when("failed = 0", "all solves converged"):
-                    if self._last_drift_apart:
-                        self._kick_after("per_h*(x-xu)")
-                    if not self._ends_tangent:
-                        self._project()
-                    self.ensemble.close(p)
-                    p.let("good_steps", "good_steps+delta(failed)", "count it")
-                    if self.kept:
-                        p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
-            with p.when("failed != 0", "a solve failed"):
-                p.each("x", "x_last", "back to where the step began")
-                p.each("v", "v_last", "back to where the step began")
-                self.ensemble.take_back(p)
-                p.let("stale", "1", "forces are those of elsewhere")
+                self.ensemble.close(p)
+                p.let("good_steps", "good_steps+delta(failed)", "count it")
+                if self.kept:
+                    p.each("x_last", "select(failed, x_last, x)", "where forces were computed")
+        with p.when("failed != 0", "a solve failed"):
+            p.each("x", "x_last", "back to where the step began")
+            p.each("v", "v_last", "back to where the step began")
+            self.ensemble.take_back(p)
+            p.let("stale", "1", "forces are those of elsewhere")
 
     def _write_single(self) -> None:
         """One drift needs no loop; set-up takes 15 times as long for each block within a loop."""
@@ -227,7 +242,7 @@ class StepWriter:
     @property
     def single(self) -> bool:
         """Whether there is one part, whose rows are all there is."""
-        return len(self.parts) == 1 and self.parts[0].alone
+        return len(self.parts) == 1 and self.parts[0].alone and not self.sited
 
     @property
     def _last_drift_apart(self) -> bool:
@@ -290,6 +305,8 @@ class StepWriter:
         for part in self.parts:
             if part.lands_last:
                 part.land(p, h)
+        if self.sited and any(part.lands_last for part in self.parts):
+            p.hold_positions("GPUs place virtual sites")
 
     def _project(self) -> None:
         p = self.program

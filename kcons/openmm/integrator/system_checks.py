@@ -212,6 +212,11 @@ def check_system(system: openmm.System) -> None:
             )
 
 
+def virtual_sites(system: openmm.System) -> list[int]:
+    """The particles that OpenMM places by others."""
+    return [k for k in range(system.getNumParticles()) if system.isVirtualSite(k)]
+
+
 def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
     """Whether steps must be made in parts: forces are needed within the step, and virtual sites are placed at its end.
 
@@ -221,15 +226,20 @@ def parts_of_steps(context: openmm.Context, integrator: Integrator) -> bool:
         There are such sites, and steps cannot be made in parts.
     """
     system, platform = context.getSystem(), context.getPlatform().getName()
-    sites = [k for k in range(system.getNumParticles()) if system.isVirtualSite(k)]
+    sites = virtual_sites(system)
     if not sites or integrator.scheme is None:
         return False
     late = platform in _LATE
     where = f"particle {sites[0]} is a virtual site"
-    if integrator.parts:
+    if integrator.parts and not any(part.sited for part in integrator.parts):
         raise UnsupportedError(
-            f"{where}, and beside parts= only scheme='leapfrog' computes all forces where virtual sites were placed; "
-            "use that, or water without virtual sites"
+            f"{where}, of which {integrator.parts[0]!r} does not know; hold rows after the sites were added, by hold "
+            "or CollectiveRows, or use scheme='leapfrog'"
+        )
+    if integrator.parts and late and "phase" not in integrator.program.idle:
+        raise UnsupportedError(
+            f"{where}: {platform} places virtual sites at the end of a program only, and beside parts= steps of "
+            f"several drifts ({integrator.scheme!r}) are not made in parts; use scheme='rattle'"
         )
     owner = getattr(context, "_integrator", integrator)
     if late and isinstance(owner, openmm.CompoundIntegrator) and not getattr(owner, "closed", False):

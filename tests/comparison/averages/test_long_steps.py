@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from ase import units
@@ -59,6 +60,17 @@ def test_bias_beyond_noise(runs):
 def test_results_can_be_repeated(layers, runs):
     again = measure(layers, METHODS["spheres"], 4 * FS, 0.01 / FS, length=4000 * FS)
     assert again.energy == runs["spheres"].energy and again.kinds == runs["spheres"].kinds
+
+
+def test_observables_beside_the_energy(layers, runs):
+    """Averages, errors and calls for a sample are those of the energy, where the energy is what is observed."""
+    seen = {"energy": lambda x: layers.slow.watched_energy(x) / layers.molecules, "nothing": lambda x: 1.0}
+    run = measure(replace(layers, observables=seen), METHODS["spheres"], 4 * FS, 0.01 / FS, length=4000 * FS)
+    value, error, calls = run.observed["energy"]
+    assert (value, error) == pytest.approx(runs["spheres"].energy) and runs["spheres"].observed == {}
+    assert calls == pytest.approx(run.correlation) and run.correlation == runs["spheres"].correlation
+    # What does not change has a sample in every look at it.
+    assert run.observed["nothing"] == pytest.approx((1.0, 0.0, run.evaluations / run.samples))
 
 
 def test_a_step_that_is_too_long_is_shown(layers):

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from ase.calculators.lj import LennardJones
 from scan_systems import chain, threefold
 
 from kcons.constraints import Custom, Dihedral
@@ -76,3 +77,16 @@ def test_python_functions_need_no_folder(tmp_path):
     with pytest.raises(InputError, match="Python function"):
         Attempts(tmp_path / "new", chain(4, threefold), grid, [], {})
     assert not (tmp_path / "new").exists()
+
+
+def test_the_calculator_has_to_be_the_same(tmp_path):
+    """Not only of the same kind."""
+    atoms = chain(4, threefold)
+    grid = Grid([Dihedral([[0, 1, 2, 3]])], [[0.1, 0.2]])
+    for epsilon in (0.1, 0.1, 0.2):
+        atoms.calc = LennardJones(epsilon=epsilon)
+        if epsilon == 0.2:
+            with pytest.raises(OccupiedError, match=r"\(calculator differ\)"):
+                Attempts(tmp_path, atoms, grid, [], {})
+        else:
+            Attempts(tmp_path, atoms, grid, [], {})

@@ -204,6 +204,11 @@ def test_bad_coordinates():
         scan(atoms, TURN, RING, held=CustomVelocity([[0, 1]], lambda r, t: np.ones((len(r), 2, 3))))
     with pytest.raises(InputError, match="fmax is 0; give a positive number"):
         scan(atoms, TURN, RING, fmax=0)
+    for wrong in ({"fmax": "x"}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            scan(atoms, TURN, RING, **wrong)
+    with pytest.raises(InputError, match="coordinates has None"):
+        scan(atoms, None, RING)
     with pytest.raises(InputError, match="no calculator"):
         scan(Atoms("C4", positions=atoms.positions), TURN, RING)
 

@@ -81,5 +81,17 @@ def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
 def test_what_a_folder_belongs_to():
     """The same in another process; another calculator or other constraints are something else."""
     assert sampler().digest == sampler().digest == pickle.loads(pickle.dumps(sampler())).digest
-    other = AseWindows(molecule("CH3OH"), partial(LennardJones, sigma=1.1), {"turn": TURN}, [PIECES])
-    assert len({sampler().digest, other.digest, sampler(held=[]).digest}) == 3
+    others = [
+        AseWindows(molecule("CH3OH"), calculator, {"turn": TURN}, [PIECES])
+        for calculator in (partial(LennardJones, sigma=1.1), made(0.01), made(0.02))
+    ]
+    assert len({sampler().digest, sampler(held=[]).digest, *(other.digest for other in others)}) == 5
+
+
+def made(epsilon):
+    """Functions of the same name, without arguments."""
+
+    def calculator():
+        return LennardJones(epsilon=epsilon)
+
+    return calculator

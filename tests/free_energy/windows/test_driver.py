@@ -188,6 +188,12 @@ def test_bad_input(tmp_path):
         run(tmp_path, PLACES[::2])
     assert len(diary(tmp_path)) == 16
     windows = Windows(Fake(str(tmp_path / "diary")), tmp_path / "other", SETTINGS)
-    for wrong in ([], [np.nan]):
+    for wrong in ([], [np.nan], [[1.0, 2.0]], np.zeros((2, 1, 1))):
         with pytest.raises(InputError, match="targets must be finite"):
             windows.run(wrong)
+    with pytest.raises(InputError, match="count is 4; give a whole number, 5 or more"):
+        windows.pull(0, 1, 4)
+    for more in ({"approach": [1.0, 2.0]}, {"approach": np.nan}, {"approach": "x"}, {"seed": None}):
+        with pytest.raises(InputError, match=next(iter(more))):
+            Windows(Fake(str(tmp_path / "diary")), tmp_path / "never", SETTINGS, **more)
+    assert not (tmp_path / "never").exists()

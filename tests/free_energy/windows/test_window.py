@@ -20,7 +20,8 @@ def held(coordinates=None, others=()):
 
 
 def test_settings_say_what_is_wrong():
-    for name, value in (("temperature", -1.0), ("timestep", 0.0), ("every", 0), ("relax", -1), ("pull", 0.5)):
+    wrong = [("temperature", -1.0), ("timestep", 0.0), ("every", 0), ("relax", -1), ("pull", 0.5)]
+    for name, value in (*wrong, ("temperature", "x"), ("friction", [1, 2]), ("every", None)):
         with pytest.raises(InputError, match=f"{name} is"):
             Settings(**{name: value})
     with pytest.raises(InputError, match="no thermostat 'andersen'"):

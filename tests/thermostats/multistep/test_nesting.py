@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from kcons.errors import InputError
@@ -114,3 +115,39 @@ def test_on_spheres_velocities_are_projected_after_each_drift():
 def test_steps_that_cannot_be(steps, words):
     with pytest.raises(InputError, match=words):
         levels_of(steps)
+
+
+def spreads(angle, share, friction=0.05, count=10):
+    """<x^2> over kT/k of an oscillator with one slow kick in `angle`, at the kick and after each inner step; exact.
+
+    `share` of its stiffness is in the slow force.
+    """
+    step, noise, seen = np.eye(2), np.zeros((2, 2)), []
+    for operation in nested(levels_of({"slow": 1, "fast": count}), 2, (1.0,)):
+        a, b, part = np.eye(2), np.zeros((2, 2)), getattr(operation, "fraction", 0.0) * angle
+        if isinstance(operation, Kick):
+            a[1, 0] = -part * (share if operation.group == "slow" else 1 - share)
+        elif isinstance(operation, Fly):
+            a[0, 1] = part
+        elif isinstance(operation, Exchange):
+            a[1, 1] = math.exp(-friction * part)
+            b[1, 1] = 1 - a[1, 1] ** 2
+        step, noise = a @ step, a @ noise @ a.T + b
+        if isinstance(operation, Evaluate) and operation.group == "fast":
+            seen.append((step, noise))
+    if np.abs(np.linalg.eigvals(step)).max() >= 1:
+        return np.full(count + 1, np.inf)
+    still = np.linalg.solve(np.eye(4) - np.kron(step, step), noise.ravel()).reshape(2, 2)
+    return np.array([still[0, 0], *((a @ still @ a.T + b)[0, 0] for a, b in seen)])
+
+
+def test_where_averages_are_right():
+    """Too wide at the kicks, too narrow halfway, right at about a fifth; near half a period both are far too wide."""
+    found = spreads(1.5, 0.2) - 1
+    assert found == pytest.approx(found[::-1], abs=5e-3)
+    assert found[0] == pytest.approx(0.088, abs=5e-4) and found[5] == pytest.approx(-0.058, abs=5e-4)
+    assert abs(found[2]) < 0.01 < -found[3]
+    # Without slow forces every inner step is right at its end.
+    assert spreads(1.5, 0.0, count=2) - 1 == pytest.approx([0, 0, 0], abs=1e-12)
+    driven = spreads(math.pi, -0.2, friction=0.2)
+    assert np.isinf(spreads(3.0, 0.2)).all() and min(driven[0], driven[5], driven.mean()) > 4
