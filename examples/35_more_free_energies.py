@@ -21,7 +21,16 @@ from ase.calculators.calculator import Calculator, all_changes
 from kcons.ase import constraints_of
 from kcons.comparison import environment, json_files
 from kcons.constraints import Dihedral, Distance, Plane
-from kcons.free_energy import AseWindows, FreeEnergy, OpenMMWindows, Settings, Windows, plot_profile, plot_surface
+from kcons.free_energy import (
+    AseWindows,
+    FreeEnergy,
+    OpenMMWindows,
+    Settings,
+    Windows,
+    fit_surface,
+    plot_profile,
+    plot_surface,
+)
 
 DOCS = Path(__file__).parents[1] / "docs"
 KT = 0.00831446261815324 * 300.0  # kJ/mol
@@ -114,7 +123,9 @@ def torsions(folder: Path, full: bool) -> dict[str, object]:
     found = sampled(sampler, np.array(grid), folder / "torsions", settings, full, both_sides=False)
     if not full:
         return {}
-    surface = found.surface
+    # A part of both turns is no period: `found.surface` would go around.
+    x, f, c = (np.array([getattr(w, name) for w in found.windows]) for name in ("value", "force", "covariance"))
+    surface = fit_surface(x, f, c)
     pictured(plot_surface(surface, coordinates=("phi / rad", "psi / rad"), energy="kJ/mol"), "torsions")
     inside = [m.x for m in surface.minima() if PHI[0] <= m.x[0] <= PHI[-1] and PSI[0] <= m.x[1] <= PSI[-1]]
     minima = []

@@ -56,7 +56,7 @@ def test_killed_runs():
     for kind in ("windows", "scan"):
         row = found[kind]
         assert row["kills"] == 30 and row["lost"] == 0 and row["result"] == "identical"
-        assert row["finished after each"] == sorted(row["finished after each"]) and row["in all"] >= 24
+        assert row["finished after each"] == sorted(row["finished after each"]) and row["finished after each"][-1] > 20
     assert "30 SIGKILLs" in TEXT and f"{found['windows']['in all']} runs of windows" in TEXT
     assert f"{found['scan']['in all']} relaxations" in TEXT
 

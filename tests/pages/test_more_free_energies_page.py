@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 from committed_pages import FOLDER, page
 
 FOUND = json.loads((FOLDER / "more_free_energies.json").read_text(encoding="utf-8"))
@@ -43,10 +42,7 @@ def test_two_torsions():
     assert f"the second {shown(second['F'] - lowest['F'], second['error'])} kJ/mol higher" in TEXT
     assert f"{found['windows']} windows" in TEXT
     assert found["consistency"] > 1e-3
-    # phi alone, from the surface, has the well of the windows of phi in the other result.
-    alone = json.loads((FOLDER / "free_energy.json").read_text(encoding="utf-8"))["alanine dipeptide"]
-    there = found["phi"][int(np.argmin(found["F of phi"]))]
-    assert abs(there - alone["phi"][int(np.argmin(alone["MBAR"]))]) < 0.3
+    assert second["F"] - lowest["F"] > 3 * second["error"]
 
 
 def test_ions():
