@@ -62,7 +62,7 @@ def test_compare_samples_fluids(tmp_path, capsys):
     assert run("compare", "thermostat", *options) == 0
     printed = capsys.readouterr()
     assert "8 Lennard-Jones atoms" in printed.out
-    assert re.match(r"At 0\.01 τ use .*: the temperature of its configurations is off by", printed.out)
+    assert re.search("temperature of (its|the) configurations", printed.out.splitlines()[0])
     assert "kT off by: temperature of the configurations" in printed.out
     assert "Metropolis sampling\n" in printed.err
     data = json.loads((out / "compare.json").read_text(encoding="utf-8"))
