@@ -901,7 +901,7 @@ MUTANTS = [
         "tests/free_energy/profiles/test_pulls.py::test_distributions_of_different_width_cross_between_their_means",
     ),
     (
-        "free_energy/held_coordinates.py",
+        "constraints/constraint_set.py",
         "if any(getattr(item, name) != getattr(wanted, name) for name in wanted.shared):",
         "if any(name is None for name in wanted.shared):",
         "tests/free_energy/test_held_coordinates.py::test_formulas_on_the_same_atoms_are_told_apart",

@@ -273,7 +273,8 @@ def _tie(system: openmm.System, pairs: IntArray) -> None:
     if not len(pairs):
         return
     n = system.getNumParticles()
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    i, j = pairs.T.astype(np.int32)  # older SciPy makes no tree of wider indices
+    links = coo_array((np.ones(len(pairs)), (i, j)), shape=(n, n))
     tree = minimum_spanning_tree(links.tocsr()).tocoo()
     force = next((f for f in system.getForces() if f.getName() == TIES), None)
     if force is None:

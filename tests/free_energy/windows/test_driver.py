@@ -129,7 +129,7 @@ def killed_again_and_again(folder: Path, kills: int) -> None:
         finished = present
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(30, marks=pytest.mark.validation)])
+@pytest.mark.parametrize("kills", [1, pytest.param(30, marks=pytest.mark.validation)])
 def test_killed_runs_go_on(tmp_path, kills):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
