@@ -296,11 +296,11 @@ def show(result: dict[str, Any], console: Console) -> None:
             if row["status"] != "ok":
                 table.add_row(*cells, row["status"])
                 continue
-            cells += [f"{100 * value:+.1f} ± {100 * error:.1f}" for value, error in row["kinds"].values()]
-            cells += [f"{value:+.3f} ± {error:.3f}" for value, error in row["off"].values()]
-            cells.append("/".join(f"{value:.0f}" for value in row["calls"].values()))
+            cells += [f"{100 * value:+.0f} ± {100 * error:.0f}" for value, error in row["kinds"].values()]
+            cells += [f"{value:+.2f} ± {error:.2f}" for value, error in row["off"].values()]
+            cells.append(", ".join(f"{value:.0f}" for value in row["calls"].values()))
             for key in ("fewer than 2 fs", "fewer than 4 fs", "less time"):
-                cells.append("/".join(f"{value:.1f}" for value in row[key].values()))
+                cells.append(", ".join(f"{value:.1f}" if value < 10 else f"{value:.0f}" for value in row[key].values()))
             table.add_row(*cells)
         console.print(table)
     console.print("off by: less the first run. calls: for an independent sample of each of these averages.")
@@ -318,10 +318,11 @@ def draw(result: dict[str, Any], path: str) -> None:
         for method, (colour, marker) in long_steps_report.STYLES.items():
             seen = sorted((one.step, averages(one)["U/kT"][2]) for one in runs_of(result, name) if one.method == method)
             if seen:
-                title = long_steps.METHODS[method].title
+                title = long_steps.METHODS[method].title.replace("the same", "Langevin")
                 panel.loglog(*np.transpose(seen), marker=marker, color=colour, label=title)
         panel.set(title=name, xlabel="step / fs", ylabel="calls of GFN2-xTB for a sample of U")
         panel.set_xticks((2, 4, 8, 16, 32), ("2", "4", "8", "16", "32"))
+        panel.set_xticks((), minor=True)
     picture.axes[0].legend(frameon=False)
     picture.savefig(path, dpi=150)
 
@@ -329,7 +330,7 @@ def draw(result: dict[str, Any], path: str) -> None:
 def main() -> None:
     parser = scripts.options(__doc__, full="long runs")
     parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
-    options, console = parser.parse_args(), Console(width=150)
+    options, console = parser.parse_args(), Console(width=200)
     if options.show:
         result = json_files.read(options.show)
         show(result, console)
