@@ -454,3 +454,9 @@ def test_a_context_of_another_system_is_refused():
     context = context_of(other, openmm.VerletIntegrator(0.001), CHAIN, some_velocities())
     with pytest.raises(InputError, match="no part of this System"):
         part.check(context)
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance": "x"}, {"tolerance": 0.0}, {"max_iterations": 2.5}])
+def test_numbers_that_are_none(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        CollectiveRows(chain_system(), [Row(bond(0, 3), 0.3)], **wrong)
