@@ -7,10 +7,9 @@ import numpy as np
 from ase import Atoms, units
 from ase.build import molecule
 from ase.calculators.tip3p import TIP3P
-from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
-from kcons.ase import constrain, rigid_water
+from kcons.ase import constrain, draw_velocities, rigid_water
 
 
 def water_box(side: int = 3, spacing: float = 3.1) -> Atoms:
@@ -31,7 +30,7 @@ def main(steps: int = 200) -> None:
 
     # One object holds everything. project=True moves the atoms onto the TIP3P geometry.
     held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    thermalize_momenta(atoms, 300, rng=np.random.default_rng(2))
+    draw_velocities(atoms, 300, rng=np.random.default_rng(2))
     print(held.report(atoms), "\n")
 
     dynamics = VelocityVerlet(atoms, 2 * units.fs)

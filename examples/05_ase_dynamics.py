@@ -20,10 +20,9 @@ from ase.md.andersen import Andersen
 from ase.md.bussi import Bussi
 from ase.md.langevin import Langevin
 from ase.md.md import MolecularDynamics
-from ase.md.velocitydistribution import thermalize_momenta
 from ase.md.verlet import VelocityVerlet
 
-from kcons.ase import ConstrainedDynamics, constrain, rigid_water
+from kcons.ase import ConstrainedDynamics, constrain, draw_velocities, rigid_water
 from kcons.comparison import environment, scripts
 from kcons.constraints import Distance
 from kcons.steppers import BlanesMoan4, BlanesMoan6, KahanLi6, Rattle, Stepper, Suzuki4
@@ -57,7 +56,7 @@ def waters(n: int, spacing: float, *, hold: bool = True, periodic: bool = False)
         atoms.pbc = True
     if hold:
         constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
-    thermalize_momenta(atoms, 300, rng=rng)
+    draw_velocities(atoms, 300, rng=rng)
     return atoms
 
 
@@ -71,7 +70,7 @@ def dumbbells(n: int, side: float = 60.0) -> Atoms:
     x[1::2] = x[0::2] + axis
     atoms = Atoms("CO" * n, positions=x, cell=[side] * 3, pbc=True, calculator=Free())
     constrain(atoms, Distance(np.arange(2 * n).reshape(-1, 2)))
-    thermalize_momenta(atoms, 300, rng=rng)
+    draw_velocities(atoms, 300, rng=rng)
     return atoms
 
 
@@ -87,7 +86,7 @@ def far_from_the_origin(steps: int) -> list[dict]:
             for dynamics in (VelocityVerlet, ConstrainedDynamics):
                 atoms = Atoms("CO", positions=np.array([[0, 0, 0], [1.1, 0, 0]]) + distance, calculator=Free())
                 constrain(atoms, Distance([0, 1]))
-                thermalize_momenta(atoms, 300, rng=np.random.default_rng(3))
+                draw_velocities(atoms, 300, rng=np.random.default_rng(3))
                 before = atoms.get_kinetic_energy()
                 dynamics(atoms, timestep * FS).run(steps)
                 change.append(abs(atoms.get_kinetic_energy() / before - 1))
@@ -113,7 +112,7 @@ def ethanol() -> tuple[Atoms, Callable[[], Calculator], str]:
     hydrogen, heavy = np.flatnonzero(atoms.numbers == 1), np.flatnonzero(atoms.numbers != 1)
     nearest = heavy[np.argmin(atoms.get_all_distances()[np.ix_(hydrogen, heavy)], axis=1)]
     constrain(atoms, Distance(np.stack([nearest, hydrogen], axis=1)))
-    thermalize_momenta(atoms, temperature, rng=np.random.default_rng(0))
+    draw_velocities(atoms, temperature, rng=np.random.default_rng(0))
     return atoms, calculator, name
 
 

@@ -315,14 +315,14 @@ def jobs(full: bool) -> dict[str, Callable[[], dict[str, Any]]]:
     """What there is to run, by name."""
     found: dict[str, Callable[[], dict[str, Any]]] = {}
     for which in range(len(FLUIDS)) if full else (1,):
-        name, steps = NAMES[which], STEPS[which] if full else 4000
-        moves = partial(metropolis, which, 600_000 if full else 20_000)
+        name, steps = NAMES[which], STEPS[which] if full else 1500
+        moves = partial(metropolis, which, 600_000 if full else 8_000)
         found[f"Metropolis, {name}"] = partial(timed, "metropolis", moves)
         for thermostat in ("g - 1", "g", "Langevin"):
             taken = steps // 3 if thermostat == "Langevin" else steps
             found[f"{thermostat}, {name}"] = partial(timed, "runs", partial(sampled, which, thermostat, taken))
     for convention in ("g - 1", "g"):
-        found[f"{convention}, trap"] = partial(timed, "trap", partial(trap, convention, 800_000 if full else 4000))
+        found[f"{convention}, trap"] = partial(timed, "trap", partial(trap, convention, 800_000 if full else 1500))
     if full:
         for name in MOLECULES:
             for kind in ("Nose-Hoover", "Langevin"):

@@ -74,8 +74,8 @@ def of_rounding(full: bool) -> dict:
     found = {}
     for name, stepper in ROUNDING.items():
         points = []
-        for steps in np.unique(np.geomspace(64, 400_000 if full else 4_000, 13 if full else 7).astype(int)):
-            if steps * stepper.force_evaluations > (600_000 if full else 20_000):
+        for steps in np.unique(np.geomspace(64, 400_000 if full else 2_000, 13 if full else 6).astype(int)):
+            if steps * stepper.force_evaluations > (600_000 if full else 8_000):
                 continue
             end = run(
                 system,

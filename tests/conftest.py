@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import locale
 import os
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import hypothesis
 import pytest
@@ -42,11 +45,29 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """What was collected stays to the end: no search through all objects has to see it."""
+    """What was collected stays to the end: no search through all objects has to see it, and searches are few."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def pytest_runtest_setup() -> None:
-    """The Fourier transforms of OpenMM's OpenCL (VkFFT) leave the process in the C locale, in which texts are ASCII."""
+    # The Fourier transforms of OpenMM's OpenCL (VkFFT) leave the process in the C locale, in which texts are ASCII.
     locale.setlocale(locale.LC_ALL, LOCALE)
+    if "openmm.app" in sys.modules:
+        read_force_fields_once(sys.modules["openmm.app"])
+
+
+def read_force_fields_once(app: ModuleType) -> None:
+    """Those that come with OpenMM: a second each, of many tests. Files of a test are read by it."""
+    force_field = app.ForceField
+    if not isinstance(force_field, type):
+        return  # done
+    once = functools.cache(force_field)
+    data = Path(app.__file__).parent / "data"
+
+    def read(*files: object) -> object:
+        own = all(isinstance(file, str) and (data / file).is_file() for file in files)
+        return (once if own else force_field)(*files)
+
+    app.ForceField = read  # type: ignore[attr-defined]

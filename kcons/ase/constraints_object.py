@@ -10,7 +10,7 @@ from typing import Any, Literal
 import ase.constraints
 import numpy as np
 from ase import Atoms
-from ase.constraints.constraint import FixConstraint
+from ase.constraints import FixConstraint
 
 import kcons.constraints as families
 from kcons.ase.binding import Binding, applied_forces, bind, check_company, touched_atoms

@@ -208,7 +208,7 @@ class ConstrainedDynamics(MolecularDynamics):
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
         if after.barostat is not None:
-            self._cell = _cell_of(self.atoms)
+            self._cell = _surroundings(self.atoms)
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
@@ -242,7 +242,7 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        cell = _cell_of(atoms)
+        cell = _surroundings(atoms)
         same = unmoved = last is not None and cell == self._cell
         if last is not None and same:
             if _plain(x) and _plain(p):
@@ -287,7 +287,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._momenta, _ = self._put(x, v)
         self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-        self._cell = _cell_of(self.atoms)
+        self._cell = _surroundings(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
@@ -357,8 +357,9 @@ def name_step(error: BaseException, number: int) -> None:
         error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
 
-def _cell_of(atoms: Atoms) -> bytes:
-    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes())
+def _surroundings(atoms: Atoms) -> bytes:
+    """The cell, and whose forces were last asked for: with another calculator they are others."""
+    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes() + id(atoms.calc).to_bytes(8, "little"))
 
 
 def _plain(values: Any) -> bool:

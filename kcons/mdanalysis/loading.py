@@ -43,14 +43,19 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def _failing_quietly() -> Iterator[None]:
-    """A reader that could not open its file also fails when it is deleted; once is enough."""
+def _failing_quietly() -> Iterator[list[str]]:
+    """A reader that could not open its file also fails when it is deleted; once is enough.
+
+    The list takes what failed. Only then is there such a reader, and it is looked for.
+    """
     hook = sys.unraisablehook
+    failures: list[str] = []
     sys.unraisablehook = lambda unraisable: None
     try:
-        yield
+        yield failures
     finally:
-        gc.collect()
+        if failures:
+            gc.collect()
         sys.unraisablehook = hook
 
 
@@ -76,18 +81,17 @@ def open_universe(topology: str | Path, trajectory: str | Path | None = None, **
     for path, what in ((topology, "topology"), (trajectory, "trajectory")):
         if path is not None:
             _look_at(Path(path), what)
-    failure = None
-    with quiet(), _failing_quietly():
+    with quiet(), _failing_quietly() as failures:
         try:
             # Without a format, MDAnalysis asks every package it can convert from whether a path is an object of its
             # own, which imports OpenMM with all its platforms: 80 MB, 70 of them the compiler of an OpenCL platform.
             universe = MDAnalysis.Universe(str(topology), **{"topology_format": guess_format(str(topology))} | options)
         except READ_ERRORS as error:
-            failure = _first_line(error)
-    if failure is not None:
+            failures.append(_first_line(error))
+    if failures:
         raise InputError(
-            f"{topology}: MDAnalysis cannot read this topology ({failure}); give a file such as PSF, PRMTOP, TPR, GRO, "
-            "PDB or mmCIF",
+            f"{topology}: MDAnalysis cannot read this topology ({failures[0]}); give a file such as PSF, PRMTOP, TPR, "
+            "GRO, PDB or mmCIF",
             item="topology",
         )
     if trajectory is not None:
@@ -106,16 +110,15 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
         A trajectory that is empty, or begins as it should and cannot be read.
     """
     _look_at(Path(trajectory), "trajectory")
-    failure = None
-    with quiet(), _failing_quietly():
+    with quiet(), _failing_quietly() as failures:
         try:
             universe.load_new(str(trajectory), format=guess_format(str(trajectory)))
             # Some readers look at the file only now.
             n_frames = universe.trajectory.n_frames
         except READ_ERRORS as error:
-            failure = _first_line(error)
+            failures.append(_first_line(error))
             text = str(error)
-    if failure is None:
+    if not failures:
         if not n_frames:
             raise UnreadableError(f"{trajectory} has no whole frame; was it cut off?", item="trajectory")
         return
@@ -134,7 +137,7 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
     # A file that begins as it should was cut off, or damaged later.
     kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
     raise kind(
-        f"{trajectory}: MDAnalysis cannot read this trajectory ({failure if text else 'no message'}); {advice}",
+        f"{trajectory}: MDAnalysis cannot read this trajectory ({failures[0] if text else 'no message'}); {advice}",
         item="trajectory",
     )
 
@@ -168,9 +171,10 @@ def _first_line(error: BaseException) -> str:
 
 def _stored_atoms(path: Path) -> int | None:
     """Number of atoms that a trajectory says it has."""
-    with quiet(), _failing_quietly():
+    with quiet(), _failing_quietly() as failures:
         try:
             reader = MDAnalysis.coordinates.core.get_reader_for(str(path), format=guess_format(str(path)))
             return int(reader.parse_n_atoms(str(path)))
-        except (*READ_ERRORS, NotImplementedError, AttributeError):
+        except (*READ_ERRORS, NotImplementedError, AttributeError) as error:
+            failures.append(_first_line(error))
             return None

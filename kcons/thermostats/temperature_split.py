@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import as_array
+from kcons.constraints.arguments import as_array, generator_of, whole_number
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
@@ -231,11 +231,12 @@ class TemperatureSplit:
             raise UnsupportedError("configurations have a temperature where rows hold positions, not velocities only")
         if displacement is not None:
             positive(displacement, "displacement")
-        if directions < 1:
-            raise InputError(f"directions is {directions}; give 1 or more", item="directions")
-        self._system, self._displacement, self._directions = system, displacement, directions
+        if groups is not None and not isinstance(groups, Mapping):
+            raise InputError(f"groups is {groups!r}; give a mapping of names to atoms", item="groups")
+        self._system, self._displacement = system, displacement
+        self._directions = whole_number(directions, "directions")
         self._groups = {name: atom_numbers(atoms, system.n_atoms) for name, atoms in (groups or {}).items()}
-        self._rng = np.random.default_rng(seed)
+        self._rng = generator_of(seed, "seed")
         self._clusters: Clusters | None = None
         #: Clusters with motions besides shifts and turns; known after the first draw.
         self._rest: NDArray[np.bool_] | None = None

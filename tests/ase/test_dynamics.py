@@ -27,7 +27,14 @@ from ase_systems import (
     water,
 )
 
-from kcons.ase import ConstrainedDynamics, Constraints, IsokineticDynamics, constrain
+from kcons.ase import (
+    ConstrainedDynamics,
+    ConstrainedLangevin,
+    ConstrainedMonteCarlo,
+    Constraints,
+    IsokineticDynamics,
+    constrain,
+)
 from kcons.constraints import Distance, FixedAtoms, KnifeEdge, LinearVelocity
 from kcons.errors import InputError, UnsupportedError
 from kcons.steppers import Geodesic, ProjectedVerlet, Rattle, Suzuki4
@@ -377,6 +384,36 @@ def test_masses_changed_between_steps_are_taken():
     atoms.set_momenta(atoms.get_momenta())
     dyn.run(5)
     assert off(atoms, held) <= 1e-13
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda atoms: ConstrainedDynamics(atoms, FS),
+        lambda atoms: ConstrainedLangevin(atoms, FS, 300, 0.01 / FS, rng=1),
+        lambda atoms: ConstrainedMonteCarlo(atoms, 0.1 * FS, 300, 3, rng=1),
+    ],
+    ids=["constant energy", "langevin", "monte carlo"],
+)
+def test_another_calculator_gives_other_forces(made):
+    """At once: a step begins with forces, and a proposal with an energy, that are known from before."""
+    atoms, _ = water()
+    atoms.calc = Field(0.05)
+    dyn = made(atoms)
+    dyn.run(2)
+    before = dyn.state.copied()
+    atoms.calc = Field(5.0)
+    dyn.run(1)
+    again, _ = water()
+    again.positions, again.calc = before.positions, Field(5.0)
+    other = made(again)
+    thermostat = before.thermostat if before.thermostat is None else before.thermostat.copy()
+    if isinstance(dyn, ConstrainedMonteCarlo):
+        thermostat[0] = np.nan  # the energy
+    other._resume(replace(before, forces=None, thermostat=thermostat))
+    other.run(1)
+    for one, two in zip(state(atoms), state(again), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-12)
 
 
 # -- time steps -------------------------------------------------------------------------------------

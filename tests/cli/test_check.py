@@ -2,17 +2,22 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import water_files as files
+from shell_commands import shell
 
 from kcons.cli.main import main
 from kcons.mdanalysis.check import report
 
 N = 20
+OPTIONS = ["--constrain", "none", "--no-rank"]
+IMPORTED = ("kcons.cli.main", "kcons.mdanalysis.check.report", "matplotlib.backends.backend_agg", "rich.table")
+PLAIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
 
 
 @pytest.fixture(scope="module")
@@ -172,24 +177,38 @@ def test_the_usual_folder_is_no_link(folder, tmp_path, monkeypatch, capsys):
 # -- terminals --------------------------------------------------------------------------------------
 
 
-def process(folder, name, tail="", **variables):
-    """`kcons check` in a shell: status of the check, what came out at the end of the pipe, and of errors."""
-    words = [sys.executable, "-m", "kcons", "check", folder / name, "--topology", folder / "t.gro"]
-    line = " ".join(map(str, [*words, "--constrain none --no-rank --out", folder / f"out-{name}"]))
+def words_of(folder, name):
+    return ["check", folder / name, "--topology", folder / "t.gro", *OPTIONS, "--out", folder / f"out-{name}"]
+
+
+def command_in_shell(folder, name, where="", **options):
+    """Status of the check, what came out at the end of the pipe, and of errors."""
+    done = shell(*words_of(folder, name), where=where, modules=IMPORTED, **options)
+    return done.status, done.out, done.errors
+
+
+def test_in_a_process_of_its_own(folder):
+    """Where nothing is imported when its streams are made."""
+    found, out, errors = command_in_shell(folder, "bad.xtc", **PLAIN)
     done = subprocess.run(
-        ["bash", "-c", f"{line} {tail}; exit ${{PIPESTATUS[0]}}"],
+        [sys.executable, "-m", "kcons", *map(str, words_of(folder, "bad.xtc"))],
         capture_output=True,
-        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHONUTF8")} | variables,
+        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHONUTF8")} | PLAIN,
     )
-    return done.returncode, done.stdout, done.stderr.decode(errors="replace")
+    assert (done.returncode, done.stderr) == (found, errors.encode()) == (1, b"")
+    assert times(done.stdout) == times(out)
+
+
+def times(page):
+    """A page without what is measured."""
+    return re.sub(rb"[0-9.]+ s\b", b"s", page)
 
 
 @pytest.mark.parametrize(
     "name,status,buffered", [("good.trr", 0, "1"), ("bad.xtc", 1, ""), ("short.xtc", 3, ""), ("none.xtc", 2, "")]
 )
 def test_in_a_c_locale(folder, name, status, buffered):
-    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii", "PYTHONUNBUFFERED": buffered}
-    found, out, errors = process(folder, name, **plain)
+    found, out, errors = command_in_shell(folder, name, **PLAIN, PYTHONUNBUFFERED=buffered)
     assert found == status and "Traceback" not in errors
     out.decode("ascii")
     if status != 2:
@@ -200,30 +219,30 @@ def test_in_a_c_locale(folder, name, status, buffered):
 
 
 @pytest.mark.parametrize(
-    "name,status,buffered,tail",
+    "name,status,buffered,where,errors_too",
     [
-        ("good.trr", 0, "", "| head -1"),
-        ("good.trr", 0, "1", "| head -1"),
-        ("bad.xtc", 1, "1", "| true"),
-        ("short.xtc", 3, "", "2>&1 | head -c 0"),
-        ("good.trr", 0, "", ">&-"),
+        ("good.trr", 0, "", "| head -1", False),
+        ("good.trr", 0, "1", "| head -1", False),
+        ("bad.xtc", 1, "1", "| true", False),
+        ("short.xtc", 3, "", "| head -c 0", True),
+        ("good.trr", 0, "", "closed", False),
     ],
 )
-def test_into_a_pipe_that_nobody_reads(folder, name, status, buffered, tail):
+def test_into_a_pipe_that_nobody_reads(folder, name, status, buffered, where, errors_too):
     json_file = folder / f"out-{name}" / "check.json"
     json_file.unlink(missing_ok=True)
     for other in ("check.png", "check.txt"):
         (folder / f"out-{name}" / other).unlink(missing_ok=True)
-    found, out, errors = process(folder, name, tail, PYTHONUNBUFFERED=buffered)
+    found, out, errors = command_in_shell(folder, name, where, errors_too=errors_too, PYTHONUNBUFFERED=buffered)
     assert found == status and not errors
-    assert out.count(b"\n") == (1 if "-1" in tail else 0)
+    assert out.count(b"\n") == (1 if "-1" in where else 0)
     assert json.loads(json_file.read_text(encoding="utf-8"))["status"] in ("kept", "violated", "incomplete")
 
 
 def test_a_full_device_is_said_and_the_files_are_there(folder):
     if not os.path.exists("/dev/full"):
         pytest.skip("needs /dev/full")
-    found, _, errors = process(folder, "good.trr", "> /dev/full")
+    found, _, errors = command_in_shell(folder, "good.trr", "/dev/full")
     assert found == 2 and "No space left" in errors and "Traceback" not in errors and "Exception" not in errors
 
 

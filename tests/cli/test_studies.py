@@ -30,7 +30,7 @@ def test_stability(tmp_path, capsys, monkeypatch):
 def test_how_long_the_step_may_be(tmp_path, monkeypatch, capsys):
     """A fluid with near molecules inside; a table, and files."""
     monkeypatch.chdir(tmp_path)
-    command = "compare thermostat-water --quick --fast 3.8 --methods spheres --dt 4 --budget 2 --out found"
+    command = "compare thermostat-water --quick --fast 3.8 --methods spheres --dt 4 --budget 0.3 --out found"
     assert main.main(command.split()) == 0
     assert "isokinetic spheres" in capsys.readouterr().out
     data = json.loads((tmp_path / "found" / "compare.json").read_text(encoding="utf-8"))

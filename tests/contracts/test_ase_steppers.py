@@ -101,7 +101,7 @@ def final(case, by, n) -> np.ndarray:
 
 @cache
 def exact(case) -> np.ndarray:
-    return final(case, KahanLi6() if case is skate_case else BlanesMoan6(), 48)
+    return final(case, KahanLi6(), 24) if case is skate_case else final(case, BlanesMoan6(), 48)
 
 
 def errors(case, stepper, numbers) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import importlib.util
 import re
@@ -50,10 +51,15 @@ def test_folders_are_small():
     assert large <= CATALOGUES
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports_of(path: Path, names: set[str]) -> set[str]:
     """Modules of the package that a file imports, inside functions and for types as well."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "kcons":
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
@@ -152,7 +158,7 @@ def sizes(path: Path) -> dict[str, int]:
                     found[f"{place}: parameters of {name}"] = (count, PARAMETERS)
             look(inner, name)
 
-    look(ast.parse(text), "")
+    look(parsed(path), "")
     return {name: size for name, (size, most) in found.items() if size > most}
 
 

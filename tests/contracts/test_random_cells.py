@@ -17,13 +17,14 @@ from cell_worlds import world
 from kcons import Motion
 from kcons.errors import ConvergenceError
 
-FAST = 150
+#: Some of those of the long run; in the last an atom of a pair is fixed, which is rare.
+FAST = (*range(90), 144)
 
 
 def test_a_share_of_the_cases():
-    found = random_cells.summary([judge(seed) for seed in range(FAST)])
+    found = random_cells.summary([judge(seed) for seed in FAST])
     assert found["faults"] == {}
-    assert found["outcomes"]["right"] > 0.8 * FAST
+    assert found["outcomes"]["right"] > 0.8 * len(FAST)
     assert set(found["kinds"]) == set(KINDS)
     assert found["features"]["longer than the cell"]["right"] > 3
     assert found["features"]["drifting"]["refused"] > 0

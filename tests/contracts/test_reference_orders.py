@@ -84,6 +84,7 @@ LONG = {
     ("A08_bead_rotating_hoop", "Suzuki4()"),
     ("A08_torus_geodesic", "Suzuki4()"),
     ("A08_torus_inner_equator", "Suzuki4()"),
+    ("A09_catenary_relax", "KahanLi6()"),
     ("A09_hanging_chain5_3d", "BlanesMoan4()"),
     ("A09_ring6_planar", "KahanLi6()"),
     ("A10_isokinetic_dumbbell_quartic", "KahanLi6()"),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 import runpy
+from contextlib import chdir, redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 
 import matplotlib
@@ -16,30 +19,32 @@ FOLDER = Path(__file__).parents[2] / "examples" / "notes"
 SCRIPTS = [f"figure_{k:02d}" for k in range(1, 12)] + [f"example_{k}" for k in range(1, 6)]
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Runs a script in a folder of its own: its names, and what it said."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Runs a script once, in a folder for all: its names, what it said, and the folder."""
     before = matplotlib.get_backend()
     matplotlib.use("Agg")
+    folder = tmp_path_factory.mktemp("notes")
 
+    @cache
     def one(name):
-        names = runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
-        return names, capsys.readouterr().out
+        with chdir(folder), redirect_stdout(StringIO()) as out:
+            names = runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
+        plt.close("all")
+        return names, out.getvalue(), folder
 
     yield one
-    plt.close("all")
     matplotlib.use(before)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_script_draws_its_figure(name, run, tmp_path):
-    names, out = run(name)
+def test_script_draws_its_figure(name, run):
+    names, out, folder = run(name)
     assert out.strip()
-    picture = matplotlib.image.imread(tmp_path / f"{name}.png")
+    picture = matplotlib.image.imread(folder / f"{name}.png")
     assert picture.shape[0] > 200
     assert np.ptp(picture[..., :3]) > 0.5
-    assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
     check_labels(names["fig"])
     check_legends(names["fig"])
 
@@ -73,7 +78,7 @@ def check_legends(figure):
 
 
 def test_example_1_says_what_is_so(run):
-    names, out = run("example_1")
+    names, out, _ = run("example_1")
     omega, form = names["omega"], names["form"]
     assert np.array_equal(np.diag(form.J), [-1j * omega, 1j * omega])  # (16), (17)
     assert np.array_equal(form.T, [[1j, -1j], [1, 1]])
@@ -86,7 +91,7 @@ def test_example_1_says_what_is_so(run):
 
 
 def test_figure_11_starts_where_the_text_of_the_notes_holds(run):
-    _, out = run("figure_11")
+    _, out, _ = run("figure_11")
     largest = [float(line.split("half the time ")[1].split(";")[0]) for line in out.splitlines()]
     # (c) a tenth below (a), as the docstring has them, and (b) on its way to rest.
     assert largest[0] == pytest.approx(0.783, abs=2e-3)

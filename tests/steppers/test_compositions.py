@@ -13,8 +13,8 @@ from kcons.steppers import Composition, KahanLi6, Rattle, Suzuki4, Yoshida4, run
 from kcons.steppers.compositions import KAHAN_LI_6, SUZUKI_4, YOSHIDA_4
 
 #: Coarser with velocity rows, where a projection takes ten milliseconds.
-STEPS = {4: [16, 24, 32], 6: [8, 12, 16]}
-COARSE = {4: [8, 12, 16], 6: [4, 6, 8]}
+STEPS = {4: [16, 32], 6: [8, 16]}
+COARSE = {4: [8, 16], 6: [4, 8]}
 COMPOSITIONS = pytest.mark.parametrize("stepper", [Yoshida4(), Suzuki4(), KahanLi6()], ids=repr)
 
 

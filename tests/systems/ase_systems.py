@@ -12,9 +12,8 @@ from ase.build import molecule
 from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.tip3p import TIP3P
-from ase.md.velocitydistribution import thermalize_momenta
 
-from kcons.ase import Constraints, constrain, rigid_water
+from kcons.ase import Constraints, constrain, draw_velocities, rigid_water
 from kcons.constraints import Angle, Distance
 from kcons.solvers.kernels.groups_of_eight import POSITION_TOLERANCE
 
@@ -75,7 +74,7 @@ def rigid(n=2, seed=0, temperature=300.0) -> tuple[Atoms, Constraints]:
     atoms = loose_waters(n, seed)
     held = constrain(atoms, rigid_water(atoms, "tip3p"), project=True)
     if temperature:
-        thermalize_momenta(atoms, temperature, rng=random(seed))
+        draw_velocities(atoms, temperature, rng=random(seed))
     atoms.calc = TIP3P(rc=6.0)
     return atoms, held
 
@@ -86,7 +85,7 @@ def water(calc=None, temperature=300.0, at=0.0) -> tuple[Atoms, Constraints]:
     atoms.positions += at
     atoms.calc = Field() if calc is None else calc
     held = constrain(atoms, rigid_water(atoms))
-    thermalize_momenta(atoms, temperature, rng=random(3))
+    draw_velocities(atoms, temperature, rng=random(3))
     return atoms, held
 
 
@@ -110,7 +109,7 @@ def dumbbells(n=60, seed=0, side=60.0) -> tuple[Atoms, Constraints]:
     x[1::2] = x[0::2] + axis
     atoms = Atoms("CO" * n, positions=x, cell=[side] * 3, pbc=True, calculator=Free())
     held = constrain(atoms, Distance(np.arange(2 * n).reshape(-1, 2)))
-    thermalize_momenta(atoms, TEMPERATURE, rng=rng)
+    draw_velocities(atoms, TEMPERATURE, rng=rng)
     return atoms, held
 
 

@@ -331,6 +331,9 @@ def test_bad_input():
     for options, text in (
         ({"displacement": 0.0}, "displacement"),
         ({"directions": 0}, "directions"),
+        ({"directions": 1.5}, "directions"),
+        ({"seed": "x"}, "seed"),
+        ({"groups": [[0, 1]]}, "groups"),
         ({"groups": {"far": [99]}}, "atoms must be"),
     ):
         with pytest.raises(InputError, match=text):

@@ -7,11 +7,14 @@ import hashlib
 import os
 import platform
 import subprocess
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import llvmlite.binding
 
 import kcons
 from kcons import __version__
@@ -35,6 +38,7 @@ def environment() -> dict[str, Any]:
             versions[name] = None
     return {
         "cpu": processor(),
+        "simd": simd_width(),
         "cores": os.cpu_count(),
         "threads": 1,
         "system": f"{platform.system()} {platform.machine()}",
@@ -62,6 +66,13 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def simd_width() -> int:
+    """Bits of the widest registers that the processor computes with in one instruction; 64 where none is known."""
+    features = llvmlite.binding.get_host_cpu_features()
+    widths = (("avx512f", 512), ("avx2", 256), ("sse2", 128), ("neon", 128))
+    return next((bits for name, bits in widths if features.get(name)), 64)
+
+
 def _commit() -> str | None:
     """Commit of the checkout this file belongs to, with '+' if it was changed since; None outside of one."""
 
@@ -87,11 +98,14 @@ def code_digest() -> str:
 
     Names of files, import statements, documentation and layout do not count, so that moving code makes nothing stale.
     """
-    found = []
-    for path in PACKAGE.rglob("*.py"):
-        tree = _Bare().visit(ast.parse(path.read_bytes()))
-        found += [hashlib.sha256(ast.unparse(part).encode()).digest() for part in tree.body]
+    found = pieces(path.read_bytes() for path in PACKAGE.rglob("*.py"))
     return hashlib.sha256(b"".join(sorted(found))).hexdigest()[:12]
+
+
+def pieces(sources: Iterable[bytes]) -> list[bytes]:
+    """A hash for each definition and statement of modules, by what it does."""
+    trees = (_Bare().visit(ast.parse(source)) for source in sources)
+    return [hashlib.sha256(ast.unparse(part).encode()).digest() for tree in trees for part in tree.body]
 
 
 class _Bare(ast.NodeTransformer):

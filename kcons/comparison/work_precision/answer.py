@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -131,6 +131,9 @@ def answer(comparison: Comparison, criterion: Criterion = "error", limit: float 
 def answer_of_averages(comparison: SamplingComparison, limit: float | None = None) -> Answer | None:
     """Rank thermostats: who is soonest at a known temperature, where the configurations have the right one.
 
+    A deviation counts with twice its standard error. Where all ran at one step, they are ranked by it instead, and
+    share a place where these intervals overlap.
+
     Parameters
     ----------
     comparison : SamplingComparison
@@ -139,12 +142,21 @@ def answer_of_averages(comparison: SamplingComparison, limit: float | None = Non
     """
     unit = comparison.scene["units"]["time"]
     pointed = [
-        Point(m.method, m.title, f"{m.setting:.4g} {unit}", abs(m.temperature_error), m.seconds_to_goal)
+        Point(
+            m.method,
+            m.title,
+            f"{m.setting:.4g} {unit}",
+            abs(m.temperature_error) + 2 * (m.temperature_standard_error or 0.0),
+            m.seconds_to_goal,
+        )
         for m in comparison.measurements
         if m.status == "ok" and m.temperature_error is not None and m.seconds_to_goal
     ]
     if not pointed:
         return None
+    if limit is None and len({point.setting for point in pointed}) == 1 < len(pointed):
+        errors = {m.method: m.temperature_standard_error or 0.0 for m in comparison.measurements}
+        return _at_one_step(pointed, errors)
     is_usual = "usual" if limit is None else "asked for"
     # Times to a goal follow from correlation times, which are known to a third.
     found = _ranked(pointed, USUAL_TEMPERATURE if limit is None else limit, 1 / 3)
@@ -156,6 +168,22 @@ def answer_of_averages(comparison: SamplingComparison, limit: float | None = Non
         cost="wall time until that temperature is known to 1 %",
         seconds=True,
     )
+
+
+def _at_one_step(points: Sequence[Point], errors: Mapping[str, float]) -> Answer:
+    """Thermostats by the deviation of the temperature: between the value of a point and four standard errors less."""
+    ranked: list[Ranked] = []
+    leader = 0.0
+    for number, point in enumerate(sorted(points, key=lambda p: p.value), 1):
+        tied = bool(ranked) and point.value - 4 * errors[point.method] <= leader
+        leader = leader if tied else point.value
+        place = ranked[-1].place if tied else number
+        ranked.append(Ranked(place, point, point.value / (ranked[0].point.value if ranked else point.value)))
+    what, cost = (
+        "a deviation of the temperature of the configurations",
+        "wall time until that temperature is known to 1 %",
+    )
+    return Answer(what, "of it", math.inf, "", cost, True, 0.0, ranked, [])
 
 
 def _value(m: Measurement, criterion: Criterion) -> float | None:
@@ -205,6 +233,11 @@ def _ranked(points: Sequence[Point], limit: float, margin: float) -> Answer:
 
 def sentence(found: Answer) -> str:
     """The answer in one sentence."""
+    if math.isinf(found.limit):
+        first, *others = [r.point for r in found.ranked if r.place == 1]
+        near = f"; within the errors as good: {', '.join(point.title for point in others)}" if others else ""
+        off = f"the temperature of its configurations is off by {first.value:.2g} of it at most"
+        return f"At {first.setting} use {first.title}: {off}{near}."
     limit = f"{found.what} of at most {found.limit:.2g} {found.unit} ({found.limit_is})"
     if not found.ranked:
         best = found.beyond[0]
@@ -239,7 +272,13 @@ def ranking(found: Answer) -> Table:
 def text(found: Answer) -> str:
     """Sentence, ranking, and who is not in it."""
     lines = [sentence(found), ""]
-    if found.ranked:
+    if math.isinf(found.limit):
+        lines += [plain_text(ranking(found)), ""]
+        lines += [
+            "deviation: with twice its standard error, which longer runs (--budget) make smaller; times: of the least."
+        ]
+        lines += [f"=: the intervals overlap. cost: {found.cost}."]
+    elif found.ranked:
         lines += [plain_text(ranking(found)), ""]
         lines += [f"cost: {found.cost}; =: equal within {100 * found.margin:.0f} %, which is how well costs repeat."]
     if found.beyond:

@@ -375,7 +375,8 @@ def _tree(
     _, first = np.unique(pair[order, 0] * n_atoms + pair[order, 1], return_index=True)
     chosen = order[np.sort(first)]
     ranks = np.arange(1.0, len(chosen) + 1)
-    graph = sp.csr_array((ranks, (pair[chosen, 0], pair[chosen, 1])), shape=(n_atoms, n_atoms))
+    ends = pair[chosen].T.astype(np.int32)  # older SciPy makes no tree of wider indices
+    graph = sp.csr_array((ranks, (ends[0], ends[1])), shape=(n_atoms, n_atoms))
     forest = minimum_spanning_tree(graph).tocoo()
     link = chosen[np.asarray(forest.data, dtype=np.int64) - 1]
     if np.any(length[link] >= half_width):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -21,16 +22,34 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.free_energy.windows.window import Sampler, Settings
 
-#: Tables of a plan and their keys.
-TABLES = {
-    "structure": ("file", "count_from"),
-    "forces": ("calculator", "settings", "system", "platform", "properties"),
-    "coordinate": ("name", "distance", "angle", "dihedral", "from", "to", "windows", "values"),
-    "held": ("constrain", "fixed", "distances"),
-    "sampling": (*(f.name for f in fields(Settings)), "both_sides", "approach", "seed"),
-    "improve": ("error", "most", "at_once"),
-    "pulls": ("from", "to", "count", "steps", "both_ways"),
-    "workers": ("processes", "scheduler"),
+#: Tables of a plan, and what the values of their keys are.
+TABLES: dict[str, dict[str, str]] = {
+    "structure": {"file": "a text", "count_from": "a whole number"},
+    "forces": {
+        **dict.fromkeys(("calculator", "system", "platform"), "a text"),
+        **dict.fromkeys(("settings", "properties"), "a table"),
+    },
+    "coordinate": {
+        "name": "a text",
+        **dict.fromkeys(("distance", "angle", "dihedral"), "whole numbers"),
+        **dict.fromkeys(("from", "to"), "a number"),
+        "windows": "a whole number above 0",
+        "values": "numbers",
+    },
+    "held": {"constrain": "a text", "fixed": "whole numbers", "distances": "pairs of whole numbers"},
+    # What there is more to say of settings, they say themselves.
+    "sampling": {**dict.fromkeys((f.name for f in fields(Settings)), ""), "both_sides": "true or false"}
+    | {"approach": "", "seed": ""},
+    "improve": {
+        **dict.fromkeys(("error", "below"), "a number above 0"),
+        **dict.fromkeys(("most", "at_once"), "a whole number above 0"),
+    },
+    "pulls": {
+        **dict.fromkeys(("from", "to"), "a number, or numbers"),
+        **dict.fromkeys(("count", "steps"), ""),
+        "both_ways": "true or false",
+    },
+    "workers": {"processes": "a whole number above 0", "scheduler": "a text"},
 }
 #: Steps of a pull unless they are given.
 _PULL = 20000
@@ -152,6 +171,28 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
                 raise InputError(f"{table} is {entry!r}; write [{table}] and its keys below", item=table)
             for key in entry:
                 _refuse(key, TABLES[table], f"[{table}]")
+                wanted = TABLES[table][key]
+                if not _is(entry[key], wanted):
+                    raise InputError(f"{key} of [{table}] is {entry[key]!r}; give {wanted}", item=key)
+    for key in ("error", "most") if "improve" in data else ():
+        if key not in data["improve"]:
+            raise InputError(f"[improve] has no {key}; give error (kJ/mol) and most, a number of windows", item=key)
+
+
+def _is(value: Any, wanted: str) -> bool:
+    """Whether a value of TOML is what is wanted."""
+    if wanted in ("a text", "a table", "true or false", ""):
+        kind = {"a text": str, "a table": dict, "true or false": bool, "": object}[wanted]
+        return isinstance(value, kind)
+    if wanted == "pairs of whole numbers":
+        return isinstance(value, list) and all(_is(pair, "whole numbers") and len(pair) == 2 for pair in value)
+    if wanted == "a number, or numbers":
+        return _is(value, "a number") or _is(value, "numbers")
+    if wanted.endswith("numbers"):
+        return isinstance(value, list) and bool(value) and all(_is(v, "a " + wanted[:-1]) for v in value)
+    kinds = int if "whole" in wanted else (int, float)
+    number = isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value)
+    return number and (value > 0 or "above 0" not in wanted)
 
 
 def _refuse(key: str, known: Any, where: str) -> None:
@@ -170,12 +211,12 @@ def _coordinate(entry: Mapping[str, Any], first: int) -> tuple[str, Constraint, 
             item="coordinate",
         )
     (family,) = families
-    item = FAMILIES[family]([[int(atom) - first for atom in entry[family]]])
+    item = FAMILIES[family]([[atom - first for atom in entry[family]]])
     if "values" in entry:
         places = np.array(entry["values"], dtype=np.float64)
     elif {"from", "to", "windows"} <= set(entry):
         turn = family == "dihedral" and abs(entry["to"] - entry["from"]) >= 360 - 1e-9
-        places = np.linspace(entry["from"], entry["to"], int(entry["windows"]), endpoint=not turn)
+        places = np.linspace(entry["from"], entry["to"], entry["windows"], endpoint=not turn)
     else:
         raise InputError(f"coordinate {name}: give values, or from, to and windows", item="coordinate")
     if places.ndim != 1 or not len(places):
@@ -232,7 +273,7 @@ def _sampler(data: Mapping[str, Any], folder: Path, coordinates: Mapping[str, Co
     first = structure.get("count_from", 0)
     rows: list[Constraint] = []
     if "fixed" in held:
-        rows.append(FixedAtoms([int(a) - first for a in held["fixed"]]))
+        rows.append(FixedAtoms([atom - first for atom in held["fixed"]]))
     if "distances" in held:
         rows.append(Distance(np.array(held["distances"], dtype=np.int64) - first))
     if "constrain" in held:

@@ -10,8 +10,9 @@ import openmm
 from openmm import app, unit
 
 from kcons.constraints.arguments import finite_number, whole_number
+from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
-from kcons.errors import InputError
+from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
 from kcons.openmm.quantities import masses_of
 from kcons.thermostats.freedom import positive
@@ -43,6 +44,8 @@ def molecular_pressure(
     ------
     InputError
         The System is not periodic; a temperature that is not positive, a strain that is none.
+    UnsupportedError
+        Rows of a part hold several molecules together, or one in space.
     """
     thermal = None if temperature is None else GAS_CONSTANT * positive(kelvins(temperature), "temperature")
     if not 0 < finite_number(strain, "strain") < 1:
@@ -60,14 +63,18 @@ def molecular_pressure(
     for number, members in enumerate(molecules):
         label[list(members)] = number
     n = len(molecules)
+    cells = _cells_to_whole(system, x, box, label)
     # As OpenMM's barostats: the mean of positions, which sites without mass take part in.
-    centres = _sums(x, label, n) / np.bincount(label, minlength=n)[:, None]
+    centres = _sums(x + cells @ box, label, n) / np.bincount(label, minlength=n)[:, None]
+    # Atoms stay in the images that they are stored in.
+    change = centres[label] - cells @ box
     energies = []
     groups = context.getIntegrator().getIntegrationForceGroups()
     try:
         for h in (strain, -strain):
             context.setPeriodicBoxVectors(*((1 + h) * box))
-            context.setPositions(x + h * centres[label])
+            context.setPositions(x + h * change)
+            _require_on_rows(context)
             energies.append(context.getState(energy=True, groups=groups).getPotentialEnergy()._value)
     finally:
         context.setPeriodicBoxVectors(*box)
@@ -126,6 +133,34 @@ class PressureReporter:
         self.values.append(molecular_pressure(simulation.context, self._temperature))
         volume = state.getPeriodicBoxVolume()._value
         print(f"{simulation.currentStep},{volume:.6f},{self.values[-1]:.6g}", file=self._file, flush=True)
+
+
+def _cells_to_whole(system: openmm.System, x: FloatArray, box: FloatArray, label: Any) -> FloatArray:
+    """By how many cells atoms have to be moved so that molecules are in one piece, shape (n, 3)."""
+    inverse = np.linalg.inv(box)
+    share, n = x @ inverse, int(label.max()) + 1
+    high, low = np.full((n, 3), -np.inf), np.full((n, 3), np.inf)
+    np.maximum.at(high, label, share)
+    np.minimum.at(low, label, share)
+    if (high - low < 0.5).all():
+        return np.zeros_like(x)
+    bonds = [system.getConstraintParameters(k)[:2] for k in range(system.getNumConstraints())]
+    for force in system.getForces():
+        if isinstance(force, openmm.HarmonicBondForce | openmm.CustomBondForce):
+            bonds += [force.getBondParameters(k)[:2] for k in range(force.getNumBonds())]
+    tree = spanning_tree(np.array(bonds, dtype=np.int64).reshape(-1, 2), len(x))
+    return np.asarray(np.round((make_whole(x, *tree, np.stack([box, inverse])) - x) @ inverse))
+
+
+def _require_on_rows(context: openmm.Context) -> None:
+    """Refuse rows that molecules leave where they move as wholes."""
+    for part in getattr(getattr(context, "_integrator", None), "parts", ()):
+        miss = part.worst_miss(context, False)
+        if miss is not None:
+            raise UnsupportedError(
+                f"molecules that move as wholes leave row {miss.name}: it holds several together, or one in space. Let "
+                "those that a row joins count as one by hold(system, ..., join=True)"
+            )
 
 
 def _sums(values: FloatArray, label: Any, n: int) -> FloatArray:

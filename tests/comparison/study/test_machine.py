@@ -42,3 +42,14 @@ def test_environment():
     about = machine.environment()
     assert about["cpu"] and about["versions"]["numpy"] and about["threads"] == 1
     assert json.loads(json.dumps(about)) == about
+    assert about["simd"] in (64, 128, 256, 512)
+
+
+def test_simd_width_is_that_of_the_widest_instructions(monkeypatch):
+    known = {"avx512f": True, "avx2": True, "sse2": True}
+    monkeypatch.setattr(machine.llvmlite.binding, "get_host_cpu_features", lambda: known)
+    assert machine.simd_width() == 512
+    known["avx512f"] = False
+    assert machine.simd_width() == 256
+    known.clear()
+    assert machine.simd_width() == 64

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from kcons.comparison.averages.sampling import Sampled, SamplingComparison
 from kcons.comparison.study.tables import plain_text
 from kcons.comparison.work_precision import answer
 from kcons.comparison.work_precision.measurement import Comparison, Measurement
@@ -111,3 +112,59 @@ def test_the_ranking_of_a_committed_run_fits_a_terminal(criterion):
     costs = [r.point.cost for r in found.ranked]
     assert costs == sorted(costs) and found.ranked[0].ratio == 1.0
     assert all(r.point.value <= 1.05 * found.limit for r in found.ranked)
+
+
+# -- temperatures -----------------------------------------------------------------------------------
+
+
+def sampled(method, setting, deviation, error, wall):
+    return Sampled(
+        method,
+        method,
+        setting,
+        "ok",
+        temperature_error=deviation,
+        temperature_standard_error=error,
+        seconds_to_goal=wall,
+    )
+
+
+def fluid(*points):
+    return SamplingComparison({"units": {"time": "τ"}}, {}, {}, {}, list(points))
+
+
+def test_a_deviation_that_is_known_badly_is_not_good_enough():
+    """0.1 % off with an error of 3 %, as short runs have it, says nothing of 1 %."""
+    found = answer.answer_of_averages(
+        fluid(
+            sampled("lucky", 0.02, 0.001, 0.03, 0.1),
+            sampled("known", 0.02, 0.002, 0.002, 5.0),
+            sampled("known", 0.01, 0.0, 0.001, 9.0),
+        )
+    )
+    assert [(r.point.method, r.point.setting) for r in found.ranked] == [("known", "0.02 τ")]
+    assert [point.method for point in found.beyond] == ["lucky"]
+    assert found.ranked[0].point.value == pytest.approx(0.006)
+
+
+def test_at_one_step_the_temperature_itself_decides():
+    found = answer.answer_of_averages(
+        fluid(
+            sampled("cheap", 0.02, -0.05, 0.002, 0.1),
+            sampled("best", 0.02, 0.004, 0.001, 9.0),
+            sampled("near", 0.02, -0.008, 0.002, 1.0),
+        )
+    )
+    assert [(r.place, r.point.method) for r in found.ranked] == [(1, "best"), (1, "near"), (3, "cheap")]
+    assert found.ranked[2].ratio == pytest.approx(0.054 / 0.006)
+    said = answer.text(found)
+    assert said.startswith(
+        "At 0.02 τ use best: the temperature of its configurations is off by 0.006 of it at most; "
+        "within the errors as good: near."
+    )
+    assert "1=  best" in said and "3   cheap" in said
+    assert max(map(len, plain_text(answer.ranking(found)).splitlines())) <= 80
+
+
+def test_one_thermostat_at_one_step_is_judged_by_the_limit():
+    assert answer.answer_of_averages(fluid(sampled("only", 0.02, 0.001, 0.001, 1.0))).limit == 0.01

@@ -43,6 +43,7 @@ seed = 4
 [improve]
 error = 0.5
 most = 20
+below = 40
 
 [workers]
 processes = 3
@@ -66,7 +67,7 @@ def test_a_plan_for_ase(folder):
     assert plan.settings.temperature == 310 and plan.settings.thermostat == "nose-hoover"
     assert plan.settings.production == 20000
     np.testing.assert_allclose(plan.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
-    assert plan.options == {"both_sides": False, "seed": 4} and plan.improve == {"error": 0.5, "most": 20}
+    assert plan.options == {"both_sides": False, "seed": 4} and plan.improve == {"error": 0.5, "most": 20, "below": 40}
     assert plan.processes == 3
     with plan.executor() as executor:
         assert executor is None
@@ -140,6 +141,15 @@ def test_a_plan_for_openmm(folder):
         ("[workers]", "[pulls]\nfrom = [1.0, 2.0]\n[workers]", r"from of \[pulls\] has 2 values.*turn"),
         ("[workers]", "[pulls]\ncount = 4\n[workers]", r"count of \[pulls\] is 4.*5 or more"),
         ("[workers]", "[pulls]\nsteps = 0.5\n[workers]", r"steps of \[pulls\] is 0.5"),
+        ("windows = 12", 'windows = "x"', r"windows of \[coordinate\] is 'x'; give a whole number above 0"),
+        ("windows = 12", "windows = -2", r"windows of \[coordinate\] is -2"),
+        ("dihedral = [2, 0, 1, 3]", "dihedral = [2.5, 0, 1, 3]", "give whole numbers"),
+        ("dihedral = [2, 0, 1, 3]", 'dihedral = "abc"', "give whole numbers"),
+        ("both_sides = false", 'both_sides = "no"', "give true or false"),
+        ("temperature = 310", 'temperature = "x"', "temperature is 'x'"),
+        ("most = 20", "", r"\[improve\] has no most"),
+        ("error = 0.5", 'error = "x"', "give a number above 0"),
+        ("processes = 3", "processes = 0", r"processes of \[workers\] is 0"),
         ("[workers]", "[pull]\ncount = 5\n[workers]", r"unknown key 'pull'; did you mean 'pulls'"),
         (
             "[workers]",

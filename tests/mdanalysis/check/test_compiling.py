@@ -36,17 +36,22 @@ class Compiled(event.Listener):
 compiled, started, run = [], [], subprocess.run
 subprocess.run = lambda *words, **options: started.append(words) or run(*words, **options)
 event.register("numba:compile", Compiled())
-result = check_trajectory(*sys.argv[1:])
-print(json.dumps([compiled, len(started), result.rank, result.series["largest Å"]]))
+for words in json.loads(sys.argv[1]):
+    compiled.clear(), started.clear()
+    result = check_trajectory(*words)
+    print(json.dumps([compiled, len(started), result.rank, result.series["largest Å"]]))
 """
 
 
-def checked(cache, *words):
+def checked(cache, *checks):
+    """What is said of checks, one after another in one process, by the words of each."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-W", "ignore", "-c", CHECK, *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    words = json.dumps([[str(word) for word in check] for check in checks])
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", CHECK, words], capture_output=True, text=True, env=environment
+    )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def test_the_process_that_checks_compiles_nothing(tmp_path):
@@ -54,22 +59,21 @@ def test_the_process_that_checks_compiles_nothing(tmp_path):
     topology = files.topology(tmp_path / "w.gro", N, x[0])
     blocks = files.write(tmp_path / "w.dcd", x)
     moving = files.write(tmp_path / "w.trr", x, velocities=np.ones_like(x))
-    compiled, started, rank, largest = checked(tmp_path, blocks, topology)
-    assert (compiled, started, rank) == ([], 1, 3 * N)
     # Frames one by one, with velocities: other kernels, of which some are there.
-    compiled, started, rank, others = checked(tmp_path, moving, topology)
-    assert (compiled, started, rank) == ([], 1, 3 * N)
-    np.testing.assert_allclose(largest, others, atol=1e-5)
+    first, second = checked(tmp_path, (blocks, topology), (moving, topology))
+    for compiled, started, rank, _ in (first, second):
+        assert (compiled, started, rank) == ([], 1, 3 * N)
+    largest = first[-1]
+    np.testing.assert_allclose(largest, second[-1], atol=1e-5)
     # Nothing is cold any more.
-    again = checked(tmp_path, blocks, topology)
-    assert again == [[], 0, 3 * N, largest]
+    assert checked(tmp_path, (blocks, topology)) == [[[], 0, 3 * N, largest]]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("constrain", ["allbonds", "hangles"])
 def test_nor_where_clusters_are_large(tmp_path, constrain):
     data = pytest.importorskip("MDAnalysisTests.datafiles")
-    compiled, started, rank, _ = checked(tmp_path, data.DCD, data.PSF, constrain)
+    ((compiled, started, rank, _),) = checked(tmp_path, (data.DCD, data.PSF, constrain))
     assert (compiled, started) == ([], 1)
     assert rank > 3000
 

@@ -48,7 +48,7 @@ def waits(integrator, count, steps):
 def test_in_mixed_precision_each_row_waits_once(count, most, platform):
     """And every 64th step twice. On a CPU, which waits for nothing, each push is measured."""
     integrator, context, part = alanine_rows(count, platform)
-    found = waits(integrator, count, 500)
+    found = waits(integrator, count, 192)
     if Precision(*platform.split()[:1], *(platform.split()[1:] or ["double"])).name == "mixed":
         assert found <= most
     else:
@@ -66,7 +66,7 @@ def test_the_motion_is_the_same(platform):
     for sparing in (0.0, 1.0):
         integrator, context, part = alanine_rows(2, platform, sparing=sparing)
         first = total_energy(context)
-        integrator.step(200)
+        integrator.step(100)
         energies.append(total_energy(context) - first)
         ends.append(state_of(context)[0])
         assert np.abs(part.residuals(context)).max() < (1e-12 if precision.name == "double" else 5e-7)

@@ -8,8 +8,9 @@ import pytest
 from openmm import app, unit
 from openmm_systems import dumbbell, started, state_of, water_box
 
-from kcons.errors import InputError
-from kcons.openmm import Langevin, PressureReporter, ProjectedIntegrator, molecular_pressure
+from kcons.constraints import Distance
+from kcons.errors import InputError, UnsupportedError
+from kcons.openmm import Langevin, PressureReporter, ProjectedIntegrator, hold, molecular_pressure
 
 
 def test_pressure_is_that_of_openmm():
@@ -77,3 +78,54 @@ def test_particles_without_mass_have_no_momentum():
     ideal = 8 * unit.BOLTZMANN_CONSTANT_kB * 300 * unit.kelvin / context.getState().getPeriodicBoxVolume()
     found = molecular_pressure(context, 300) - molecular_pressure(context)
     assert found == pytest.approx(ideal.value_in_unit(unit.bar), rel=1e-6)
+
+
+def chain_and_atom(bonded):
+    """A chain of four across a face of the cell, and an atom near it; as stored, and each atom wrapped."""
+    side = 2.0
+    system = openmm.System()
+    force = openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.CutoffPeriodic)
+    force.setCutoffDistance(0.9)
+    for mass, depth in ((14.0, 0.3),) * 4 + ((40.0, 1.0),):
+        system.addParticle(mass)
+        force.addParticle(0.0, 0.35, depth)
+    for i in range(4):
+        for j in range(i):
+            force.addException(i, j, 0.0, 1.0, 0.0)
+    system.addForce(force)
+    bonds = openmm.HarmonicBondForce()
+    bonds.setUsesPeriodicBoundaryConditions(True)
+    for i in range(3 if bonded else 0):
+        bonds.addBond(i, i + 1, 0.153, 2e5)
+    system.addForce(bonds)
+    system.setDefaultPeriodicBoxVectors(*(side * np.eye(3)))
+    x = np.array([[0.03, 0.08, 0.03], [0.03, 0.23, 0.03], [-0.1, 0.29, -0.02], [-0.1, 0.39, -0.13], [0.5, 0.3, 0.1]])
+    return system, x, x % side
+
+
+def test_molecules_across_a_face_of_the_cell():
+    """Whichever images their atoms are stored in."""
+    system, x, wrapped = chain_and_atom(True)
+    found = [molecular_pressure(started(system, openmm.VerletIntegrator(0.001), y), 300) for y in (x, wrapped)]
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+    assert abs(found[0]) < 100
+
+
+def test_rows_that_join_molecules():
+    """They move as one where `hold` says so, and are refused otherwise: their forces would be missing."""
+    found = []
+    for join in (False, True, True):
+        system, x, wrapped = chain_and_atom(False)
+        y = wrapped if found else x
+        rows = Distance([[0, 1], [1, 2], [2, 3]])
+        context = started(system, ProjectedIntegrator(0.001, parts=[hold(system, rows, y, join=join)]), y)
+        if join:
+            found.append(molecular_pressure(context, 300))
+            continue
+        before = state_of(context)
+        with pytest.raises(UnsupportedError, match="join=True"):
+            molecular_pressure(context, 300)
+        for one, other in zip(before, state_of(context), strict=True):
+            assert np.array_equal(one, other)
+    assert found[1] == pytest.approx(found[0], rel=1e-6)

@@ -28,22 +28,24 @@ from kcons.openmm.surfaces.surface_integrator import SurfaceIntegrator
 
 #: Order, and numbers of steps in TIME where the leading error rules and rounding does not.
 ORDERS = {
-    "rattle": (2, (24, 32, 48)),
-    "geodesic": (2, (24, 32, 48)),
-    "suzuki4": (4, (24, 32, 48)),
-    "yoshida4": (4, (32, 48, 64)),
-    "kahan-li6": (6, (24, 32, 48)),
-    "blanes-moan4": (4, (24, 32, 48)),
-    "blanes-moan6": (6, (12, 16, 24)),
-    "blanes-moan6a": (6, (12, 16, 20)),
+    "rattle": (2, (24, 48)),
+    "geodesic": (2, (24, 48)),
+    "suzuki4": (4, (24, 48)),
+    "yoshida4": (4, (32, 64)),
+    "kahan-li6": (6, (24, 48)),
+    "blanes-moan4": (4, (24, 48)),
+    "blanes-moan6": (6, (12, 24)),
+    "blanes-moan6a": (6, (12, 20)),
 }
 TIME = 2.0
 assert set(ORDERS) == {name for name in SCHEMES if not name.startswith("isokinetic")}
 
 
-@pytest.mark.parametrize("platform", PLATFORMS)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("scheme", ["rattle", "geodesic", "blanes-moan6a"])
+@pytest.mark.parametrize(
+    ("scheme", "platform"),
+    [("rattle", "CPU"), *((scheme, "Reference") for scheme in ("rattle", "geodesic", "blanes-moan6a"))],
+)
 def test_on_the_surface_and_along_it(kind, scheme, platform):
     integrator, context = on_surface(kind, scheme, 0.02, platform)
     for _ in range(3):

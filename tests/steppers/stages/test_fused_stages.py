@@ -190,9 +190,9 @@ def test_few_rows_of_any_shape(stepper, name) -> None:
 def test_steps_without_solution_are_the_engines(names) -> None:
     """The same error, for the same row, after which a usual step is what it would have been."""
     taken = failed = 0
+    pair = [molecules(*names, force=None, piecewise=p) for p in (False, True)]
     for stepper in STEPPERS:
         for dt in [0.5, 20.0] if names == ["longer"] else np.geomspace(0.5, 20.0, 12):
-            pair = [molecules(*names, force=None, piecewise=p) for p in (False, True)]
             outcomes = []
             for system, state in pair:
                 before = state.positions.copy(), state.velocities.copy()
@@ -403,17 +403,17 @@ def test_a_step_without_solution_names_row_and_step(stepper) -> None:
 def test_the_engine_takes_over_in_the_middle_of_a_stage() -> None:
     """Steps so long that some flights take many iterations or a rescue, and some have no solution."""
     taken = failed = 0
+    (system, state), (other, _) = triangles(force=None), triangles(force=None, piecewise=True)
+    engine, calls = system.motion.project_positions, []
+
+    def counted(*args, **kwargs):
+        calls.append(kwargs["dt"])
+        return engine(*args, **kwargs)
+
+    system.motion.project_positions = counted
     for stepper in STEPPERS:
         for dt in np.geomspace(0.5, 8.0, 20):
-            (system, state), (other, _) = triangles(force=None), triangles(force=None, piecewise=True)
-            calls = []
-            engine = system.motion.project_positions
-
-            def counted(*args, engine=engine, calls=calls, **kwargs):
-                calls.append(kwargs["dt"])
-                return engine(*args, **kwargs)
-
-            system.motion.project_positions = counted
+            calls.clear()
             outcomes = []
             for each in (system, other):
                 try:
@@ -545,9 +545,9 @@ def test_mixed_rows_are_those_made_piece_by_piece(stepper, name) -> None:
 def test_mixed_steps_without_solution_are_the_engines(name) -> None:
     """The same error, for the same row, after which a usual step is what it would have been."""
     taken = failed = 0
+    pair = [mixed(name, force=None, piecewise=p) for p in (False, True)]
     for stepper in (Rattle(), Suzuki4(), BlanesMoan4()):
         for dt in np.geomspace(0.5, 20.0, 12):
-            pair = [mixed(name, force=None, piecewise=p) for p in (False, True)]
             outcomes = []
             for system, state in pair:
                 before = state.positions.copy(), state.velocities.copy()

@@ -39,7 +39,7 @@ def error(a: State, b: cases.Snapshot) -> float:
 
 
 #: Steps a unit of time for each order, few enough for errors to be above rounding.
-STEPS = {2: (40, 80, 160), 4: (8, 16, 32), 6: (4, 6, 8)}
+STEPS = {2: (40, 80), 4: (8, 16), 6: (4, 8)}
 
 
 def slope(counts, errors) -> float:
