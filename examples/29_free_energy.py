@@ -3,6 +3,7 @@
     python examples/29_free_energy.py                   some seconds: a chain under three thermostats
     python examples/29_free_energy.py --full            the same with errors of 1 %, into docs/results/free_energy.json
     python examples/29_free_energy.py --alanine FOLDER  phi of alanine dipeptide: windows against umbrellas and MBAR
+    python examples/29_free_energy.py --placement       how many windows five profiles need
 
 The chain has four atoms, bonds held, harmonic angles and a torsion that is held; a trap on its first atom leaves the
 torsion's distribution alone, and keeps thermostats without noise ergodic. Its mean force is a quadrature.
@@ -11,6 +12,7 @@ torsion's distribution alone, and keeps thermostats without noise ergodic. Its m
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +121,88 @@ def closed_forms(full: bool) -> dict[str, object]:
     return {"quadrature": truth, "steps": steps, "degrees of freedom": 8, "thermostats": rows}
 
 
+# -- where windows are put ------------------------------------------------------------------------------
+
+#: F, its derivative, first and last window, and the period.
+PROFILES = {
+    "Lennard-Jones": (lambda r: 4 * (r**-12 - r**-6), lambda r: 4 * (6 * r**-7 - 12 * r**-13), 0.95, 3.0, None),
+    "Morse": (
+        lambda r: 50 * (1 - np.exp(-2 * (r - 1))) ** 2,
+        lambda r: 200 * (1 - np.exp(-2 * (r - 1))) * np.exp(-2 * (r - 1)),
+        0.7,
+        4.0,
+        None,
+    ),
+    "torsion": (
+        lambda t: 7 * np.cos(t) + 3 * np.cos(2 * t) + 8 * np.cos(3 * t),
+        lambda t: -7 * np.sin(t) - 6 * np.sin(2 * t) - 24 * np.sin(3 * t),
+        -np.pi,
+        np.pi,
+        2 * np.pi,
+    ),
+    "double well": (lambda x: 5 * (x**2 - 1) ** 2, lambda x: 20 * x * (x**2 - 1), -1.5, 1.5, None),
+    "sharp barrier": (  # a twentieth of the range wide, and not in its middle
+        lambda x: 20 * np.exp(-(((x - 0.4) / 0.05) ** 2)) + 5 * x,
+        lambda x: -800 * ((x - 0.4) / 0.05) * np.exp(-(((x - 0.4) / 0.05) ** 2)) + 5,
+        0.0,
+        1.0,
+        None,
+    ),
+}
+SEEDS, MOST = 3, 64
+
+
+def placement() -> dict[str, object]:
+    """The fewest windows from which on all differences of free energy have an error below 1 % of the range of F.
+
+    Each window's mean force has an error of 0.6 % of that range by the length of the coordinate.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    from kcons.free_energy import integrate
+
+    table = {}
+    for name, (F, f, low, high, period) in PROFILES.items():
+        size = float(np.ptp(F(np.linspace(low, high, 201))))
+        noise = 0.006 * size / (high - low)
+
+        def off(at: np.ndarray, found: np.ndarray, F: object = F, size: float = size) -> float:
+            return float(np.std(found - F(at))) / size
+
+        def sampled_at(x: np.ndarray, rng: object, f: object = f, noise: float = noise) -> np.ndarray:
+            return f(x) + noise * rng.standard_normal(len(x))
+
+        errors: dict[str, dict[int, list[float]]] = {way: {} for way in ("proposed", "trapezoidal rule", "spline")}
+        for seed in range(SEEDS):
+            rng = np.random.default_rng(seed)
+            x = np.linspace(low, high, 7, endpoint=period is None)
+            y = sampled_at(x, rng)
+            while len(x) <= 24:
+                profile = integrate(x, y, np.full(len(x), noise), period=period)
+                errors["proposed"].setdefault(len(x), []).append(off(profile.x, profile.F))
+                new = np.array(profile.next_windows(1))
+                x, y = np.append(x, new), np.append(y, sampled_at(new, rng))
+            for n in range(7, MOST + 1):
+                x = np.linspace(low, high, n, endpoint=period is None)
+                y = sampled_at(x, np.random.default_rng(seed))
+                profile = integrate(x, y, np.full(n, noise), period=period, method="spline")
+                errors["spline"].setdefault(n, []).append(off(profile.x, profile.F))
+                if period is not None:
+                    x, y = np.append(x, high), np.append(y, y[0])
+                straight = np.interp(profile.x, x, cumulative_trapezoid(y, x, initial=0.0))
+                errors["trapezoidal rule"].setdefault(n, []).append(off(profile.x, straight))
+        table[name] = {way: _enough(found) for way, found in errors.items()}
+        print(name, table[name], flush=True)
+    return table
+
+
+def _enough(errors: dict[int, list[float]]) -> int | None:
+    """The fewest from which on the root mean square of the errors stays below 1 %; None if it does not."""
+    bad = [n for n, each in errors.items() if np.sqrt(np.mean(np.square(each))) > 0.01]
+    least = max(bad, default=min(errors) - 1) + 1
+    return least if least in errors else None
+
+
 # -- alanine dipeptide ----------------------------------------------------------------------------------
 
 
@@ -132,6 +216,7 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
 
     from openmm import app
     from pymbar import FES, timeseries
+    from scipy.interpolate import CubicSpline
 
     from kcons.free_energy import OpenMMWindows, Windows
 
@@ -148,7 +233,7 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
         print("windows", *n, flush=True)
 
     held.run(places, workers=workers, progress=progress)
-    result = held.improve(0.05, most, workers=workers, progress=progress, at_once=8)
+    result = held.improve(0.05, most, below=HIGHEST, workers=workers, progress=progress, at_once=8)
     profile, windows = result.profile, len(result.windows)
     total = 2 * windows * (settings.pull + settings.equilibration + production)
     each = total // first
@@ -170,10 +255,12 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
     centres = ((bins[1:] + bins[:-1]) / 2)[np.histogram(phi, bins)[0] > 0]
     known = fes.get_fes(centres, reference_point="from-lowest", uncertainty_method="analytical")
     at = int(np.argmin(known["f_i"]))
-    ours = np.interp(centres, profile.x, profile.F)
+    # A histogram has means over its bins, which on a steep slope are not the values in their middles.
+    inside = centres[:, None] + np.diff(bins)[0] * (np.arange(20) + 0.5 - 10) / 20
+    ours = -kT * np.log(np.exp(-CubicSpline(profile.x, profile.F)(inside) / kT).mean(axis=1))
     ours -= ours[at]
     difference = ours - kT * known["f_i"]
-    low = kT * known["f_i"] < 30
+    low = kT * known["f_i"] < HIGHEST
     difference -= difference[low].mean()
     errors = np.interp(centres, profile.x, profile.error)
     found = {
@@ -192,11 +279,34 @@ def alanine(folder: Path, first: int, most: int, production: int, workers: int) 
         "MBAR": (kT * known["f_i"]).tolist(),
         "MBAR error": (kT * known["df_i"]).tolist(),
     }
+    found["pulls"] = pulls(sampler, replace(settings, pull=5000), folder / "pulls", profile, workers)
     print({k: v for k, v in found.items() if not isinstance(v, list)})
     return found
 
 
+def pulls(sampler: object, settings: Settings, folder: Path, profile: object, workers: int) -> dict[str, object]:
+    """From the lowest minimum over the lower barrier, 20 ps each, both ways; and the windows between the same ends."""
+    from kcons.free_energy import Windows
+
+    start, end = -1.3, 0.0
+    found = Windows(sampler, folder, settings).pull(start, end, 8, workers=workers)
+    windows = profile.difference(start, end)
+    return {
+        "from, to": [start, end],
+        "pulls each way": 8,
+        "steps": settings.pull,
+        "BAR": [found.bar.value, found.bar.error],
+        "Jarzynski": [found.jarzynski.value, found.jarzynski.error],
+        "Jarzynski, backward": [found.jarzynski_backward.value, found.jarzynski_backward.error],
+        "lost": found.dissipated,
+        "overlap": found.overlap,
+        "windows": [windows.value, windows.error],
+        "standard errors off": (found.bar.value - windows.value) / float(np.hypot(found.bar.error, windows.error)),
+    }
+
+
 TEMPERATURE, STIFFNESS = 300.0, 150.0  # K, kJ/mol/rad^2
+HIGHEST = 30.0  # kJ/mol: what is compared, and where windows are added for
 STEP, FRICTION = 4.0, 1.0  # fs with heavy hydrogens, 1/ps: psi, which is slow, turns fastest
 
 
@@ -241,7 +351,9 @@ def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
         folder.mkdir(parents=True, exist_ok=True)
-        found = {"alanine dipeptide": alanine(folder, 24, 48, 40_000, 1)}
+        found = {"alanine dipeptide": alanine(folder, 24, 36, 40_000, 1)}
+    elif "--placement" in arguments:
+        found = {"placement": placement()}
     else:
         found = {"chain": closed_forms("--full" in arguments)}
         if "--full" not in arguments:

@@ -29,7 +29,6 @@ from rich.table import Table
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.cli.progress import Bars
 from kcons.comparison import (
-    ASE_UNITS,
     FittedForces,
     Potential,
     environment,
@@ -252,22 +251,28 @@ def averages(one: long_steps.Stepped) -> dict[str, tuple[float, float, float]]:
 
 
 def compared(result: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    """Each run beside single steps of 2 fs: how far averages are off, and how many times less a sample costs."""
+    """Each run beside single steps of 2 fs: how far averages are off, and how many times less a sample costs.
+
+    Costs beside single steps of 4 fs, too, whose run is as long as the others.
+    """
     runs = runs_of(result, name)
     known, over = averages(runs[0]), result["parts"].get(f"{name}, cost", {}).get("over_two_fs", {})
+    usual = next((one for one in runs if (one.method, one.step) == ("langevin", 4.0)), runs[0])
     rows = []
     for one in runs:
         rows.append({"method": one.method, "step": one.step, "friction": 1000 * one.friction, "status": one.status})
         if one.status != "ok":
             continue
         found = averages(one)
-        fewer = {key: known[key][2] / found[key][2] for key in known}
-        spent = over.get(f"{one.method}, {one.step:g} fs", float("nan")) * one.step / runs[0].step
+        fewer = [{key: was[key][2] / found[key][2] for key in known} for was in (known, averages(usual))]
+        spent = over.get(f"{one.method}, {one.step:g} fs", 0.0) * one.step / runs[0].step
         rows[-1] |= {
             "kinds": one.kinds,
             "off": {k: (found[k][0] - known[k][0], float(np.hypot(found[k][1], known[k][1]))) for k in known},
-            "fewer calls": fewer,
-            "less time": {key: value / spent for key, value in fewer.items()},
+            "calls": {key: found[key][2] for key in known},
+            "fewer than 2 fs": fewer[0],
+            "fewer than 4 fs": fewer[1],
+            "less time": {key: value / spent for key, value in fewer[0].items()} if spent else {},
         }
     return rows
 
@@ -282,34 +287,50 @@ def show(result: dict[str, Any], console: Console) -> None:
         console.print(f"along the constraints are off by {100 * fit['error']:.1f} % of their size", highlight=False)
         table = Table(box=None)
         headings = ["method", "fs", "1/ps", *(f"T {kind}\n%" for kind in kinds), *(f"{key}\noff by" for key in seen)]
-        for k, heading in enumerate([*headings, "fewer\ncalls", "less\ntime"]):
+        for k, heading in enumerate(
+            [*headings, "calls", "fewer than\n2 fs", "fewer than\n4 fs", "less time\nthan 2 fs"]
+        ):
             table.add_column(heading, justify="right" if k else "left")
         for row in rows:
             cells = [long_steps.METHODS[row["method"]].title, f"{row['step']:g}", f"{row['friction']:g}"]
             if row["status"] != "ok":
                 table.add_row(*cells, row["status"])
                 continue
-            cells += [f"{100 * value:+.1f} ± {100 * error:.1f}" for value, error in row["kinds"].values()]
-            cells += [f"{value:+.3f} ± {error:.3f}" for value, error in row["off"].values()]
-            cells += ["/".join(f"{value:.1f}" for value in row[key].values()) for key in ("fewer calls", "less time")]
+            cells += [f"{100 * value:+.0f} ± {100 * error:.0f}" for value, error in row["kinds"].values()]
+            cells += [f"{value:+.2f} ± {error:.2f}" for value, error in row["off"].values()]
+            cells.append(", ".join(f"{value:.0f}" for value in row["calls"].values()))
+            for key in ("fewer than 2 fs", "fewer than 4 fs", "less time"):
+                cells.append(", ".join(f"{value:.1f}" if value < 10 else f"{value:.0f}" for value in row[key].values()))
             table.add_row(*cells)
         console.print(table)
-    console.print("off by: less the first run. fewer calls, less time: for an independent sample of these averages.")
+    console.print("off by: less the first run. calls: for an independent sample of each of these averages.")
     machine = result["machine"]
     spent = sum(part.get("cpu_seconds", 0.0) for part in result["parts"].values())
     console.print(f"{spent / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
 
 
 def draw(result: dict[str, Any], path: str) -> None:
-    """The curves of the page: ethanol."""
-    runs = [one for one in runs_of(result, "ethanol") if one.status == "ok"]
-    long_steps_report.figure(runs, ASE_UNITS, "ethanol: bias against calls of GFN2-xTB").savefig(path, dpi=150)
+    """Calls of GFN2-xTB for an independent sample of the energy."""
+    from matplotlib.figure import Figure
+
+    picture = Figure((9, 3.6), layout="constrained")
+    for panel, name in zip(picture.subplots(1, len(CHOSEN)), CHOSEN, strict=True):
+        for method, (colour, marker) in long_steps_report.STYLES.items():
+            seen = sorted((one.step, averages(one)["U/kT"][2]) for one in runs_of(result, name) if one.method == method)
+            if seen:
+                title = long_steps.METHODS[method].title.replace("the same", "Langevin")
+                panel.loglog(*np.transpose(seen), marker=marker, color=colour, label=title)
+        panel.set(title=name, xlabel="step / fs", ylabel="calls of GFN2-xTB for a sample of U")
+        panel.set_xticks((2, 4, 8, 16, 32), ("2", "4", "8", "16", "32"))
+        panel.set_xticks((), minor=True)
+    picture.axes[0].legend(frameon=False)
+    picture.savefig(path, dpi=150)
 
 
 def main() -> None:
     parser = scripts.options(__doc__, full="long runs")
     parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
-    options, console = parser.parse_args(), Console(width=150)
+    options, console = parser.parse_args(), Console(width=200)
     if options.show:
         result = json_files.read(options.show)
         show(result, console)

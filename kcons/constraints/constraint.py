@@ -15,7 +15,7 @@ Both are differentiated to A a = b (notes eqs. 81-92): A_k is `gradient`, and
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
@@ -361,3 +361,18 @@ def _atom_table(atoms: ArrayLike, name: str, width: int | None) -> IntArray:
                 f"{name}: row {row} names an atom twice: {tuple(table[row].tolist())}", item="atoms", atoms=table[row]
             )
     return table
+
+
+def constraints_in(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
+    """One constraint, or several, as a list.
+
+    Raises
+    ------
+    InputError
+        Something else.
+    """
+    found = [given] if isinstance(given, Constraint) else list(given) if isinstance(given, Iterable) else [given]
+    for entry in found:
+        if not isinstance(entry, Constraint):
+            raise InputError(f"{item} has {entry!r}, which is no kcons constraint; see kcons.constraints", item=item)
+    return found

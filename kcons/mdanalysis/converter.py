@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from MDAnalysis.converters.base import ConverterBase
 
-from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint import Constraint, constraints_in
 from kcons.errors import InputError
 from kcons.mdanalysis.conversions import to_ase
 from kcons.mdanalysis.topology import constraints_of
@@ -23,7 +23,11 @@ class ASEConverter(ConverterBase):  # type: ignore[misc]
     units = {"time": None, "length": "Angstrom"}
 
     def convert(
-        self, obj: Any, constrain: str | None = None, constraints: Iterable[Constraint] = (), **options: Any
+        self,
+        obj: Any,
+        constrain: str | None = None,
+        constraints: Constraint | Iterable[Constraint] = (),
+        **options: Any,
     ) -> ase.Atoms:
         """ASE `Atoms` of the present frame.
 
@@ -42,7 +46,7 @@ class ASEConverter(ConverterBase):  # type: ignore[misc]
         InputError
             Both `constrain` and `constraints`, or options without a name.
         """
-        given = list(constraints)
+        given = constraints_in(constraints, "constraints")
         if given and constrain is not None:
             raise InputError("give constrain, a name, or constraints, a list; not both", item="constraints")
         if options and constrain is None:

@@ -9,6 +9,7 @@ import pytest
 from constraint_cases import CASES, MASSES, N_ATOMS, TIME, scattered
 
 from kcons.constraints import FAMILIES, Distance, FixedAtoms, MovingTarget, Sphere, from_dict
+from kcons.constraints.constraint import constraints_in
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.errors import InputError
 
@@ -190,3 +191,11 @@ def test_names_and_repr():
     assert Distance([[4, 5]]).row_name(0) == "Distance(4, 5)"
     assert repr(Distance([[4, 5], [6, 7]])) == "<Distance(2 rows)>"
     assert repr(FixedAtoms(3)) == "<FixedAtoms(3 rows)>"
+
+
+@pytest.mark.parametrize("given", [None, 3, "ab", [Distance([[0, 1]]), None]])
+def test_what_are_no_constraints(given):
+    with pytest.raises(InputError, match=r"held has .* is no kcons constraint"):
+        constraints_in(given, "held")
+    row = Distance([[0, 1]])
+    assert constraints_in(row, "held") == [row] == constraints_in(iter([row]), "held")

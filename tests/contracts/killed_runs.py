@@ -1,6 +1,7 @@
 """Windows and relaxed scans that are killed (SIGKILL) at random times, against runs that nobody disturbed.
 
     python tests/contracts/killed_runs.py           30 kills each, into docs/results/killed_runs.json
+    python tests/contracts/killed_runs.py KIND      of one kind
     python tests/contracts/killed_runs.py KIND DIR  one run, begun or gone on with
 
 After each kill what was finished must still be there, byte for byte; at the end the result must be that of the run
@@ -29,33 +30,37 @@ from kcons.free_energy import AseWindows, Settings, Windows, scan
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "killed_runs.json"
 TORSION = Dihedral([[2, 0, 1, 3]])
-#: Seconds after its first step within which a run is killed.
+#: Seconds after its first note within which a run is killed.
 LATEST = 0.8
 
 
 def windows(folder: Path) -> dict[str, object]:
-    """24 windows of the torsion of H2O2 with EMT, from both sides; every run of 150 steps is noted when it begins."""
+    """40 windows of the torsion of H2O2 with EMT, from both sides; every run of 150 steps is noted when it is done."""
 
     class Noted(AseWindows):
         def sample(self, window, settings, file):
-            note(folder, window.name)
             super().sample(window, settings, file)
+            note(folder, window.name)
 
     sampler = Noted(molecule("H2O2"), EMT, {"torsion": TORSION}, [Angle([[2, 0, 1], [0, 1, 3]])])
     settings = Settings(timestep=0.5, relax=5, pull=20, equilibration=30, production=100, every=2)
     found = Windows(sampler, folder / "out", settings).run(
-        np.radians(np.linspace(60, 300, 24)), executor=ThreadPoolExecutor(1)
+        np.radians(np.linspace(60, 300, 40)), executor=ThreadPoolExecutor(1)
     )
     assert not found.failed, found.failed
     return found.numbers()
 
 
 def relaxed(folder: Path) -> dict[str, object]:
-    """24 points of the same torsion relaxed, from both neighbours."""
+    """121 points of the same torsion relaxed, from both neighbours; relaxations that are there are noted."""
     atoms = molecule("H2O2")
     atoms.calc = EMT()
-    note(folder, "begun")
-    found = scan(atoms, TORSION, np.radians(np.linspace(60, 300, 24)), folder=folder / "out", fmax=0.002)
+
+    def progress(done: int, points: int, line: str) -> None:
+        note(folder, "done")
+
+    values = np.radians(np.linspace(60, 300, 121))
+    found = scan(atoms, TORSION, values, folder=folder / "out", fmax=0.002, progress=progress)
     assert not found.failed, found.failed
     positions = [found.best[point].positions.tolist() for point in sorted(found.best)]
     return {"energies": found.energies.tolist(), "positions": positions, "relaxations": len(found.attempts)}
@@ -111,27 +116,30 @@ def killed(kind: str, folder: Path, kills: int) -> dict[str, object]:
     assert all(now[name] == content for name, content in before.items())
     one, other = ((f / "result.json").read_text() for f in (whole, broken))
     assert one == other
-    entries = (broken / "diary").read_text().split() if kind == "windows" else []
+    # Windows are noted once they are done, relaxations whenever they are there.
+    noted = len((broken / "diary").read_text().split())
     return {
         "kills": begun,
         "finished after each": counts,
         "in all": len(now),
         "lost": 0,
-        "runs begun": len(entries),
+        "noted": noted,
         "result": "identical",
     }
 
 
 def main(arguments: list[str]) -> None:
-    if arguments:
+    if len(arguments) == 2:
         kind, folder = arguments[0], Path(arguments[1])
         found = KINDS[kind](folder)
         (folder / "result.json").write_text(json.dumps(found))
         return
-    with tempfile.TemporaryDirectory() as folder:
-        found = {kind: killed(kind, Path(folder), 30) for kind in KINDS}
-    print(json.dumps(found, indent=1))
-    json_files.write(RESULT, found | {"machine": environment()})
+    for kind in arguments or KINDS:
+        with tempfile.TemporaryDirectory() as folder:
+            row = killed(kind, Path(folder), 30)
+        print(kind, row)
+        known = json_files.read(RESULT) if RESULT.exists() else {}
+        json_files.write(RESULT, known | {kind: row, "machine": environment()})
 
 
 if __name__ == "__main__":

@@ -43,6 +43,10 @@ def test_constraints_are_carried(ethane):
     assert same.get_removed_dof(by_name) == 6
     one = ethane.select_atoms("element C").convert_to("ASE", constraints=[Distance([[0, 1]])])
     assert len(one) == 2 and one.constraints[0].get_removed_dof(one) == 1
+    alone = ethane.atoms.convert_to("ASE", constraints=Distance([[0, 1]]))
+    assert alone.constraints[0].get_removed_dof(alone) == 1
+    with pytest.raises(InputError, match="constraints has 3"):
+        ethane.atoms.convert_to("ASE", constraints=3)
 
 
 def test_bad_input(ethane):

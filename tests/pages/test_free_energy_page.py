@@ -7,6 +7,7 @@ import json
 from committed_pages import FOLDER, page
 
 FOUND = json.loads((FOLDER / "free_energy.json").read_text(encoding="utf-8"))
+WAYS = ("proposed", "trapezoidal rule", "spline")
 TEXT = " ".join(page("free_energy.md").split())
 
 
@@ -24,11 +25,40 @@ def test_three_thermostats_agree_with_the_quadrature():
 def test_alanine_dipeptide_against_mbar():
     found = FOUND["alanine dipeptide"]
     assert f"square difference is {found['root mean square difference']:.2f} kJ/mol" in TEXT
-    assert f"the largest {found['largest difference below 30 kJ/mol']:.1f};" in TEXT
+    assert f"the largest {found['largest difference below 30 kJ/mol']:.2f};" in TEXT
     ours, theirs = found["largest error of the windows"], found["largest error of MBAR"]
     assert f"standard error {ours:.2f} of the windows and {theirs:.2f} of MBAR" in TEXT
+    steps, windows = f"{found['steps of each method']:,}", found["windows"]
+    assert f"{windows} windows from both sides" in TEXT and f"({steps}, 4 fs)" in TEXT
     assert found["root mean square difference"] < (ours**2 + theirs**2) ** 0.5
     assert found["doubtful windows"] == []
+
+
+def test_pulls_against_windows():
+    found = FOUND["alanine dipeptide"]["pulls"]
+    for name in ("BAR", "Jarzynski", "windows"):
+        assert "{:.1f} ± {:.1f}".format(*found[name]) in TEXT
+    assert f"{found['standard errors off']:+.1f} standard errors" in TEXT
+    assert abs(found["standard errors off"]) < 3
+
+
+def test_where_windows_are_put():
+    for name, row in FOUND["placement"].items():
+        numbers = " | ".join("more than 64" if row[way] is None else str(row[way]) for way in WAYS)
+        assert f"| {name} | {numbers} |" in TEXT
+        assert row["trapezoidal rule"] is None or 2 * row["proposed"] <= row["trapezoidal rule"]
+    saved = [name for name, row in FOUND["placement"].items() if 2 * row["proposed"] <= row["spline"]]
+    assert saved == ["Lennard-Jones"]
+
+
+def test_killed_runs():
+    found = json.loads((FOLDER / "killed_runs.json").read_text(encoding="utf-8"))
+    for kind in ("windows", "scan"):
+        row = found[kind]
+        assert row["kills"] == 30 and row["lost"] == 0 and row["result"] == "identical"
+        assert row["finished after each"] == sorted(row["finished after each"]) and row["finished after each"][-1] > 20
+    assert "30 SIGKILLs" in TEXT and f"{found['windows']['in all']} runs of windows" in TEXT
+    assert f"{found['scan']['in all']} relaxations" in TEXT
 
 
 def test_butane_beside_its_relaxed_scan():

@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from kcons.constraints.arguments import FloatArray, numbers
@@ -134,6 +134,11 @@ class Profile:
             F = F + self._added(ends)
         return difference(F, covariance)
 
+    def lower_than(self, energy: float, at: FloatArray | None = None) -> NDArray[np.bool_]:
+        """At which places (those of the profile by default) F is at most so much above its lowest value there."""
+        F = self.F if at is None else self._known.values(self.method, at, self._closed)[0]
+        return np.asarray(F - F.min() <= energy)
+
     def without_jacobian(
         self, jacobian: Literal["distance", "angle"] | Callable[[FloatArray], FloatArray], thermal_energy: float
     ) -> Profile:
@@ -175,11 +180,13 @@ class Profile:
         shift = added(np.append(self.x, self.zero))
         return replace(self, F=self.F + shift[:-1] - shift[-1], _added=added)
 
-    def next_window(self, *, between: tuple[float, float] | None = None) -> float:
+    def next_window(self, *, between: tuple[float, float] | None = None, below: float | None = None) -> float:
         """Where one more window would tell most; see `next_windows`."""
-        return self.next_windows(1, between=between)[0]
+        return self.next_windows(1, between=between, below=below)[0]
 
-    def next_windows(self, count: int, *, between: tuple[float, float] | None = None) -> list[float]:
+    def next_windows(
+        self, count: int, *, between: tuple[float, float] | None = None, below: float | None = None
+    ) -> list[float]:
         """Where more windows would tell most, if they were sampled as long as those that are there.
 
         Each is put where the variance of all differences of free energy together is reduced most (Bayesian
@@ -192,16 +199,23 @@ class Profile:
         count : int
         between : tuple of two float, optional
             Only the difference between these two places counts; all of the profile by default.
+        below : float, optional
+            Only places count where the free energy is this much above its lowest value or less: rates and populations
+            do not depend on the others.
 
         Raises
         ------
         InputError
-            `between` is not in the range of the windows.
+            `between` is not in the range of the windows; `below` is not positive, or given beside `between`.
         """
         known = self._known
         grid = np.linspace(known.x[0], known.end, _POINTS)
         aims = grid if between is None else _places(between, known, "between")
         closed = self._closed and known.period is not None
+        if below is not None:
+            if not below > 0 or between is not None:
+                raise InputError(f"below is {below}; give a positive energy, and no between beside it", item="below")
+            aims = grid[self.lower_than(below, grid)]
         covariance = known.process(closed).posterior((aims[:, None], [-1]), (grid[:, None], [0]))[1]
         noise = np.interp(grid, known.x, known.e**2, period=known.period)
         m = len(aims)

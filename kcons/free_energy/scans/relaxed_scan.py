@@ -26,6 +26,7 @@ from kcons.ase.topology import bonds_of
 from kcons.ase.translation import translated
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
+from kcons.constraints.constraint import constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CalculatorError,
@@ -184,22 +185,14 @@ def scan(
     KconsError
         The first failure, where no point at all could be relaxed.
     """
-    items = _constraints(coordinates, "coordinates")
+    items = constraints_in(coordinates, "coordinates")
     lists = [values] if isinstance(coordinates, Constraint) else list(values)  # type: ignore[arg-type]
     grid = Grid(items, lists)  # type: ignore[arg-type]
     fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
-    surface = _Surface(atoms, grid, _constraints(held, "held"))
+    surface = _Surface(atoms, grid, constraints_in(held, "held"))
     settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
     attempts = Attempts(None if folder is None else Path(folder), atoms, grid, surface.held, settings)
     return _Wavefront(surface, grid, attempts, settings, progress).run()
-
-
-def _constraints(given: Constraint | Iterable[Constraint], item: str) -> list[Constraint]:
-    found = [given] if isinstance(given, Constraint) else list(given) if isinstance(given, Iterable) else [given]
-    for entry in found:
-        if not isinstance(entry, Constraint):
-            raise InputError(f"{item} has {entry!r}; give constraints of kcons.constraints", item=item)
-    return found
 
 
 class _Surface:

@@ -257,6 +257,7 @@ class Windows:
         most: int,
         *,
         between: tuple[float, float] | None = None,
+        below: float | None = None,
         executor: Executor | None = None,
         workers: int | None = None,
         progress: Callable[[int, int, float], None] | None = None,
@@ -269,18 +270,18 @@ class Windows:
         error : float
         most : int
             Never more than so many windows.
+        between, below
+            Of `Profile.next_windows`. With `below`, errors higher up do not count.
         at_once : int
             How many are added before the profile is looked at again: as many as there are workers.
         """
         result = self.result({})
-        while len(self._targets) < most and result.profile.error.max() > error:
-            count = min(at_once, most - len(self._targets))
-            result = self.run(
-                result.profile.next_windows(count, between=between),
-                executor=executor,
-                workers=workers,
-                progress=progress,
-            )
+        while len(self._targets) < most:
+            profile = result.profile
+            if profile.error[profile.lower_than(np.inf if below is None else below)].max() <= error:
+                break
+            places = profile.next_windows(min(at_once, most - len(self._targets)), between=between, below=below)
+            result = self.run(places, executor=executor, workers=workers, progress=progress)
             if result.failed:
                 break
         return result
@@ -337,8 +338,7 @@ class Windows:
         every = [job for each in jobs.values() for job in each]
         missing = [job for job in every if not self.file(job).exists()]
         self._sample(missing, executor, workers, progress, len(every))
-        kT = BOLTZMANN * self.settings.temperature
-        works, log_weights = [], []
+        kT, works, log_weights = BOLTZMANN * self.settings.temperature, [], []
         for each in jobs.values():
             series = [Series.load(self.file(job)) for job in each if self.file(job).exists()]
             works.append(np.array([s.work[-1] * self.sampler.kJ for s in series]))

@@ -40,7 +40,10 @@ TABLES: dict[str, dict[str, str]] = {
     # What there is more to say of settings, they say themselves.
     "sampling": {**dict.fromkeys((f.name for f in fields(Settings)), ""), "both_sides": "true or false"}
     | {"approach": "", "seed": ""},
-    "improve": {"error": "a number above 0", **dict.fromkeys(("most", "at_once"), "a whole number above 0")},
+    "improve": {
+        **dict.fromkeys(("error", "below"), "a number above 0"),
+        **dict.fromkeys(("most", "at_once"), "a whole number above 0"),
+    },
     "pulls": {
         **dict.fromkeys(("from", "to"), "a number, or numbers"),
         **dict.fromkeys(("count", "steps"), ""),

@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from kcons.constraints import Angle, Constraint, Distance
-from kcons.constraints.constraint import IntArray
+from kcons.constraints.constraint import IntArray, constraints_in
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 from kcons.openmm.carried.carried_constraints import CarriedConstraints
@@ -128,10 +128,7 @@ def hold(
     KconsError
         As `CarriedConstraints`; a barostat that would break a row. The System was not changed.
     """
-    given = [constraints] if isinstance(constraints, Constraint) else list(constraints)
-    for item in given:
-        if not isinstance(item, Constraint):
-            raise InputError(f"{item!r} is no kcons constraint", item="constraints")
+    given = constraints_in(constraints, "constraints")
     n = system.getNumParticles()
     table = _table(system)
     chosen = _chosen(system, table, () if take == "touched" else take, keep_water)

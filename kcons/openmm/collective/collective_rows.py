@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from openmm import unit
 
 from kcons.constraints import Formula
+from kcons.constraints.arguments import whole_number
 from kcons.constraints.target import FloatArray
 from kcons.errors import (
     CertificateError,
@@ -44,6 +45,7 @@ from kcons.openmm.integrator.program import Program
 from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.steppers.compositions import Composition
 from kcons.steppers.rattle import Rattle
+from kcons.thermostats.freedom import positive
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
@@ -114,12 +116,8 @@ class CollectiveRows(GroupRows):
         if not given:
             raise InputError("no rows to hold", item="rows")
         self.asked_tolerance = tolerance
-        tolerance = TOLERANCE if tolerance is None else tolerance
-        if not tolerance > 0 or max_iterations < 1:
-            raise InputError(
-                f"tolerance {tolerance} and max_iterations {max_iterations} must be positive", item="tolerance"
-            )
-        self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
+        self.tolerance = positive(TOLERANCE if tolerance is None else tolerance, "tolerance")
+        self.max_iterations = whole_number(max_iterations, "max_iterations")
         self.n_rows = len(given)
         forces = [_parts_of(system, row.force, k) for k, row in enumerate(given)]
         self._units = [unit_of(f[0]) if len(f) == 1 else None for f in forces]

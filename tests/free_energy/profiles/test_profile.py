@@ -265,7 +265,7 @@ def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side(nam
 @pytest.mark.validation
 @pytest.mark.parametrize(("name", "to", "equal"), [("Lennard-Jones", 10, 28), ("Morse", 9, 17), ("torsion", 14, 28)])
 def test_what_proposed_windows_save(name, to, equal):
-    """From the table in docs/free_energy.md: equal distances need as many windows for the same error, and no fewer."""
+    """Equal distances need as many windows for the same error, and no fewer."""
     case = CASES[name]
     error = 0.006 * float(np.ptp(case.F(np.linspace(case.low, case.high, 201)))) / (case.high - case.low)
     reached = adapted(name, 7, to, error, seeds=3)[to]
@@ -283,6 +283,18 @@ def test_next_windows_lie_apart_and_where_little_is_known():
     assert -0.01 <= between <= 1.5
     with pytest.raises(InputError, match="between"):
         profile.next_window(between=(0.0, 5.0))
+
+
+def test_windows_that_help_what_is_low():
+    """F = x^3/3, which is 3 at x = 2.1: windows for what is below are put there, those for all of it higher up."""
+    x = np.linspace(0.0, 4.0, 9)
+    profile = integrate(x, x**2, np.full(9, 0.3))
+    np.testing.assert_allclose(profile.x[profile.lower_than(3.0)].max(), 9 ** (1 / 3), atol=0.05)
+    assert max(profile.next_windows(3, below=3.0)) < 1.1 < min(profile.next_windows(3))
+    assert profile.next_windows(2, below=np.inf) == profile.next_windows(2)
+    for wrong in ({"below": -1.0}, {"below": math.nan}, {"below": 5.0, "between": (0.0, 1.0)}):
+        with pytest.raises(InputError, match="below is"):
+            profile.next_window(**wrong)
 
 
 @pytest.mark.parametrize(

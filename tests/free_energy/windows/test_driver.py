@@ -95,6 +95,13 @@ def test_windows_are_added_where_they_help(tmp_path):
         better = windows.improve(0.5, 20, executor=executor, at_once=2)
     assert first.profile.error.max() > 0.5 and len(first.windows) == 5
     assert 5 < len(better.windows) < 20 and better.profile.error.max() <= 0.5
+    # Of the lowest place alone nothing is to be known.
+    near = Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", SETTINGS)
+    with ThreadPoolExecutor(1) as executor:
+        near.run(np.linspace(-np.pi, np.pi, 6)[:-1], executor=executor)
+        found = near.improve(0.5, 20, below=1e-6, executor=executor)
+    errors = found.profile.error[found.profile.lower_than(1e-6)]
+    assert errors.max() <= 0.5 < found.profile.error.max() and len(found.windows) == 5
 
 
 def test_a_killed_worker_changes_nothing(tmp_path):

@@ -219,6 +219,7 @@ def test_nothing_changes_when_hold_is_refused():
         ([Distance([[0, 3]], 0.2), Distance([[3, 0]], 0.3)], ContradictionError),
         ([Distance([[0, 99]])], InputError),
         (["bond"], InputError),
+        (None, InputError),
         ([Distance([[0, 3]], 1.9)], InputError),
         ([Distance([[0, 3]], -1.0)], ValueError),
     ):
