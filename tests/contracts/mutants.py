@@ -802,6 +802,30 @@ MUTANTS = [
         "series.kinetic / g if g > 99",
         "tests/free_energy/test_mean_forces.py::test_one_end_to_end_length_beside_two_bonds",
     ),
+    (
+        "free_energy/mean_forces.py",
+        "np.mean(away * force[:, k]) / spread * difference",
+        "np.mean(away * force[:, k]) / spread * away / 2",
+        "tests/free_energy/test_mean_forces.py::test_of_two_estimates_the_mixture_that_fluctuates_least",
+    ),
+    (
+        "free_energy/rigid_turns.py",
+        "np.isfinite(before) and abs(after - before) < _SAME",
+        "np.isfinite(before)",
+        "tests/free_energy/test_rigid_turns.py::test_other_rows_must_not_change",
+    ),
+    (
+        "free_energy/rigid_turns.py",
+        "r = x[self.group] - x[self.axis[1]]\n        return",
+        "r = x[self.group]\n        return",
+        "tests/free_energy/test_rigid_turns.py::test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy",
+    ),
+    (
+        "free_energy/profiles/profile.py",
+        "aims = grid[self.lower_than(below, grid)]",
+        "aims = grid[~self.lower_than(below, grid)]",
+        "tests/free_energy/profiles/test_profile.py::test_windows_that_help_what_is_low",
+    ),
     # -- relaxed scans --
     (
         "free_energy/scans/relaxed_scan.py",

@@ -131,7 +131,7 @@ class LennardJones:
         y = np.array(x, dtype=np.float64)
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
         common = self.first, self.sites, self.box, np.array([self.cutoff]), thermal_energy, every, rng
-        accepted = _metropolis(y, *common, (shift, turn), energies, _one)
+        accepted = _metropolis(y, *common, (shift, turn), energies)
         return energies, y, accepted / (every * len(energies) * (len(self.first) - 1))
 
 
@@ -265,30 +265,37 @@ def _one(y, a, b, x, first, sites, box, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _metropolis(x, first, sites, box, reach, kt, every, rng, moves, energies, one):  # type: ignore[no-untyped-def]
+def _proposed(y, moves, rng):  # type: ignore[no-untyped-def]
+    """A molecule at places y, turned about its centre and moved, in place; shape (n, 3)."""
+    centre = np.zeros(3)
+    for i in range(len(y)):
+        centre += y[i] / len(y)
+    axis = rng.normal(0.0, 1.0, 3)
+    axis /= np.sqrt((axis * axis).sum())
+    angle = moves[1] * (2.0 * rng.random() - 1.0)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    move = moves[0] * (2.0 * rng.random(3) - 1.0)
+    for i in range(len(y)):
+        p = y[i] - centre
+        y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
+
+
+# That of near molecules is written out beside it: what takes a function as an argument is compiled by every process.
+@numba.njit(cache=True, nogil=True)
+def _metropolis(x, first, sites, box, cutoff, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
     molecules = len(first) - 1
     energy = 0.0
     for k in range(molecules):
-        energy += 0.5 * one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, reach)
+        energy += 0.5 * _one(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, cutoff)
     accepted = 0
     for record in range(len(energies)):
         for _ in range(every * molecules):
             k = int(rng.random() * molecules)
             a, b = first[k], first[k + 1]
             y = x[a:b].copy()
-            centre = np.zeros(3)
-            for i in range(b - a):
-                centre += y[i] / (b - a)
-            axis = rng.normal(0.0, 1.0, 3)
-            axis /= np.sqrt((axis * axis).sum())
-            angle = moves[1] * (2.0 * rng.random() - 1.0)
-            sine, cosine = np.sin(angle), np.cos(angle)
-            move = moves[0] * (2.0 * rng.random(3) - 1.0)
-            for i in range(b - a):
-                p = y[i] - centre
-                y[i] = centre + move + cosine * p + sine * np.cross(axis, p) + (1.0 - cosine) * (axis * p).sum() * axis
-            change = one(y, a, b, x, first, sites, box, reach)
-            change -= one(x[a:b], a, b, x, first, sites, box, reach)
+            _proposed(y, moves, rng)
+            change = _one(y, a, b, x, first, sites, box, cutoff)
+            change -= _one(x[a:b], a, b, x, first, sites, box, cutoff)
             if change <= 0.0 or rng.random() < np.exp(-change / kt):
                 x[a:b] = y
                 energy += change

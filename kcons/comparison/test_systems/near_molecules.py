@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.comparison.test_systems.lennard_jones import LennardJones, _metropolis, _pair, _push
+from kcons.comparison.test_systems.lennard_jones import LennardJones, _pair, _proposed, _push
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
 
@@ -65,7 +65,7 @@ class NearMolecules:
         energies, rng = np.empty(sweeps // every), np.random.default_rng(seed)
         reach = np.array([of.cutoff, BEGIN * self.reach, self.reach])
         common = of.first, of.sites, of.box, reach, thermal_energy, every, rng
-        accepted = _metropolis(y, *common, (shift, turn), energies, _one_molecule)
+        accepted = _near_metropolis(y, *common, (shift, turn), energies)
         return energies, y, accepted / (every * len(energies) * (len(of.first) - 1))
 
 
@@ -135,3 +135,26 @@ def _one_molecule(y, a, b, x, first, sites, box, reach):  # type: ignore[no-unty
                 energy += _pair(dx * dx + dy * dy + dz * dz, sites[i], sites[j], cutoff, 2.0 * cutoff)[0]
         total += share * energy
     return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _near_metropolis(x, first, sites, box, reach, kt, every, rng, moves, energies):  # type: ignore[no-untyped-def]
+    molecules = len(first) - 1
+    energy = 0.0
+    for k in range(molecules):
+        energy += 0.5 * _one_molecule(x[first[k] : first[k + 1]], first[k], first[k + 1], x, first, sites, box, reach)
+    accepted = 0
+    for record in range(len(energies)):
+        for _ in range(every * molecules):
+            k = int(rng.random() * molecules)
+            a, b = first[k], first[k + 1]
+            y = x[a:b].copy()
+            _proposed(y, moves, rng)
+            change = _one_molecule(y, a, b, x, first, sites, box, reach)
+            change -= _one_molecule(x[a:b], a, b, x, first, sites, box, reach)
+            if change <= 0.0 or rng.random() < np.exp(-change / kt):
+                x[a:b] = y
+                energy += change
+                accepted += 1
+        energies[record] = energy
+    return accepted

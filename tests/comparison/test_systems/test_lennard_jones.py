@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kcons.comparison.test_systems import fluid, lennard_jones, near_molecules
 from kcons.comparison.test_systems.lennard_jones import LennardJones
+from kcons.comparison.test_systems.near_molecules import NearMolecules
 from kcons.errors import InputError
 
 
@@ -113,3 +116,13 @@ def test_bad_input():
         LennardJones(range(4), 1.58, cutoff=-1.0)
     with pytest.raises(InputError, match="in the order of the atoms"):
         LennardJones([0, 1, 0], 3.0)
+
+
+@pytest.mark.parametrize("kernel", [lennard_jones._metropolis, near_molecules._near_metropolis])
+def test_moves_are_compiled_once_on_a_machine(kernel):
+    """Functions as arguments are others in each process, for which no cache has anything."""
+    chosen = fluid.dumbbells(8)
+    forces = NearMolecules(chosen.forces, 0.4 * chosen.forces.box) if "near" in kernel.__name__ else chosen.forces
+    forces.metropolis(chosen.positions, 1.0, 2, 1, 1, 0.1, 0.1)
+    assert kernel.signatures
+    assert not [kind for kinds in kernel.signatures for kind in kinds if isinstance(kind, numba.types.Dispatcher)]

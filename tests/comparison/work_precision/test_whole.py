@@ -173,6 +173,7 @@ def test_redraw_makes_the_same_page_from_the_numbers(finished, tmp_path, capsys)
     assert (tmp_path / "sphere.png").exists()
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_command(tmp_path, capsys):
     assert main.main(["compare", "--all", "--only", "sphere", "--out", str(tmp_path / "o")]) == 0
     printed = capsys.readouterr()

@@ -43,6 +43,7 @@ seed = 4
 [improve]
 error = 0.5
 most = 20
+below = 40
 
 [workers]
 processes = 3
@@ -66,7 +67,7 @@ def test_a_plan_for_ase(folder):
     assert plan.settings.temperature == 310 and plan.settings.thermostat == "nose-hoover"
     assert plan.settings.production == 20000
     np.testing.assert_allclose(plan.targets[:, 0], np.radians(np.arange(-180, 180, 30)))
-    assert plan.options == {"both_sides": False, "seed": 4} and plan.improve == {"error": 0.5, "most": 20}
+    assert plan.options == {"both_sides": False, "seed": 4} and plan.improve == {"error": 0.5, "most": 20, "below": 40}
     assert plan.processes == 3
     with plan.executor() as executor:
         assert executor is None
