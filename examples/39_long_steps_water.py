@@ -3,6 +3,7 @@
     python examples/39_long_steps_water.py                   seconds: one method, some steps of 8 waters
     python examples/39_long_steps_water.py --full FOLDER     64 rigid TIP3P waters, hours; goes on where it was stopped
     python examples/39_long_steps_water.py --collect FOLDER  what its runs have shown so far, into docs/results
+    python examples/39_long_steps_water.py --fresh           energies on spheres with other seeds, into docs/results
     python examples/39_long_steps_water.py --show FILE       the table of a file of results
 
 The fast forces are those between molecules whose oxygens are near, switched off from 4 to 6 angstrom; the slow ones are
@@ -364,6 +365,45 @@ def collect(folder: Path, samples: int) -> list[dict[str, Any]]:
     return rows
 
 
+#: Seeds that no setting was chosen by, settings, and ps of each run after 10 ps.
+SEEDS, LATER = (11, 12), (Method("split", 20, 24), Method("split", 20, 32), Method("split", 20, 32, auxiliary=0))
+FRESH = 60.0
+
+
+def fresh() -> list[dict[str, Any]]:
+    """Energies of split spheres with other seeds; those of the reference are in the table."""
+    found = []
+    for method in LATER:
+        for seed in SEEDS:
+            water, own = Water(method), method.stepper()
+            stepper = IsokineticSpheres(
+                KT,
+                own.friction,
+                seed,
+                steps={"slow": 1, "fast": round(method.outer / method.inner)},  # type: ignore[attr-defined]
+                auxiliary=method.auxiliary,
+            )
+            energies: list[float] = []
+            dt = method.outer * units.fs
+            state = run(water.system, water.start, dt, round(10_000 / method.outer), stepper=stepper)
+            steps = round(1000 * FRESH / method.outer)
+            look = [lambda now, w=water, u=energies: u.append(w.potential.watched_energy(now.positions) / KJ / 64)]
+            run(water.system, state, dt, steps, stepper=stepper, observers=look, every=8)
+            found.append({"name": method.name, "seed": seed, "ps": FRESH, "energy": list(mean(energies[1:]))})
+            print(found[-1], flush=True)
+    return found
+
+
+def show_fresh(result: dict[str, Any]) -> str:
+    """Energies beside that of the reference, with its error."""
+    known, lines = result["water"][0]["energy"], []
+    for row in result["fresh"]:
+        value, error = row["energy"]
+        off = [100 * x / abs(known[0]) for x in (value - known[0], math.hypot(error, known[1]))]
+        lines.append(f"{row['name']:32s} seed {row['seed']:3d}{value:8.2f}({error:.2f}){off[0]:+7.2f}({off[1]:.2f}) %")
+    return "\n".join(lines)
+
+
 def show_water(result: dict[str, Any]) -> str:
     """Averages beside the reference, and what they cost."""
     head = f"{'bath, friction, step':52s}{'slow/ps':>8s}{'ps':>6s}{'U, kJ/mol':>13s}{'off, %':>12s}{'T shift':>12s}"
@@ -405,13 +445,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", type=Path, metavar="FOLDER")
     parser.add_argument("--collect", type=Path, metavar="FOLDER")
+    parser.add_argument("--fresh", action="store_true")
     parser.add_argument("--show", type=Path, metavar="FILE")
     parser.add_argument("--tried", action="store_true", help="with --full: also what was tried besides")
     parser.add_argument("--hours", type=float, default=8.0, help="with --full: when to stop")
     parser.add_argument("--samples", type=int, default=300, help="with --collect: frames for temperatures")
     given = parser.parse_args()
     if given.show:
-        print(show_water(json_files.read(given.show)))
+        result = json_files.read(given.show)
+        print(show_water(result), show_fresh(result), sep="\n\n")
+    elif given.fresh:
+        print(show_fresh(keep("fresh", fresh())))
     elif given.full:
         full(given.full, (*METHODS, *TRIED) if given.tried else METHODS, given.hours)
     elif given.collect:

@@ -132,6 +132,7 @@ def check_company(present: Sequence[Any], own: Any, bound: Binding) -> None:
 
 
 _REPLACEMENTS = {
+    "Constraints": ": atoms.set_constraint(), then constrain(atoms, [*old.constraints, *new])",
     "FixAtoms": ", with FixedAtoms for what FixAtoms held",
     "FixBondLengths": ", with Distance for what FixBondLengths held",
     "FixInternals": ", with Distance, Angle and Dihedral for what FixInternals held",

@@ -134,6 +134,8 @@ def load_trajectory(universe: Any, trajectory: str | Path, topology: str | Path 
         advice = (
             "files of this format cannot be read at all when they were cut off; write DCD, XTC or TRR if that happens"
         )
+    if Path(trajectory).suffix.lower() == ".traj":
+        advice = "that is ASE's own format: ase convert run.traj run.xyz, or write with kcons.mdanalysis.write_ase"
     # A file that begins as it should was cut off, or damaged later.
     kind = UnreadableError if _begins_well(Path(trajectory)) else InputError
     raise kind(

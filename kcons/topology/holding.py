@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from kcons.constraints import Constraint
 from kcons.constraints.constraint import IntArray
-from kcons.errors import InputError
+from kcons.errors import InputError, did_you_mean
 from kcons.topology.rigid_groups import GEOMETRIES, WATER
 from kcons.topology.topology import near_misses
 
@@ -97,7 +97,7 @@ class Holding:
     def __post_init__(self) -> None:
         if self.kind not in CONSTRAIN:
             raise InputError(
-                f"cannot constrain {self.constrain!r}{near_misses(self.kind, CONSTRAIN)}; there are "
+                f"cannot constrain {self.constrain!r}{did_you_mean(self.kind, CONSTRAIN)}; there are "
                 f"{', '.join(CONSTRAIN)}",
                 item="constrain",
             )

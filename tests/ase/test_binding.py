@@ -351,3 +351,11 @@ def test_nan_force_in_dynamics_is_an_error():
     with pytest.raises(KconsError, match="not finite"):
         VelocityVerlet(atoms, 1 * units.fs).run(1)
     assert np.array_equal(atoms.positions, before)
+
+
+def test_a_second_object_of_kcons_says_how_to_make_one():
+    atoms = molecule("CH3OH")
+    first = constrain(atoms, Distance([[0, 1]]))
+    with pytest.raises(UnsupportedError, match=r"Constraints acts on atom 0.*\[\*old\.constraints, \*new\]"):
+        constrain(atoms, Distance([[0, 2]]))
+    assert atoms.constraints == [first]

@@ -51,6 +51,13 @@ def test_files_that_cannot_be_opened(tmp_path, ending):
     assert not isinstance(error.value, UnreadableError)
 
 
+def test_files_of_ase_are_told_from_broken_ones(tmp_path):
+    path = tmp_path / "run.traj"
+    path.write_bytes(b"- of UlmASE-Trajectory" * 50)
+    with pytest.raises(InputError, match=r"ASE's own format: ase convert run\.traj run\.xyz"):
+        load_trajectory(files.universe(N), path)
+
+
 def test_netcdf_that_was_cut_off_says_so(tmp_path, x):
     path = cut(files.write(tmp_path / "whole.nc", x), tmp_path / "cut.nc", -900)
     with pytest.raises(UnreadableError, match=r"cut\.nc.*cut off"):

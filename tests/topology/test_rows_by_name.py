@@ -139,7 +139,7 @@ def test_virtual_sites_are_no_degrees_of_freedom():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"constrain": "hbond"}, r"cannot constrain 'hbond' \(did you mean HBONDS"),
+        ({"constrain": "hbond"}, r"cannot constrain 'hbond' \(did you mean 'hbonds'\?"),
         ({"constrain": "none", "rigid_water": False}, "nothing is to be held"),
         ({"angles": "cosines"}, "angles must be"),
         ({"water_geometry": (1.0, 190.0)}, "give both positive"),

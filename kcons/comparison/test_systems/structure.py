@@ -222,6 +222,7 @@ def _explained(error: Exception, topology: Any) -> InputError:
         remedy = "add hydrogens: --add-hydrogens"
     else:
         remedy = "give a force field that has it (--forcefield FILE ...), or take it out of the file"
+    remedy += "; small molecules need none with other forces, --forces gfn2"
     return InputError(f"the force field has no template for {where}: {found[3]} Remedy: {remedy}", item="residue")
 
 
