@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -109,7 +110,7 @@ def test_another_process_needs_neither_sympy_nor_the_compiler(tmp_path):
             text=True,
             check=True,
             cwd=Path(expressions.__file__).parents[3],
-            env={**__import__("os").environ, "XDG_CACHE_HOME": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"},
+            env={**os.environ, "XDG_CACHE_HOME": str(tmp_path), "NUMBA_CACHE_DIR": "", "NUMBA_DEBUG_CACHE": "1"},
         )
         outputs.append(done.stdout)
     kept = [[line for line in out.splitlines() if "kcons-formulas" in line] for out in outputs]
