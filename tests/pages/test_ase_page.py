@@ -30,6 +30,12 @@ def test_statistics_lie_within_three_standard_errors(results):
         assert row["error"] <= 0.01 * row["expected"], row["what"]
 
 
+def test_what_order_four_gains(results):
+    off = {row["stepper"]: row["deviation_ev"] for row in results["energy"]}
+    assert f"{off['Rattle()'] / off['BlanesMoan4()']:.0f} times better than RATTLE" in page("ase.md")
+    assert off["BlanesMoan6()"] > off["BlanesMoan4()"]
+
+
 def test_energy_far_from_the_origin(results):
     rows = results["far"]
     assert all(row["kcons"] <= 1e-10 for row in rows)
