@@ -68,7 +68,11 @@ TABLE = {
         ("kcons compare water --out compare-water", "cp compare-water/compare.json F"),
         7,
     ),
-    "constant_pressure.json": Measurement((*BATHS, "ase"), script("34_constant_pressure", "--full"), 60),
+    "constant_pressure.json": Measurement(
+        (*BATHS, "ase"),
+        (*script("34_constant_pressure", "--full"), *script("38_constant_pressure_water", "--full")),
+        60,
+    ),
     "engine_speed.json": Measurement(CORE, script("03_engine_speed"), 20),
     "error_budget.json": Measurement(CORE, script("18_error_budget")),
     "free_energy.json": Measurement(
@@ -77,6 +81,7 @@ TABLE = {
     "growth.json": Measurement((*CORE, "models"), ("python examples/notes/growth_results.py --full --out F",), None),
     "hard_cases.json": Measurement(HARD, ("kcons hardcases --out hardcases", "cp hardcases/hard_cases.json F"), 6),
     "high_order.json": Measurement(CORE, script("04_high_order")),
+    "killed_runs.json": Measurement(("free_energy",), ("python tests/contracts/killed_runs.py",), None),
     "long_runs.json": Measurement(
         CORE,
         ("env KCONS_LONG_RUNS=F python -m pytest -m validation tests/contracts/test_long_runs.py",),
@@ -84,9 +89,13 @@ TABLE = {
     ),
     "long_steps.json": Measurement(
         (*BATHS, "ase"),
-        script("31_long_steps", "--small", "--cost", "--full long-steps", "--collect long-steps"),
+        (
+            *script("31_long_steps", "--small", "--cost"),
+            *script("39_long_steps_water", "--full long-steps", "--collect long-steps", "--fresh"),
+        ),
         500,
     ),
+    "long_steps_xtb.json": Measurement((*BATHS, "ase", "comparison/averages"), script("36_xtb_steps"), 30),
     "monte_carlo.json": Measurement(
         (*BATHS, "openmm", "ase"),
         script(
@@ -94,6 +103,9 @@ TABLE = {
             *(f"--full {part} --out F" for part in ("small", "water", "precision", "dhfr", "judge", "chain")),
         ),
         None,
+    ),
+    "more_free_energies.json": Measurement(
+        (*BATHS, "ase", "openmm", "free_energy"), script("35_more_free_energies", "--full more-free-energies"), 80
     ),
     "openmm.json": Measurement(OPENMM, script("06_openmm"), None),
     "openmm_compare.json": Measurement(OPENMM, script("11_openmm_compare"), 20),

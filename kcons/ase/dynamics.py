@@ -41,8 +41,7 @@ class ConstrainedDynamics(MolecularDynamics):
 
     Used as ASE's own classes are (`run`, `irun`, `attach`, trajectories, logs). Holds what the constraints on the atoms
     hold - those of kcons, and those of ASE that `from_ase_constraints` knows - all as one set, and what `constraints`
-    adds. Velocities come from the multipliers, not from differences of positions: the distance from the origin costs no
-    accuracy.
+    adds. Velocities come from the multipliers: the distance from the origin costs no accuracy.
 
     Parameters
     ----------
@@ -118,6 +117,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self._system: System | None = None
         self._state: State | None = None
         self._cell = b""
+        self._calculator = atoms.calc  # whose forces the state has
         self._momenta = np.zeros((0, 3))  # as written last
         self._weights = (self._momenta, self._momenta)  # masses to multiply and to divide by; fixed atoms stay
         self._forces = None if forces is None else _array(forces, len(atoms), "forces")
@@ -208,7 +208,7 @@ class ConstrainedDynamics(MolecularDynamics):
         carried = after.remainder, after.time_remainder, after.thermostat, after.barostat
         self._state = State(after.positions, v, after.time, after.forces, after.step, *carried)
         if after.barostat is not None:
-            self._cell = _surroundings(self.atoms)
+            self._cell = _cell_of(self.atoms)
 
     def _refresh_properties(self) -> None:
         # Some steppers do not end with forces at the last positions; compute these only for someone who looks.
@@ -242,14 +242,13 @@ class ConstrainedDynamics(MolecularDynamics):
         atoms = self.atoms
         x, p = atoms.arrays["positions"], atoms.arrays["momenta"]
         last = self._state
-        cell = _surroundings(atoms)
-        same = unmoved = last is not None and cell == self._cell
+        if last is not None and atoms.calc is not self._calculator:
+            last = self._state = replace(last, forces=None, thermostat=self._thermostat_after_change(last))
+        self._calculator = atoms.calc
+        cell = _cell_of(atoms)
+        same = last is not None and cell == self._cell
         if last is not None and same:
-            if _plain(x) and _plain(p):
-                unmoved = equal_pairs(x, last.positions, p, self._momenta)
-            else:
-                unmoved = bool((last.positions == x).all() and (self._momenta == p).all())
-            if unmoved:
+            if _same(x, last.positions, p, self._momenta):
                 if last.step == self.nsteps and last.time == self.time:
                     return last
                 remainder = last.time_remainder if last.time == self.time else 0.0
@@ -287,7 +286,7 @@ class ConstrainedDynamics(MolecularDynamics):
         self.time, self.nsteps = float(state.time), int(state.step)
         self._momenta, _ = self._put(x, v)
         self._state = replace(state.copied(), positions=x, velocities=v, time=self.time, step=self.nsteps)
-        self._cell = _surroundings(self.atoms)
+        self._cell = _cell_of(self.atoms)
 
     def _thermostat_after_change(self, last: State | None) -> FloatArray | None:
         """What a thermostat goes on with where somebody moved the atoms."""
@@ -357,9 +356,15 @@ def name_step(error: BaseException, number: int) -> None:
         error.add_note(f"in step {number}; the atoms are as they were at the end of the last good step")
 
 
-def _surroundings(atoms: Atoms) -> bytes:
-    """The cell, and whose forces were last asked for: with another calculator they are others."""
-    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes() + id(atoms.calc).to_bytes(8, "little"))
+def _cell_of(atoms: Atoms) -> bytes:
+    return bytes(atoms.cell.array.tobytes() + atoms.pbc.tobytes())
+
+
+def _same(x: FloatArray, y: FloatArray, p: FloatArray, q: FloatArray) -> bool:
+    """Whether x is y and p is q, to the last bit."""
+    if _plain(x) and _plain(p):
+        return bool(equal_pairs(x, y, p, q))
+    return bool((x == y).all() and (p == q).all())
 
 
 def _plain(values: Any) -> bool:
