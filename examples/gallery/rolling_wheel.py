@@ -1,4 +1,4 @@
-"""A wheel that rolls down a slope without slipping: a nonholonomic constraint. it falls behind one that slides.
+"""A wheel that rolls down a slope without slipping: a nonholonomic constraint. It falls behind one that slides.
 
 python rolling_wheel.py [FOLDER] [FRAMES]     writes rolling_wheel.gif
 """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import check_pairs, numbers
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError
@@ -39,13 +39,13 @@ class FittedForces:
     Raises
     ------
     InputError
-        An exchange that takes a pair to what is no pair; powers below 1.
+        Pairs that are none; an exchange that takes a pair to what is no pair; powers below 1.
     """
 
     def __init__(
         self, pairs: ArrayLike, exchanges: ArrayLike, powers: Sequence[int] = (1, 2, 3), length: float = 2.0
     ) -> None:
-        self.pairs: IntArray = np.asarray(pairs, dtype=np.int64)
+        self.pairs: IntArray = check_pairs(pairs)
         if not len(powers) or min(powers) < 1:
             raise InputError(f"powers are {tuple(powers)}; give numbers of 1 and more", item="powers")
         self.powers, self.length = np.array(powers, dtype=np.float64), length
@@ -81,10 +81,13 @@ class FittedForces:
         Raises
         ------
         InputError
-            No frames, or none that are finite.
+            No frames, or one with numbers that are not finite. The coefficients stay what they were.
         """
         if not len(frames):
             raise InputError("there are no frames to fit to", item="frames")
+        for k, frame in enumerate(frames):
+            if not all(np.isfinite(numbers(part, "frames")).all() for part in frame):
+                raise InputError(f"frame {k} has positions or forces that are not finite; leave it out", item="frames")
         self._centre = np.mean([self._features(x)[0] + self._centre for x, _ in frames], axis=0)
         kinds = self._sums[0]  # features of one kind have the same usual value
         self._centre = kinds.T @ ((kinds @ self._centre) / kinds.sum(axis=1))

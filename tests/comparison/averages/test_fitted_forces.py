@@ -90,3 +90,20 @@ def test_bad_input(motion):
         FittedForces(PAIRS, SAME, (0,))
     with pytest.raises(InputError, match="no frames to fit to"):
         FittedForces(PAIRS, SAME).fit(motion, [])
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_a_frame_that_is_not_finite_changes_nothing(motion, frames, part):
+    found = FittedForces(PAIRS, SAME, (1,))
+    found.fit(motion, frames)
+    before = found.evaluate(X)[1]
+    spoiled = [tuple(array.copy() for array in frame) for frame in frames]
+    spoiled[7][part][2, 1] = np.nan
+    with pytest.raises(InputError, match="frame 7 has positions or forces that are not finite"):
+        found.fit(motion, spoiled)
+    assert np.array_equal(found.evaluate(X)[1], before)
+
+
+def test_pairs_are_whole_numbers():
+    with pytest.raises(InputError, match="pairs of atoms"):
+        FittedForces(PAIRS + 0.5, SAME)
