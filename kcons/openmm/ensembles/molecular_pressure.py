@@ -14,6 +14,7 @@ from kcons.constraints.periodic.one_piece import make_whole, spanning_tree
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.openmm.ensembles.isokinetic_ensemble import GAS_CONSTANT, kelvins
+from kcons.openmm.integrator.system_checks import virtual_sites
 from kcons.openmm.quantities import masses_of
 from kcons.thermostats.freedom import positive
 
@@ -148,6 +149,7 @@ def _cells_to_whole(system: openmm.System, x: FloatArray, box: FloatArray, label
     for force in system.getForces():
         if isinstance(force, openmm.HarmonicBondForce | openmm.CustomBondForce):
             bonds += [force.getBondParameters(k)[:2] for k in range(force.getNumBonds())]
+    bonds += [(k, system.getVirtualSite(k).getParticle(0)) for k in virtual_sites(system)]
     tree = spanning_tree(np.array(bonds, dtype=np.int64).reshape(-1, 2), len(x))
     return np.asarray(np.round((make_whole(x, *tree, np.stack([box, inverse])) - x) @ inverse))
 

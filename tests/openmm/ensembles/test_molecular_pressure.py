@@ -112,6 +112,16 @@ def test_molecules_across_a_face_of_the_cell():
     assert abs(found[0]) < 100
 
 
+def test_a_virtual_site_is_in_one_piece_with_its_molecule():
+    system, x, wrapped = chain_and_atom(True)
+    system.addParticle(0.0)
+    system.getForce(0).addParticle(0.0, 0.35, 0.0)
+    system.setVirtualSite(5, openmm.TwoParticleAverageSite(2, 3, 0.5, 0.5))
+    x, wrapped = (np.vstack([y, y[2:4].mean(axis=0)]) for y in (x, wrapped))
+    found = [molecular_pressure(started(system, openmm.VerletIntegrator(0.001), y), 300) for y in (x, wrapped)]
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
 def test_rows_that_join_molecules():
     """They move as one where `hold` says so, and are refused otherwise: their forces would be missing."""
     found = []
