@@ -125,13 +125,12 @@ SHAPED = {
 }
 
 
-def judge_beside(ensemble, barostat, count, off):
-    """Twelve molecules, and an energy that keeps the shape of the box and knows nothing of its volume.
+def judge_beside(ensemble, barostat, count, off, n=12, side=4.0):
+    """Rigid molecules, and an energy that keeps the shape of the box and knows nothing of its volume.
 
     Without it shapes of a gas wander; it is stiff enough that no box vector has to be replaced by a shorter one, about
     which OpenMM's flexible barostat is not exact, also beside its own integrators. N is told from `off` more and less.
     """
-    n, side = 12, 4.0
     system, x = gas(n=n, side=side)
     system.addForce(openmm.CustomVolumeForce(f"{20 * KT}*((ax^2+bx^2+by^2+cx^2+cy^2+cz^2)/v^(2/3)-3)"))
     pressure = (n + 1) * KT / side**3
@@ -156,7 +155,11 @@ def test_volumes_beside_barostats_of_shapes(ensemble, barostat):
 @pytest.mark.parametrize("ensemble", ENSEMBLES)
 @pytest.mark.parametrize("barostat", SHAPED)
 def test_volumes_of_each_beside_each(ensemble, barostat):
-    judge_beside(ensemble, barostat, 20_000, 1)
+    """With fewer molecules OpenMM's trials reach volumes below zero, but for those of the flexible barostat."""
+    if barostat == "flexible":  # six lengths at once: few volumes are independent
+        judge_beside(ensemble, barostat, 20_000, 2)
+    else:
+        judge_beside(ensemble, barostat, 20_000, 1, N, SIDE)
 
 
 @pytest.mark.parametrize("joined", [False, True])
