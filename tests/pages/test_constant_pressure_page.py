@@ -71,7 +71,10 @@ def test_slopes_between_pressures_and_temperatures():
         assert abs(line["found"] - line["exact"]) < 3 * line["error"]
         beside = 0.35 if line["run"].startswith("OpenMM") else 0.2  # shorter runs
         assert line["error"] < beside * abs(line["exact"])
-        assert line["physical_validation"] < 3
+        if line["physical_validation"] is None:
+            assert line["run"] == "OpenMM, flexible, Langevin"
+        else:
+            assert line["physical_validation"] < 3
 
 
 def test_a_barostat_costs_less_than_a_twentieth_of_a_step():
