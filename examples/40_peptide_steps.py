@@ -5,9 +5,9 @@
     python examples/40_peptide_steps.py --show F         the tables of an earlier result
     python examples/40_peptide_steps.py --show F --draw P   and its curves, into the picture P
 
-Alanine dipeptide with amber14 in TIP3P. Expensive: PME with 9 A in space, as it is usually run. Cheap: all bonds, angles
-and torsions, and the same charges and Lennard-Jones terms up to 6 A, with a reaction field. Temperatures of shifts and
-turns are those of water, nearly all of them; internal motion is the peptide's alone.
+Alanine dipeptide with amber14 in TIP3P. Expensive: PME with 9 A in space, as it is usually run. Cheap: all bonds,
+angles and torsions, and the same charges and Lennard-Jones terms up to 6 A, with a reaction field. Temperatures of
+shifts and turns are those of water, nearly all of them; internal motion is the peptide's alone.
 """
 
 from __future__ import annotations
