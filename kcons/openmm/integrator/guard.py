@@ -134,11 +134,12 @@ class Guard:
         """What each relative residual may be, given the tolerance and the size of the coordinates.
 
         `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
-        positions to single numbers then, until the next step.
+        positions there to single numbers then, until the next step.
         """
         coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
         place = 2.0**-24 if coarse else self.precision.place
-        reach = np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0) / self.rows.lengths
+        inside = float(np.abs(np.array(_box(self.context))).sum(axis=0).max()) if coarse else 0.0
+        reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
         # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
         # particles are rounded.
         rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
