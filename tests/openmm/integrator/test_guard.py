@@ -316,10 +316,10 @@ def test_positions_rounded_to_single_numbers_are_excused_where_few_molecules_cro
     given = x.copy()
     given[: 2 * crossed] = inside[: 2 * crossed].astype(np.float32) - seen
     assert integrator.context is context
-    watch = integrator._guard
+    watch = integrator._guard.constraints
     assert (np.abs(watch.rows.stretches(given)) > watch.limit(given))[:crossed].all()
     if refused:
         with pytest.raises(ConvergenceError):
-            watch.check_rows(given, 1)
+            watch.check(given, 1)
     else:
-        watch.check_rows(given, 1)
+        watch.check(given, 1)
