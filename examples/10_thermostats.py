@@ -315,8 +315,8 @@ def jobs(full: bool) -> dict[str, Callable[[], dict[str, Any]]]:
     """What there is to run, by name."""
     found: dict[str, Callable[[], dict[str, Any]]] = {}
     for which in range(len(FLUIDS)) if full else (1,):
-        name, steps = NAMES[which], STEPS[which] if full else 1500
-        moves = partial(metropolis, which, 600_000 if full else 8_000)
+        name, steps = NAMES[which], STEPS[which] if full else 1000
+        moves = partial(metropolis, which, 600_000 if full else 3_000)
         found[f"Metropolis, {name}"] = partial(timed, "metropolis", moves)
         for thermostat in ("g - 1", "g", "Langevin"):
             taken = steps // 3 if thermostat == "Langevin" else steps

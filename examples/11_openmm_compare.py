@@ -95,7 +95,7 @@ def run(full: bool) -> dict[str, Any]:
                 continue
             test_system = test_systems.build(name, quick=not full)
             methods = None if full else QUICK_METHODS
-            result = measure.compare(test_system, methods=methods, budget=60 if full else 5, watcher=watcher)
+            result = measure.compare(test_system, methods=methods, budget=60 if full else 2, watcher=watcher)
             found[name] = result.to_dict()
             if full:
                 found[name]["targets"] = [cheapest(result, target) for target in targets]

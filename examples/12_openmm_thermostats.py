@@ -152,7 +152,7 @@ def sampling(full: bool, keep: Callable[[dict[str, Any]], None]) -> dict[str, An
     openmm.LocalEnergyMinimizer.minimize(context, 10, 200)
     relax.step(50_000 if full else 200)
     positions = context.getState(positions=True).getPositions(asNumpy=True)
-    length, interval = (1000.0, 100.0) if full else (0.5, 20.0)
+    length, interval = (1000.0, 100.0) if full else (0.2, 8.0)
     plan: list[tuple[str, Make, float, float]] = [
         ("LangevinMiddleIntegrator", middle, 1.0, 1.0),
         *[("kcons Langevin", langevin, fs, 1.0) for fs in (1.0, 2.0, 3.0, 4.0)],

@@ -242,7 +242,7 @@ def show_cost(result: dict[str, Any]) -> str:
 def quick() -> None:
     """A step in words, and a short run of each kind."""
     print(IsokineticSpheres(1.0, 1.0, 3, steps={"slow": 1, "fast": 2}).listing())
-    result = small(1500, 300, (("split", 1, 64, False),))
+    result = small(600, 150, (("split", 1, 64, False),))
     print(show_small(result))
     system, state = copies_of(64)
     energies: list[float] = []
