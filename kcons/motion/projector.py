@@ -139,6 +139,7 @@ class Projector:
         reference_time: float | None = None,
         velocities: FloatArray | None = None,
         dt: float | None = None,
+        flight: float = 0.0,
         out: FloatArray | None = None,
         multipliers: FloatArray | None = None,
     ) -> FloatArray:
@@ -155,6 +156,9 @@ class Projector:
             those of fixed atoms stay as they are.
         dt : float, optional
             Needed with `velocities`.
+        flight : float
+            Where `x_new` is the end of a flight of this length from `x_ref`, rows of velocities hold at its middle:
+            a((x_ref + x)/2) . (x - x_ref) = flight c((reference_time + time)/2). They do not count if it is 0.
         out : ndarray, optional
             Where to put the result; ``out=x_new`` works in place. Without it a new array is made.
         multipliers : ndarray, shape (n_rows,), optional
@@ -189,11 +193,11 @@ class Projector:
         if atoms is None:
             work = x if out is x_new else x.copy()
             ref = ref.copy() if np.may_share_memory(work, ref) else ref
-            self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers)
+            self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers, flight)
             return _in(out, work)
         part = x.take(atoms, 0)
         speeds = None if velocities is None else velocities.take(atoms, 0)
-        self._solve.positions(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers)
+        self._solve.positions(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers, flight)
         if velocities is not None and speeds is not None:
             velocities.put(self._flat, speeds)
         return self._put_back(part, x, x_new, out)

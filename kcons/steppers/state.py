@@ -21,7 +21,7 @@ from kcons.motion.certificate import Schedule
 from kcons.motion.motion import Motion
 from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.stages.compensated_steps import beyond, check_finite
-from kcons.steppers.stages.drifts import Drift, GreatCircles, rattle_drift
+from kcons.steppers.stages.drifts import Drift, FreeFlight, GreatCircles
 from kcons.steppers.stages.friction import Friction
 from kcons.steppers.stages.fused_stages import Flights
 
@@ -456,7 +456,7 @@ class System:
     @cached_property
     def drift(self) -> Drift:
         """Constrained flight by one RATTLE step."""
-        return rattle_drift(self.motion, self.inverse_masses)
+        return FreeFlight(self.motion)
 
     @cached_property
     def flights(self) -> Flights | None:

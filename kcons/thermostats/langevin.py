@@ -17,6 +17,21 @@ from kcons.steppers.stepper import Listed, stays
 from kcons.thermostats.freedom import carried, drift_velocity, open_directions, positive, refuse_friction
 
 
+def wind(bits: np.random.Philox, key: tuple[int, int], number: int, part: int = 0) -> None:
+    """Set a counter-based generator to the stretch of the key's stream that belongs to a part of a step."""
+    bits.state = {
+        "bit_generator": "Philox",
+        "state": {
+            "counter": np.array([0, 0, number, part], dtype=np.uint64),
+            "key": np.array(key, dtype=np.uint64),
+        },
+        "buffer": np.zeros(4, dtype=np.uint64),
+        "buffer_pos": 4,
+        "has_uint32": 0,
+        "uinteger": 0,
+    }
+
+
 class SeededBath(Listed):
     """What baths share whose noise is a function of a seed and of the number of the step.
 
@@ -81,19 +96,7 @@ class SeededBath(Listed):
 
     def drawn(self, number: int, shape: tuple[int, ...], part: int = 0) -> FloatArray:
         """Normal numbers that are a function of the seed, of the number of the step, and of its part."""
-        # A counter-based generator, set to the step's own stretch of the seed's stream.
-        bits = self._bits
-        bits.state = {
-            "bit_generator": "Philox",
-            "state": {
-                "counter": np.array([0, 0, number, part], dtype=np.uint64),
-                "key": np.array([self.seed, 0], dtype=np.uint64),
-            },
-            "buffer": np.zeros(4, dtype=np.uint64),
-            "buffer_pos": 4,
-            "has_uint32": 0,
-            "uinteger": 0,
-        }
+        wind(self._bits, (self.seed, 0), number, part)
         return self._normal.standard_normal(shape)
 
 

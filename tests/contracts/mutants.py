@@ -788,12 +788,24 @@ MUTANTS = [
         "free_energy/held_coordinates.py",
         "result[j] += mixed[s]",
         "result[j] += mixed[j]",
-        "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
+        "tests/free_energy/test_compiled_samples.py::test_the_same_as_the_general_formulas",
     ),
     (
         "free_energy/held_coordinates.py",
         "return seen if others is None else seen + metric.reactions @ others",
         "return seen if others is None else seen - metric.reactions @ others",
+        "tests/free_energy/test_compiled_samples.py::test_the_same_as_the_general_formulas",
+    ),
+    (
+        "free_energy/compiled_samples.py",
+        "out[j] += there[s]",
+        "out[j] += there[j]",
+        "tests/free_energy/test_held_coordinates.py::test_mean_force_is_the_one_of_the_definition",
+    ),
+    (
+        "free_energy/compiled_samples.py",
+        "answer[k] = -product[i, d + k]",
+        "answer[k] = product[i, d + k]",
         "tests/free_energy/test_held_coordinates.py::test_multipliers_are_those_of_the_engine",
     ),
     (
@@ -816,8 +828,8 @@ MUTANTS = [
     ),
     (
         "free_energy/rigid_turns.py",
-        "r = x[self.group] - x[self.axis[1]]\n        return",
-        "r = x[self.group]\n        return",
+        "u, v, w = x[atom, 0] - x[near, 0],",
+        "u, v, w = x[atom, 0],",
         "tests/free_energy/test_rigid_turns.py::test_the_smaller_group_turns_and_its_force_is_the_slope_of_the_energy",
     ),
     (

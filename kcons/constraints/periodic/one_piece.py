@@ -30,15 +30,18 @@ def lattice_of(cell: FloatArray | None, pbc: bool | Sequence[bool] | BoolArray) 
     InputError
         Periodic cell vectors that are zero or not independent.
     """
-    periodic = np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
-    if cell is None or not periodic.any():
+    # Barostats come here at each trial, with True; the rest takes many times as long.
+    periodic = None if pbc is True else np.broadcast_to(np.asarray(pbc, dtype=bool), (3,))
+    if cell is None or (periodic is not None and not periodic.any()):
         return None
-    if periodic.all():
-        # Barostats come here at each trial; the rest takes five times as long.
+    if periodic is None or periodic.all():
         with suppress(np.linalg.LinAlgError):
-            inverse = np.linalg.inv(cell)
-            if np.vdot(cell, cell) * np.vdot(inverse, inverse) < 1e16:
-                return np.stack([cell, inverse])
+            found = np.empty((2, 3, 3))
+            found[0], found[1] = cell, np.linalg.inv(cell)
+            if np.vdot(found[0], found[0]) * np.vdot(found[1], found[1]) < 1e16:
+                return found
+    if periodic is None:
+        periodic = np.ones(3, dtype=bool)
     full = cell.copy()
     basis = cell[periodic]
     _, singular, vh = np.linalg.svd(basis)

@@ -2,6 +2,7 @@
 
 - `cell_system`: a system whose cell can change
 - `pieces`: what moves as one: clusters tied by constraints, molecules, free atoms
+- `centre_moves`: pieces moved by their centres, compiled
 - `strains`: the ways in which a cell may change
 - `barostat`: trial cells, and the rule by which they are accepted
 - `monte_carlo_barostat`, `cell_rescaling`: where trial cells come from

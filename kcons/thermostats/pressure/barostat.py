@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ from kcons.steppers import State
 from kcons.steppers.operations import Operation
 from kcons.steppers.stages.compensated_steps import check_finite
 from kcons.thermostats.freedom import positive
+from kcons.thermostats.langevin import wind
 from kcons.thermostats.pressure.cell_system import CellSystem
 from kcons.thermostats.pressure.pieces import Held, Pieces, find_pieces, lattice_of, require_periodic
 from kcons.thermostats.pressure.strains import Kind, Strains
@@ -59,7 +61,7 @@ class Place:
     forces: FloatArray | None = None
     stress: FloatArray | None = None
 
-    @property
+    @cached_property
     def volume(self) -> float:
         return float(abs(np.linalg.det(self.cell)))
 
@@ -109,7 +111,7 @@ class Barostat:
     Raises
     ------
     InputError
-        Numbers that are not finite, an unknown kind, `every` below 1.
+        Numbers that are not finite, a pressure for each axis, an unknown kind, `every` below 1.
     """
 
     #: What the trial is, in words.
@@ -120,7 +122,7 @@ class Barostat:
         self,
         pressure: float,
         *,
-        every: int = 50,
+        every: int = 100,
         kind: Kind = "isotropic",
         seed: int = 0,
         tension: float = 0.0,
@@ -128,6 +130,13 @@ class Barostat:
         held: Held = "refuse",
         cutoff: float | None = None,
     ) -> None:
+        if not isinstance(pressure, str) and np.ndim(pressure):
+            raise InputError(
+                f"pressure is {pressure!r}; give one number. Work against a pressure of each axis depends on the way "
+                "from one cell to another, so that no distribution belongs to it; for layers give tension=, by which "
+                "the pressure along them is less by tension over thickness",
+                item="pressure",
+            )
         self.pressure = finite_number(pressure, "pressure")
         self.tension = finite_number(tension, "tension")
         self.strains = Strains.of(kind)
@@ -139,6 +148,8 @@ class Barostat:
         self.molecules = None if molecules is None else check_pairs(molecules)
         self.held: Held = held
         self.cutoff = None if cutoff is None else positive(cutoff, "cutoff")
+        self._bits = np.random.Philox(0)
+        self._random = np.random.Generator(self._bits)
         self._pieces: WeakKeyDictionary[CellSystem, Pieces] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -179,6 +190,8 @@ class Barostat:
 
     def acceptance(self, state: State) -> FloatArray:
         """Mean probability of acceptance of each mode so far; NaN before the first trial."""
+        if state.barostat is None:
+            return np.full(len(self.strains), np.nan)
         tried, taken = self._modes(state.barostat)[:2]
         with np.errstate(invalid="ignore"):
             return np.asarray(taken / tried)
@@ -197,9 +210,9 @@ class Barostat:
         """
         assert state.barostat is not None and state.cell is not None
         pieces = self.pieces(system, state.positions, state.time)
-        rng = np.random.Generator(np.random.Philox(key=[self.seed, 1], counter=[0, 0, state.step, 0]))
+        wind(self._bits, (self.seed, 1), state.step)
         before = self._place(system, state.cell, state.positions, state)
-        trial = self._trial(system, pieces, before, state, thermal_energy, dt, rng)
+        trial = self._trial(system, pieces, before, state, thermal_energy, dt, self._random)
         variables = state.barostat.copy()
         tried, taken, adapted = self._modes(variables)
         kept = np.abs(trial.e) <= self.strains.most
@@ -219,7 +232,7 @@ class Barostat:
             except BaseException:
                 system.set_cell(before.cell, state.positions)
                 raise
-        accepted = rng.random() < chance
+        accepted = self._random.random() < chance
         self._adapt(trial.mode, chance, tried, taken, adapted)
         if not accepted:
             if after is not before:

@@ -11,6 +11,7 @@ from kcons.steppers import State
 from kcons.thermostats.freedom import positive
 from kcons.thermostats.pressure.barostat import Barostat, Place, Trial
 from kcons.thermostats.pressure.cell_system import CellSystem
+from kcons.thermostats.pressure.centre_moves import work_of_shapes
 from kcons.thermostats.pressure.pieces import Pieces, lattice_of
 
 
@@ -52,18 +53,13 @@ class CellRescaling(Barostat):
         """Mean and standard deviation of each mode's change until the next trial."""
         strains, volume = self.strains, place.volume
         generators = strains.generators_in(strains.frame(place.cell))
-        traces = np.trace(strains.generators, axis1=1, axis2=2)
-        slope = np.empty(len(strains))
-        assert place.forces is not None and place.stress is not None
         rise = energy_by_strain(system, pieces, place)
-        for k, generator in enumerate(generators):
-            enthalpy = float((rise * generator).sum()) + self.pressure * volume * traces[k]
-            if self.tension:
-                enthalpy -= self.tension * place.area * float(generator[0, 0] + generator[1, 1])
-            # What the measure of the states and the changing width of the noise ask for leaves N, not N + 1.
-            slope[k] = float(np.diag(strains.generators[k]) @ pieces.moving) - enthalpy / thermal_energy
-        sizes = (strains.generators**2).sum(axis=(1, 2))
-        spread = self.compressibility * thermal_energy / (3 * sizes * volume * self.tau) * self.every * abs(dt)
+        enthalpy = generators.reshape(-1, 9) @ rise.ravel() + self.pressure * volume * strains.traces
+        if self.tension:
+            enthalpy -= self.tension * place.area * strains.diagonals[:, :2].sum(axis=1)
+        # What the measure of the states and the changing width of the noise ask for leaves N, not N + 1.
+        slope = strains.diagonals @ pieces.moving - enthalpy / thermal_energy
+        spread = self.compressibility * thermal_energy / (3 * strains.sizes * volume * self.tau) * self.every * abs(dt)
         wide = np.sqrt(2 * spread)
         # Bounded, so that from far away trials can still be taken back, and be accepted.
         return np.clip(spread * slope, -wide, wide), wide
@@ -103,9 +99,8 @@ def energy_by_strain(system: CellSystem, pieces: Pieces, place: Place) -> FloatA
     against the forces, and is taken out again.
     """
     assert place.forces is not None and place.stress is not None
-    y, _ = pieces.whole(place.positions, lattice_of(system))
-    followed = pieces.centres(y).T @ (pieces.sums(place.forces) * pieces.open)
-    return place.volume * place.stress + y.T @ place.forces - followed
+    own = pieces.label, pieces.weight, pieces.open, *pieces.tree
+    return place.volume * place.stress + work_of_shapes(place.positions, place.forces, *own, lattice_of(system))
 
 
 def _log_normal(e: FloatArray, mean: FloatArray, wide: FloatArray) -> float:

@@ -63,6 +63,7 @@ class CellSystem(System):
             )
         self._matrix = lattice[0].copy()
         self.periodic: NDArray[np.bool_] = lattice[1].any(axis=0)
+        self._pbc: bool | list[bool] = True if self.periodic.all() else self.periodic.tolist()
         self.stress_of = stress
         super().__init__(
             motion,
@@ -101,7 +102,7 @@ class CellSystem(System):
         InputError, ImageError
             As `Motion.set_cell`; nothing was changed.
         """
-        self.motion.set_cell(cell, self.periodic.tolist(), positions)
+        self.motion.set_cell(cell, self._pbc, positions)
         self._matrix = np.array(cell)
 
     def energy(self, x: FloatArray, time: float, step: int) -> float:

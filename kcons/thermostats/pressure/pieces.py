@@ -16,6 +16,7 @@ from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, UnsupportedError
 from kcons.motion.motion import Motion
 from kcons.thermostats.pressure.cell_system import CellSystem
+from kcons.thermostats.pressure.centre_moves import displacements
 
 Held = Literal["refuse", "stay"]
 
@@ -56,11 +57,11 @@ class Pieces:
         """How many pieces follow the cell along each axis, shape (3,)."""
         return self.open.sum(axis=0)
 
-    def whole(self, x: FloatArray, lattice: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions with each piece in one piece, and by how many cells atoms were moved for it."""
+    def whole(self, x: FloatArray, lattice: FloatArray) -> FloatArray:
+        """Positions with each piece in one piece."""
         y = x.copy()
         follow_parents(y, *self.tree, lattice)
-        return y, np.round((y - x) @ lattice[1])
+        return y
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Of an array over atoms, shape (n_atoms, 3), for each piece."""
@@ -71,12 +72,6 @@ class Pieces:
         """Centres of mass of positions in one piece (or their velocities), shape (n_pieces, 3)."""
         return self.sums(self.weight[:, None] * y)
 
-    def along(self, y: FloatArray, strain: FloatArray) -> FloatArray:
-        """By how much each atom moves where centres R move by R `strain`, shape (n_atoms, 3)."""
-        moved = self.centres(y) @ strain
-        moved *= self.open
-        return moved.take(self.label, axis=0)
-
     def moved(self, x: FloatArray, change: FloatArray, lattice: FloatArray) -> FloatArray:
         """Displacements for a cell that becomes cell (1 + `change`), each atom in the image that it is stored in.
 
@@ -85,17 +80,14 @@ class Pieces:
         UnsupportedError
             What stays in its place is stored across a face of the cell that moves.
         """
-        y, cells = self.whole(x, lattice)
-        d = self.along(y, change)
-        images = cells @ (lattice[0] @ change)
-        stays = ~self.open[self.label]
-        if images[stays].any():
-            atom = int(np.argmax((stays & (images != 0)).any(axis=1)))
+        d = np.empty_like(x)
+        atom = displacements(x, self.label, self.weight, self.open, *self.tree, lattice, change, d)
+        if atom >= 0:
             raise UnsupportedError(
                 f"atom {atom} is held in its place across a face of the cell that the barostat moves: the constraint "
                 "would mean another place. Store what is held with its neighbours on the same side"
             )
-        return d - images
+        return d
 
 
 def find_pieces(
@@ -172,7 +164,7 @@ def find_pieces(
     near = _joined(nearest)
     pieces = Pieces(label, masses / total[label], total, opened, spanning_tree(near, n_atoms, order))
     lattice = lattice_of(system)
-    y, _ = pieces.whole(positions, lattice)
+    y = pieces.whole(positions, lattice)
     closing = np.flatnonzero(np.round((y[near[:, 1]] - y[near[:, 0]]) @ lattice[1]).any(axis=1))
     if wound or len(closing):
         pair = f" between atoms {near[closing[0], 0]} and {near[closing[0], 1]}" if len(closing) else ""

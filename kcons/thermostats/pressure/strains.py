@@ -12,6 +12,7 @@ invariant measures, which differ by (S_11/S_33)^2 in a trial: see docs/constant_
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -79,6 +80,20 @@ class Strains:
         axes: NDArray[np.bool_] = np.asarray(np.diagonal(generators, axis1=1, axis2=2).sum(axis=0) > 0)
         return cls(kind, generators, axes, MOST / np.abs(generators).max(axis=(1, 2)))
 
+    @cached_property
+    def diagonals(self) -> FloatArray:
+        """Of the generators, shape (k, 3)."""
+        return np.ascontiguousarray(np.diagonal(self.generators, axis1=1, axis2=2))
+
+    @cached_property
+    def traces(self) -> FloatArray:
+        return np.asarray(self.diagonals.sum(axis=1))
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Sums of squares of the entries, shape (k,)."""
+        return np.asarray((self.generators**2).sum(axis=(1, 2)))
+
     @property
     def flexible(self) -> bool:
         return self.kind == "flexible"
@@ -99,13 +114,13 @@ class Strains:
     def matrix(self, e: FloatArray, frame: FloatArray | None) -> FloatArray:
         """S."""
         if not self.flexible:
-            return np.diag(np.exp(np.einsum("k,kii->i", e, self.generators)))
+            return np.diag(np.exp(e @ self.diagonals))
         inner = _exponential(np.tensordot(e, self.generators, 1))
         return inner if frame is None else frame.T @ inner @ frame
 
     def log_measure(self, e: FloatArray, moving: NDArray[np.int64]) -> float:
         """ln of the factor by which the measure of states grows; `moving` pieces follow the cell along each axis."""
-        logs = np.einsum("k,kii->i", e, self.generators)  # ln S_ii
+        logs = e @ self.diagonals  # ln S_ii
         shape = 2 * (logs[0] - logs[2]) if self.flexible else 0.0
         return float(logs @ moving + logs.sum() + shape)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,11 +34,13 @@ from kcons.thermostats.pressure import CellSystem, MonteCarloBarostat
         ({"molecules": [[0, 1], [2]]}, "bonds"),
         ({"held": "maybe"}, "held"),
         ({"width": 0.0}, "width"),
+        ({"pressure": [1.0, 1.0, 2.0], "kind": "anisotropic"}, "no distribution belongs to it"),
+        ({"pressure": np.ones(1)}, "give one number"),
     ],
 )
 def test_bad_settings(settings, match):
     with pytest.raises(InputError, match=match):
-        MonteCarloBarostat(1.0, **settings)
+        MonteCarloBarostat(**{"pressure": 1.0, **settings})
 
 
 def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
@@ -47,6 +50,7 @@ def test_widths_go_to_an_acceptance_of_one_half_and_trials_are_counted():
     for k in range(400):
         state = barostat.move(system, state, 1.0, 1.0)
         vars(state)["step"] = k
+    assert np.isnan(barostat.acceptance(replace(state, barostat=None))).all()
     tried, _, widths = state.barostat[10:].reshape(3, 2)
     assert tried.sum() == 400
     assert np.all(np.exp(widths) > 0.03)

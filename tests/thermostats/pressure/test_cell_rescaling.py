@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from pressure_systems import METHANE, cells_of, gas, no_force, p_value, round_shape, started
 from scipy import stats
 
 from kcons.errors import InputError
-from kcons.thermostats.pressure import CellRescaling
+from kcons.thermostats.pressure import CellRescaling, MonteCarloBarostat
 from kcons.thermostats.pressure.barostat import Place
 from kcons.thermostats.pressure.cell_rescaling import energy_by_strain
 from kcons.thermostats.pressure.pieces import find_pieces, lattice_of
@@ -69,6 +71,42 @@ def test_energy_by_strain_is_the_derivative(turned):
             system.set_cell(cell @ matrix, y)
             energies.append(system.energy(y, 0.0, 0))
         assert (found * generator).sum() == pytest.approx((energies[0] - energies[1]) / 2e-5, rel=1e-6, abs=1e-6)
+
+
+class Turned:
+    """A generator whose numbers are those of other axes."""
+
+    def __init__(self, inner, order):
+        self.inner, self.order, self.random = inner, order, inner.random
+
+    def standard_normal(self, n):
+        return self.inner.standard_normal(n)[self.order]
+
+    def integers(self, n):
+        return self.order.index(int(self.inner.integers(n)))
+
+
+@pytest.mark.parametrize("order", [[1, 2, 0], [1, 0, 2]])
+@pytest.mark.parametrize(
+    "barostat",
+    [
+        CellRescaling(0.06, 2.0, 16.0, every=1, seed=2, kind="anisotropic"),
+        MonteCarloBarostat(0.06, every=1, seed=2, kind="anisotropic", width=0.05),
+    ],
+    ids=["rescaling", "Monte Carlo"],
+)
+def test_no_axis_is_another_than_the_others(barostat, order):
+    """The same system with its axes in another order, and the same noise: the same cells in that order."""
+    cells = []
+    for taken in ([0, 1, 2], order):
+        system, x = gas(METHANE, 6, **waves())
+        x = np.ascontiguousarray(x[:, taken])
+        again = copy.deepcopy(barostat)
+        again._random = Turned(again._random, taken)
+        cells.append(cells_of(system, started(system, x, again), again, 40))
+    first, second = (np.diagonal(found, axis1=1, axis2=2) for found in cells)
+    assert second == pytest.approx(first[:, order], rel=1e-9)
+    assert np.ptp(first, axis=1)[-1] > 0.05 and len(np.unique(first)) > 20
 
 
 def round_stress(x, t, h):

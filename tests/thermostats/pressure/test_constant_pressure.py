@@ -74,6 +74,16 @@ def test_march_is_the_same_as_steps():
     assert np.array_equal(one.barostat, many.barostat)
 
 
+def test_all_states_shown_have_a_cell():
+    """Also the first, and in a trajectory."""
+    system, state = begun()
+    seen = []
+    kept = run(system, state, 0.05, 4, stepper=made("langevin", 2), observers=[lambda s: seen.append(s.cell)], record=2)
+    assert np.array_equal(seen[0], SIDE * np.eye(3))
+    assert [frame.cell.shape for frame in kept.frames] == [(3, 3)] * 3
+    assert np.array_equal(kept.last.cell, system.cell)
+
+
 def test_listing():
     lines = made("langevin", 25, kind="anisotropic").listing().splitlines()
     assert lines[0].startswith("a step of ConstantPressure(Langevin(")

@@ -33,7 +33,7 @@ def test_pieces_move_by_their_centres_and_keep_their_shape():
     system.set_cell(lattice[0] @ (np.eye(3) + change), y)
     assert system.motion.constraint_set.value(y, 0.0) == pytest.approx(np.zeros(80), abs=1e-13)
     # Differences of centres scale, up to cell vectors.
-    before, after = pieces.whole(x, lattice)[0], pieces.whole(y, lattice_of(system))[0]
+    before, after = pieces.whole(x, lattice), pieces.whole(y, lattice_of(system))
     d = pieces.centres(after) - pieces.centres(before) @ (np.eye(3) + change)
     assert d == pytest.approx(np.zeros((8, 3)), abs=1e-13)
     m = system.masses.reshape(8, 5, 1)
