@@ -108,8 +108,7 @@ class ConstraintSet(InCell):
         _check_atoms(given, x, m)
 
         self.constraints: tuple[Constraint, ...] = ()
-        starts = np.concatenate([[0], np.cumsum([c.n_rows for c in given], dtype=np.int64)])
-        self.starts: IntArray = starts.astype(np.int64)
+        self.starts: IntArray = np.concatenate([[0], np.cumsum([c.n_rows for c in given])]).astype(np.int64)
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)

@@ -238,8 +238,7 @@ class System:
         self.force = force
         self.potential = potential
         self.velocity_dependent = velocity_dependent and force is not None
-        self.n_atoms = motion.n_atoms
-        self._shape = (motion.n_atoms, 3)
+        self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
         fixed = _fixed_atoms(motion)
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))
