@@ -93,7 +93,7 @@ def test_what_moves_is_carried_and_not_expressed():
 def test_velocities_are_carried_and_not_expressed():
     row = VelocityFormula("x1*vy1 - y1*vx1", 0)
     system = beads()
-    with pytest.raises(UnsupportedError, match="holds velocities, not positions; hold it by kcons.openmm.hold"):
+    with pytest.raises(UnsupportedError, match=r"holds velocities, not positions; hold it by kcons.openmm.hold"):
         CollectiveRows(system, [row], positions=X)
     end = ran(system, hold(system, row, X))
     assert abs(np.cross(end[0, :3], end[0, 3:])[2]) < 1e-10
