@@ -4,6 +4,7 @@
     python examples/29_free_energy.py --full            the same with errors of 1 %, into docs/results/free_energy.json
     python examples/29_free_energy.py --alanine FOLDER  phi of alanine dipeptide: windows against umbrellas and MBAR
     python examples/29_free_energy.py --placement       how many windows five profiles need
+    python examples/29_free_energy.py --recording       what a sample costs beside a step
 
 The chain has four atoms, bonds held, harmonic angles and a torsion that is held; a trap on its first atom leaves the
 torsion's distribution alone, and keeps thermostats without noise ergodic. Its mean force is a quadrature.
@@ -347,6 +348,55 @@ def umbrella(place: float, number: int, steps: int, folder: str) -> np.ndarray:
     return np.array(found)
 
 
+# -- what recording costs ---------------------------------------------------------------------------------
+
+
+def recording(turns: int = 40, steps: int = 200) -> dict[str, object]:
+    """What recording adds to the processor time of alanine dipeptide's steps with phi (and psi) held, as a part of it.
+
+    Ratios of turns that follow one another, and their median: nothing else on the machine tells on them.
+    """
+    import io
+    from time import process_time
+
+    from openmm import Platform, app
+
+    from kcons.free_energy import HeldCoordinatesReporter, OpenMMWindows, Window
+    from kcons.openmm import Langevin as Bath
+
+    pdb = app.PDBFile(str(Path(__file__).parents[1] / "tests" / "data" / "alanine-dipeptide-implicit.pdb"))
+    torsions = {"phi": Dihedral([[4, 6, 8, 14]]), "psi": Dihedral([[6, 8, 14, 16]])}
+    default = Settings().every
+    found: dict[str, object] = {"every": default, "platform": Platform.getPlatformByName("Reference").getName()}
+    for count in (1, 2):
+        held = dict(list(torsions.items())[:count])
+        sampler = OpenMMWindows(pdb.topology, _system(pdb), pdb.positions, held, platform="Reference")
+        start, _ = sampler.begin()
+        window = Window(0, "up", tuple(start), tuple(start), 1)
+        bath = Bath(TEMPERATURE, FRICTION)
+        simulation = sampler._simulation(start, [0.0] * count, bath, STEP / 1000, window)
+        simulation.context.setPositions(pdb.positions)
+        simulation.integrator.applyConstraints()
+        simulation.integrator.setVelocitiesToTemperature(simulation.context, TEMPERATURE, 1)
+        reporters = {every: HeldCoordinatesReporter(io.StringIO(), every, held) for every in (10, default)}
+        for reporter in reporters.values():  # what is set up once
+            simulation.reporters = [reporter]
+            simulation.step(2 * default)
+        ratios: dict[int, list[float]] = {every: [] for every in reporters}
+        for _ in range(turns):
+            times = {}
+            for every in (0, *reporters):
+                simulation.reporters = [reporters[every]] if every else []
+                began = process_time()
+                simulation.step(steps)
+                times[every] = process_time() - began
+            for every in reporters:
+                ratios[every].append(times[every] / times[0] - 1)
+        found[f"{count} held"] = {str(every): float(np.median(each)) for every, each in ratios.items()}
+        print(count, found[f"{count} held"], flush=True)
+    return found
+
+
 def main(arguments: list[str]) -> None:
     if "--alanine" in arguments:
         folder = Path(arguments[arguments.index("--alanine") + 1])
@@ -354,6 +404,8 @@ def main(arguments: list[str]) -> None:
         found = {"alanine dipeptide": alanine(folder, 24, 36, 40_000, 1)}
     elif "--placement" in arguments:
         found = {"placement": placement()}
+    elif "--recording" in arguments:
+        found = {"recording": recording()}
     else:
         found = {"chain": closed_forms("--full" in arguments)}
         if "--full" not in arguments:

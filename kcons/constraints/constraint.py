@@ -38,6 +38,7 @@ class RowKind(IntEnum):
     ANGLE = 2  # atoms i, j, k with vertex j; no parameters; coordinate theta
     LINEAR = 3  # sum_a c_a . r_a; parameters c, 3 numbers an atom
     FUNCTION = 4  # a function that the kernels call; see `kcons.solvers.sparse.row_functions`
+    VELOCITY = 6  # linear in the velocities, coefficients from a function; 5 and 7 are functions of differences
 
 
 class Constraint(ABC):

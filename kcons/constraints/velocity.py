@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kcons.constraints.arguments import ANY, SPEED, lent, numbers
-from kcons.constraints.constraint import Constraint
+from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.target import FloatArray, Target, first_derivative_4
 from kcons.constraints.vectors import dot, first_true, norm, unit
 from kcons.errors import InputError
@@ -58,6 +58,7 @@ class LinearVelocity(VelocityRows):
     """
 
     family = "LinearVelocity"
+    kind = RowKind.VELOCITY
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"coefficients": (-1, 3)}
     coefficients: FloatArray
 
@@ -80,6 +81,9 @@ class LinearVelocity(VelocityRows):
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         return np.zeros(self.n_rows)
+
+    def parameters(self) -> FloatArray:
+        return np.hstack([np.full((self.n_rows, 1), 3.0 * self.width), self.coefficients.reshape(self.n_rows, -1)])
 
 
 class KnifeEdge(VelocityRows):
@@ -108,6 +112,7 @@ class KnifeEdge(VelocityRows):
     """
 
     family = "KnifeEdge"
+    kind = RowKind.VELOCITY
     row_width = 2
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"normal": _VECTOR, "contact": ()}
@@ -147,6 +152,9 @@ class KnifeEdge(VelocityRows):
         gliding = dot(along, np.einsum("ka,kai->ki", self._shares, v))
         return -turning * gliding
 
+    def parameters(self) -> FloatArray:
+        return np.hstack([self.normal, self.contact[:, None]])
+
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         d = r[:, 1] - r[:, 0]
         _refuse_short(self, norm(np.cross(d, self.normal)), norm(d), "the blade is normal to its plane", first_row)
@@ -181,6 +189,7 @@ class Rolling(VelocityRows):
     """
 
     family = "Rolling"
+    kind = RowKind.VELOCITY
     row_width = 2
     translation_invariant = True
     per_row: ClassVar[Mapping[str, tuple[int, ...]]] = {"radius": (), "heading": _VECTOR, "normal": _VECTOR}
@@ -229,6 +238,9 @@ class Rolling(VelocityRows):
         stretching = (up * dot(ds, self.normal) + ahead * dot(ds, self.heading)) / square
         return 2 * self.radius * stretching * dot(w, ds)
 
+    def parameters(self) -> FloatArray:
+        return np.hstack([self.radius[:, None], self.heading, self.normal])
+
     def check(self, r: FloatArray, time: float, first_row: int) -> None:
         s = r[:, 1] - r[:, 0]
         in_wheel = np.hypot(dot(s, self.normal), dot(s, self.heading))
@@ -236,14 +248,15 @@ class Rolling(VelocityRows):
 
 
 class CustomVelocity(VelocityRows):
-    """A row whose coefficients are a Python function, called once a row.
+    """A row whose coefficients are a function, called once a row.
 
     Parameters
     ----------
     atoms : array_like of int, shape (n_rows, width) or (width,)
         Atoms of each row.
     coefficients : callable
-        ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``.
+        ``coefficients(r) -> (width, 3)`` for positions of shape (width, 3); with `time_dependent`, ``(r, t)``. It must
+        depend on nothing else. Where Numba has compiled it, kernels call it without Python.
     derivative : callable, optional
         ``derivative(r, v) -> (width, 3)``, the time derivative of the coefficients along the motion; with
         `time_dependent`, ``(r, v, t)``, and the explicit time derivative included. Without it the coefficients
@@ -259,6 +272,7 @@ class CustomVelocity(VelocityRows):
     """
 
     family = "CustomVelocity"
+    kind = RowKind.VELOCITY
     held = ANY
     functions: ClassVar[tuple[str, ...]] = ("coefficients", "derivative")
 
@@ -306,6 +320,10 @@ class CustomVelocity(VelocityRows):
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         rows = [self._call(self.coefficients, "coefficients", k, r[k], time) for k in range(self.n_rows)]
         return np.array(rows).reshape(self.n_rows, self.width, 3)
+
+    def row(self, k: int, r: FloatArray, time: float) -> FloatArray:
+        """Coefficients of row `k` alone at `r`, shape (width, 3); for kernels."""
+        return self._call(self.coefficients, "coefficients", k, r, time)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         out = np.zeros(self.n_rows)

@@ -15,6 +15,7 @@ from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.constraint_set import ConstraintSet, rows_like
 from kcons.constraints.target import FloatArray
 from kcons.errors import InputError, NonFiniteError, SingularGeometryError, UnsupportedError
+from kcons.free_energy.compiled_samples import CompiledSamples, compilable
 from kcons.free_energy.rigid_turns import RigidTurn, leaves_the_rest, rigid_turn
 from kcons.motion.motion import Motion
 
@@ -146,6 +147,11 @@ class HeldCoordinates:
         self._inverse_masses = 1 / held.masses[self.atoms, None]
         self.motion = Motion(self._others, x[other_atoms], time=time) if len(others) else None
         self._at(x[self.atoms], time)
+        self._compiled: CompiledSamples | None = None
+        if compilable(self._own) and compilable(self._others):
+            places = (self._rank_of, self._own_atoms, self._other_atoms)
+            masses = held.masses[self.atoms]
+            self._compiled = CompiledSamples(self._own, self._others, *places, self.atoms, 1 / masses, self.periods)
         self._turns: list[RigidTurn | None] = [None] * len(self)
         if bonds is not None:
             pairs = np.array(bonds, dtype=np.int64).reshape(-1, 2)
@@ -180,16 +186,19 @@ class HeldCoordinates:
             A coordinate has come to depend on the other constraints.
         """
         shape = (self._source.n_atoms, 3)
-        arrays, whole = [], []
-        for array, item in ((x, "positions"), (v, "velocities"), (f, "forces")):
-            whole.append(as_array(array, shape, item))
-            near = whole[-1][self.atoms]
-            finite = np.isfinite(near).all(axis=1)
+        named = ((x, "positions"), (v, "velocities"), (f, "forces"))
+        whole = [as_array(array, shape, item) for array, item in named]
+        turned = np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns])
+        found = None if self._compiled is None else self._compiled.sample(whole, time, self._source.lattice)
+        if found is not None:
+            value, moving, kinetic, gradient, off, log_det_z = found
+            return Sample(time, value, moving, kinetic, float(log_det_z[0]), gradient, max(off.tolist()), turned)
+        for array, (_, item) in zip(whole, named, strict=True):
+            finite = np.isfinite(array[self.atoms]).all(axis=1)
             if not finite.all():
                 atom = int(self.atoms[np.argmin(finite)])
                 raise NonFiniteError(f"{item} of atom {atom} are not finite at time {time:g}", item=item, atom=atom)
-            arrays.append(near)
-        here, speed, force = arrays
+        here, speed, force = (array[self.atoms] for array in whole)
         metric = self._at(here, time)
         pushed = np.einsum("ian,an->i", metric.kept, force)
         bent = self._curvatures(here, self._fields(speed, metric.directions), time, metric)
@@ -199,18 +208,11 @@ class HeldCoordinates:
             rest, driven = np.zeros(len(self)), -bent[0]
         still, moving = metric.inverse @ (rest - pushed), metric.inverse @ (driven - pushed)
         value = self._named(self._own.measure(here[self._own_atoms], time))
+        gradient = self._change_of_z(bent[1:])
         off = value - self._named(self._own.target(time))
         off -= self.periods * np.round(off / np.where(self.periods, self.periods, np.inf))
-        return Sample(
-            time,
-            value,
-            moving,
-            moving - still,
-            metric.log_det_z,
-            self._change_of_z(bent[1:]),
-            float(np.abs(off).max()),
-            np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns]),
-        )
+        largest = float(np.abs(off).max())
+        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, largest, turned)
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).

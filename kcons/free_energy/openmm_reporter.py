@@ -8,7 +8,6 @@ from typing import Any, TextIO
 
 import numpy as np
 import openmm
-from openmm import unit
 
 from kcons.constraints import Constraint
 from kcons.constraints.arguments import whole_number
@@ -93,8 +92,12 @@ class HeldCoordinatesReporter:
 
     def report(self, simulation: Any, state: openmm.State) -> None:
         """Write a line."""
-        x = state.getPositions(asNumpy=True).value_in_unit(unit.nanometer)
-        time = state.getTime().value_in_unit(unit.picosecond)
+        # A State is in nm and ps; its Quantities take longer to make than the sample.
+        kinds = (openmm.State.Positions, openmm.State.Velocities, openmm.State.Forces)
+        x, v, f = arrays = [np.empty((simulation.system.getNumParticles(), 3)) for _ in kinds]
+        for kind, array in zip(kinds, arrays, strict=True):
+            state._getVectorAsNumpy(kind, array)
+        time = state.getTime()._value
         if self._held is None:
             self._begin(simulation, x, time)
         assert self._held is not None and self._set is not None
@@ -103,13 +106,10 @@ class HeldCoordinatesReporter:
         ensemble = getattr(simulation.integrator, "ensemble", None)
         if isinstance(ensemble, Isokinetic):
             self.series.isokinetic_degrees_of_freedom = ensemble.count(simulation.integrator)
-        v = state.getVelocities(asNumpy=True).value_in_unit(unit.nanometer / unit.picosecond)
-        f = state.getForces(asNumpy=True).value_in_unit(unit.kilojoule_per_mole / unit.nanometer)
         sample = self._held.sample(x, v, f, time)
-        self.series.append(sample)
-        pairs = np.column_stack([sample.value, sample.multiplier]).ravel().tolist()
-        numbers = [time, *pairs, sample.log_det_z, float(self.series[-2:].work[-1]) + self._work]
-        self._work = numbers[-1]
+        self._work += self.series.append(sample)
+        pairs = [n for pair in zip(sample.value.tolist(), sample.multiplier.tolist(), strict=True) for n in pair]
+        numbers = [time, *pairs, sample.log_det_z, self._work]
         self._file.write(",".join([str(simulation.currentStep), *(f"{number:.12g}" for number in numbers)]) + "\n")
         self._file.flush()
 

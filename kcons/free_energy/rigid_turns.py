@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -48,11 +49,7 @@ class RigidTurn(NamedTuple):
 
     def force(self, x: FloatArray, f: FloatArray) -> float:
         """dU/dphi of the turn; NaN where a bond of the group is broken, by a box for example."""
-        apart = np.linalg.norm(x[self.bonds[:, 0]] - x[self.bonds[:, 1]], axis=1)
-        if (apart > _BROKEN * self.lengths).any():
-            return float("nan")
-        r = x[self.group] - x[self.axis[1]]
-        return -float(self._direction(x) @ np.cross(r, f[self.group]).sum(axis=0))
+        return float(_torque(x, f, self.axis, self.group, self.bonds, self.lengths))
 
     def _direction(self, x: FloatArray) -> FloatArray:
         e: FloatArray = x[self.axis[1]] - x[self.axis[0]]
@@ -120,3 +117,20 @@ def _volume(rows: ConstraintSet, x: FloatArray) -> float:
         return 0.0
     a = rows.jacobian(x).toarray() / np.sqrt(np.repeat(rows.masses, 3))
     return float(np.linalg.slogdet(a @ a.T)[1])
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _torque(x, f, axis, group, bonds, lengths):  # type: ignore[no-untyped-def]
+    for b in range(len(bonds)):
+        i, j = bonds[b, 0], bonds[b, 1]
+        square = (x[i, 0] - x[j, 0]) ** 2 + (x[i, 1] - x[j, 1]) ** 2 + (x[i, 2] - x[j, 2]) ** 2
+        if square > (_BROKEN * lengths[b]) ** 2:
+            return np.nan
+    far, near = axis
+    a, b, c = x[near, 0] - x[far, 0], x[near, 1] - x[far, 1], x[near, 2] - x[far, 2]
+    total = 0.0
+    for atom in group:
+        u, v, w = x[atom, 0] - x[near, 0], x[atom, 1] - x[near, 1], x[atom, 2] - x[near, 2]
+        p, q, r = f[atom, 0], f[atom, 1], f[atom, 2]
+        total -= a * (v * r - w * q) + b * (w * p - u * r) + c * (u * q - v * p)
+    return total / np.sqrt(a * a + b * b + c * c)

@@ -59,8 +59,16 @@ class Series:
         self.periods: FloatArray = np.broadcast_to(np.asarray(periods, dtype=np.float64), (len(self.names),)).copy()
         self._samples: list[Sample] = []
 
-    def append(self, sample: Sample) -> None:
+    def append(self, sample: Sample) -> float:
+        """Add a sample; what moving targets have done since the one before."""
+        done = 0.0
+        if self._samples:
+            before = self._samples[-1]
+            ends = (before.value, sample.value, before.multiplier, sample.multiplier, self.periods)
+            for a, b, first, last, period in zip(*(array.tolist() for array in ends), strict=True):
+                done += (first + last) / 2 * (b - a - (period * round((b - a) / period) if period else 0.0))
         self._samples.append(sample)
+        return done
 
     def __len__(self) -> int:
         return len(self._samples)

@@ -41,6 +41,7 @@ class LocalProjections:
         self.unchecked: FloatArray | None = None
         # Plain attributes: a step of one bond takes microseconds, and looking these up would show.
         self._moving = rows.moving
+        self._velocity_rows: IntArray = np.flatnonzero(~rows.holonomic)
         self._several = len(plan.solvers) > 1 or len(plan.pinned) > 0
         self.iterations = [0] * len(plan.solvers)
         self._rescuers = Rescuers(rows, plan, numbers)
@@ -54,12 +55,21 @@ class LocalProjections:
         velocities: FloatArray | None,
         inv_dt: float,
         multipliers: FloatArray | None,
+        flight: float = 0.0,
     ) -> None:
-        """Run all solvers in place; restore what they changed and raise if one fails."""
+        """Run all solvers in place; restore what they changed and raise if one fails.
+
+        Rows of velocities hold at the middle of a `flight` of that length from `ref` to `x`; if it is 0, they do not
+        count.
+        """
         plan, rows = self.plan, self.rows
         lattice = rows.lattice
         images = None if lattice is None else rows.images
         targets = rows.target(time) if self._moving else None
+        if len(self._velocity_rows):
+            targets = rows.target(time) if targets is None else targets
+            middle = rows.target(0.5 * (reference_time + time)) if flight else targets
+            targets[self._velocity_rows] = flight * middle[self._velocity_rows]
         # One solver alone restores what it changed; several need a copy to go back to.
         several = self._several or images is not None
         saved = (x.copy(), None if velocities is None else velocities.copy()) if several else None
@@ -76,7 +86,7 @@ class LocalProjections:
                 stored, ref = ref, images.make_whole(ref, lattice)
                 shifts = images.follow(x, stored, ref, lattice)
                 x[images.atoms] += shifts
-            given = (x, ref, targets, lattice, time, reference_time, velocities, inv_dt)
+            given = (x, ref, targets, lattice, time, reference_time, velocities, inv_dt, flight != 0)
             request = tuple.__new__(Request, given)  # as `Request(*given)`, in a third of its time
             for k, solver in enumerate(plan.solvers):
                 lam = None if multipliers is None else np.empty(len(solver.rows))
@@ -130,7 +140,7 @@ class LocalProjections:
                         np.copyto(y, saved)
                     raise
         found: list[FloatArray | None] = []
-        request = tuple.__new__(Request, (y, x, rates, lattice, time, time, None, 0.0))
+        request = tuple.__new__(Request, (y, x, rates, lattice, time, time, None, 0.0, False))
         for k, solver in enumerate(plan.solvers):
             lam = None if multipliers is None else np.empty(len(solver.rows))
             outcome = solver.tangents(request if lattice is None else plan.asked_of(k, request), lam)

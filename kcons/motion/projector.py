@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, check_multipliers, check_out
+from kcons.constraints.arguments import as_array, check_multipliers, check_out, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
@@ -33,6 +33,7 @@ class Projector:
     ) -> None:
         if degenerate not in ("convert", "raise"):
             raise InputError(f"degenerate must be 'convert' or 'raise', not {degenerate!r}", item="degenerate")
+        refuse_other(constraint_set, ConstraintSet, "constraint_set", "a kcons.ConstraintSet")
         self._shape = (constraint_set.n_atoms, 3)
         x = as_array(positions, self._shape, "positions")
         self._given = constraint_set
@@ -139,6 +140,7 @@ class Projector:
         reference_time: float | None = None,
         velocities: FloatArray | None = None,
         dt: float | None = None,
+        flight: float = 0.0,
         out: FloatArray | None = None,
         multipliers: FloatArray | None = None,
     ) -> FloatArray:
@@ -155,6 +157,9 @@ class Projector:
             those of fixed atoms stay as they are.
         dt : float, optional
             Needed with `velocities`.
+        flight : float
+            Where `x_new` is the end of a flight of this length from `x_ref`, rows of velocities hold at its middle:
+            a((x_ref + x)/2) . (x - x_ref) = flight c((reference_time + time)/2). They do not count if it is 0.
         out : ndarray, optional
             Where to put the result; ``out=x_new`` works in place. Without it a new array is made.
         multipliers : ndarray, shape (n_rows,), optional
@@ -189,11 +194,11 @@ class Projector:
         if atoms is None:
             work = x if out is x_new else x.copy()
             ref = ref.copy() if np.may_share_memory(work, ref) else ref
-            self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers)
+            self._solve.positions(work, ref, time, reference_time, velocities, inv_dt, multipliers, flight)
             return _in(out, work)
         part = x.take(atoms, 0)
         speeds = None if velocities is None else velocities.take(atoms, 0)
-        self._solve.positions(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers)
+        self._solve.positions(part, ref.take(atoms, 0), time, reference_time, speeds, inv_dt, multipliers, flight)
         if velocities is not None and speeds is not None:
             velocities.put(self._flat, speeds)
         return self._put_back(part, x, x_new, out)

@@ -180,10 +180,9 @@ def _row_tables(constraint_set: ConstraintSet) -> tuple[NDArray[np.int64], IntAr
     pairs = np.full((constraint_set.n_rows, 2), -1, dtype=np.int64)
     for item, start in zip(constraint_set.constraints, constraint_set.starts, strict=False):
         rows = slice(start, start + item.n_rows)
-        if item.holonomic:
-            kinds[rows] = item.kind
-            if item.windings is not None:  # whole cells between the atoms of a row: for no compiled solver
-                kinds[start + np.flatnonzero(item.windings.any(axis=(1, 2)))] = RowKind.INTERPRETED
+        kinds[rows] = item.kind
+        if item.windings is not None:  # whole cells between the atoms of a row: for no compiled solver
+            kinds[start + np.flatnonzero(item.windings.any(axis=(1, 2)))] = RowKind.INTERPRETED
         if item.kind == RowKind.DISTANCE:
             pairs[rows] = item.atoms
     return kinds, pairs

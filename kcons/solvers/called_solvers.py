@@ -52,7 +52,7 @@ class CalledSolver(ABC):
     tables : ndarray of float64
         What the kernels know of the rows, in one array.
     numbers : ndarray of float64
-        What functions among the rows get and give; begins with two times, now and at the reference.
+        What functions among the rows get and give; begins as `kcons.solvers.sparse.row_functions` says.
     """
 
     rows: IntArray
@@ -77,9 +77,9 @@ class CalledSolver(ABC):
 
     def positions(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """Solve the SHAKE condition by true Newton, in place."""
-        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt = request
+        x, reference, wanted, lattice, time, reference_time, velocities, inv_dt, flight = request
         numbers = self._given.numbers
-        numbers[:2] = time, reference_time
+        numbers[:3] = time, reference_time, flight
         for careful in self.ways:
             found = self.kernels[0](
                 careful, True, x, reference, x if velocities is None else velocities,
@@ -96,7 +96,7 @@ class CalledSolver(ABC):
     def tangents(self, request: Request, multipliers: FloatArray | None = None) -> Outcome:
         """M-orthogonal projection of y onto A y = rates, in place."""
         y, x, wanted, lattice, time, *_ = request
-        self._given.numbers[:2] = time
+        self._given.numbers[:3] = time, time, 1.0
         found = self.kernels[1](
             True, x, y, NO_NUMBERS if wanted is None else wanted[self.rows],
             NO_LATTICE if lattice is None else lattice, lattice is not None, self.tables, self._given.numbers,

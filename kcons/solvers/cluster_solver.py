@@ -29,6 +29,10 @@ class Request(NamedTuple):
     velocities : ndarray, shape (n_atoms, 3), optional
         Changed by the displacement of positions times `inv_dt`.
     inv_dt : float
+    flight : bool
+        Whether `reference` is where a flight began that ends in `changed`: rows of velocities then hold at its middle,
+        at the middle of the times, and `wanted` has what they are held at times the length of the flight. Otherwise
+        rows of velocities do not count in positions.
     """
 
     changed: FloatArray
@@ -39,6 +43,7 @@ class Request(NamedTuple):
     reference_time: float = 0.0
     velocities: FloatArray | None = None
     inv_dt: float = 0.0
+    flight: bool = False
 
 
 class Outcome(NamedTuple):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
@@ -35,6 +36,37 @@ class _Batch:
     columns: IntArray  # (n, C) Cartesian columns of the subset
     entries: IntArray  # where the subset's Jacobian data stand ...
     places: IntArray  # ... and where they go in the flat (n, K, C) array
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """Where and when rows of velocities hold, and at what, as `Request` says."""
+
+    subset: ConstraintSet
+    start: FloatArray
+    time: float
+    wanted: FloatArray
+
+    @property
+    def entries(self) -> NDArray[np.bool_]:
+        """Which of the Jacobian's data are those of rows of velocities."""
+        return np.repeat(~self.subset.holonomic, 3 * np.diff(self.subset.incidence.indptr))
+
+    @classmethod
+    def of(cls, request: Request, subset: ConstraintSet, atoms: IntArray, rows: IntArray) -> _Flight | None:
+        """For some atoms and rows; None where rows of velocities do not count."""
+        if not request.flight or request.wanted is None:
+            return None
+        middle = 0.5 * (request.reference_time + request.time)
+        return cls(subset, request.reference[atoms], middle, request.wanted[rows])
+
+    def jacobian(self, end: FloatArray) -> csr_array:
+        return self.subset.jacobian(0.5 * (self.start + end), self.time)
+
+    def slips(self, end: FloatArray) -> FloatArray:
+        """By how much rows of velocities are off at `end`; 0 for the others, as these have 0 for sigma."""
+        found: FloatArray = self.jacobian(end) @ (end - self.start).ravel() - self.wanted
+        return np.where(self.subset.holonomic, 0.0, found)
 
 
 class GeneralClusters:
@@ -113,11 +145,13 @@ class GeneralClusters:
         reach = np.einsum("nka,na->nk", norms, sizes)
         return np.maximum(1e-14, 2 * _EPS * reach / self._scale[batch.rows])
 
-    def _sigma(self, batch: _Batch, state: FloatArray, time: float) -> FloatArray:
-        return self.subset.value(state, time)[batch.rows]
+    def _sigma(self, batch: _Batch, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
+        sigma = self.subset.value(state, time) + (0.0 if flight is None else flight.slips(state))
+        return sigma[batch.rows]
 
-    def _data(self, state: FloatArray, time: float) -> FloatArray:
-        return self.subset.jacobian(state, time).data
+    def _data(self, state: FloatArray, time: float, flight: _Flight | None = None) -> FloatArray:
+        data = self.subset.jacobian(state, time).data
+        return data if flight is None else np.where(flight.entries, flight.jacobian(state).data, data)
 
     # -- positions ------------------------------------------------------------------------------
 
@@ -125,13 +159,15 @@ class GeneralClusters:
         """Solve sigma(x_new + M^-1 A(x_ref)^T Lambda, time) = 0 in place; see `Motion.project_positions`."""
         self.subset.lattice = request.lattice
         state = request.changed[self.atoms]
+        flight = None if self._held.all() else _Flight.of(request, self.subset, self.atoms, self.rows)
         with np.errstate(all="ignore"):
             reference = self._data(request.reference[self.atoms], request.reference_time)
             total = np.zeros(len(self.rows))
             moves = np.zeros_like(state)
             worst = Outcome(True, 0.0, 0, -1)
             for batch in self._batches:
-                outcome = self._newton(batch, state, moves, self._weighted(batch, reference), request.time, total)
+                along = self._weighted(batch, reference)
+                outcome = self._newton(batch, state, moves, along, request.time, total, flight)
                 if not outcome.converged:
                     return outcome
                 worst = _worse(worst, outcome)
@@ -150,9 +186,10 @@ class GeneralClusters:
         b0: FloatArray,
         time: float,
         total: FloatArray,
+        flight: _Flight | None,
     ) -> Outcome:
         """Damped Newton along fixed directions, all clusters of a batch side by side, in place."""
-        held = self._held[batch.rows]
+        held = self._held[batch.rows] | (flight is not None)
         size0 = np.linalg.norm(b0, axis=2)
         bad = held & ~(np.isfinite(size0) & (size0 > 0))
         if bad.any():
@@ -167,12 +204,12 @@ class GeneralClusters:
         root_w = self._root_w[batch.columns]
         flat, flat_moves = state.reshape(-1), moves.reshape(-1)
         along = np.zeros(kept.shape)
-        sigma = self._sigma(batch, state, time) * held
+        sigma = self._sigma(batch, state, time, flight) * held
         error = _rms(sigma / scale)
         done = np.zeros(len(batch.rows), dtype=bool)
         polished = np.zeros(len(batch.rows), dtype=bool)
         for iteration in range(1, MAX_ITERATIONS + 1):
-            data = self._data(state, time)
+            data = self._data(state, time, flight)
             b = self._weighted(batch, data)
             relative = np.abs(sigma) / scale
             settled = _each(relative <= self._rounding(batch, data, state))
@@ -197,7 +234,7 @@ class GeneralClusters:
             factor = np.where(done, 0.0, 1.0)
             for _ in range(_HALVINGS):
                 flat[batch.columns] = here + factor[:, None] * shift
-                trial = self._sigma(batch, state, time) * held
+                trial = self._sigma(batch, state, time, flight) * held
                 trial_error = _rms(trial / scale)
                 # Clusters at the rounding error take one more step only if it gains.
                 worse = ~(trial_error < error) & (factor > 0)

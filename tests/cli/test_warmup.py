@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +29,14 @@ end = run(System(motion, lambda x, t: -x), State(x, v), 0.01, 5)
 assert motion.report(end.positions, end.velocities)
 print(announcer.seconds)
 """
+#: Says which kernels are there, and for what arguments.
+KERNELS = """
+import gc, json
+from numba.core.registry import CPUDispatcher
+found = [kernel for kernel in gc.get_objects() if isinstance(kernel, CPUDispatcher)]
+names = {f"{k.py_func.__module__}.{k.py_func.__qualname__} {s}" for k in found for s in k.signatures}
+print(json.dumps(sorted(name for name in names if name.startswith("kcons."))))
+"""
 
 
 def process(*arguments, **environment):
@@ -34,15 +44,32 @@ def process(*arguments, **environment):
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=given, check=True)
 
 
-def test_what_was_compiled_beforehand_is_there(tmp_path):
-    folder = {"NUMBA_CACHE_DIR": str(tmp_path)}
-    told = process("-m", "kcons", "warmup", "molecules", **folder)
-    assert "molecules: compiled in" in told.stdout
-    assert "This happens once" not in told.stderr  # the command says it itself
-    told = process("-c", f"from kcons.cli import main; main.main(['warmup', 'molecules']){MOLECULE}", **folder)
-    said, seconds = told.stdout.splitlines()
-    assert "molecules: is there" in said
-    assert (float(seconds), told.stderr) == (0.0, "")
+def test_what_was_compiled_beforehand_is_there():
+    """Nothing that the molecule calls is anything but what the command has called, whatever others have compiled."""
+    warmed = process("-c", f"from kcons.cli import main; main.main(['warmup', 'molecules']){KERNELS}")
+    told, called = warmed.stdout.splitlines()
+    assert re.match("molecules: (compiled in|is there)", told)
+    assert "This happens once" not in warmed.stderr  # the command says it itself
+    used = process("-c", MOLECULE + KERNELS)
+    seconds, needed = used.stdout.splitlines()
+    assert (float(seconds), used.stderr) == (0.0, "")
+    assert json.loads(needed) and set(json.loads(needed)) <= set(json.loads(called))
+
+
+def test_it_says_what_was_compiled(monkeypatch, capsys):
+    """Only what is not there: a kind that takes a second, which it does once."""
+    left = [1.0, 0.0]
+
+    def slow():
+        """A kind."""
+        announcer.seconds += left.pop(0)
+
+    monkeypatch.setattr(warmup, "KINDS", {"slow": slow})
+    monkeypatch.setattr(announcer, "seconds", 0.0)
+    monkeypatch.setattr(announcer, "announced", True)
+    assert [main.main(["warmup"]) for _ in range(2)] == [0, 0]
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == "slow: compiled in 1.0 s" and second.startswith("slow: is there")
 
 
 def test_all_kinds_can_be_had(capsys):

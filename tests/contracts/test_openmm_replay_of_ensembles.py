@@ -28,9 +28,16 @@ MADE = {
 }
 AT_CONSTANT_ENERGY = ("RattleIntegrator", "rattle")
 made = pytest.mark.parametrize("name", MADE)
-#: On GPUs in mixed precision, which is what they are used in.
+#: On GPUs in mixed precision, which is what they are used in: without a thermostat, and two that scale velocities.
 ON_GPUS = [p for p in GPUS if "mixed" in p.id or "none" in p.id]
-platforms = pytest.mark.parametrize("platform", [*PLATFORMS, *ON_GPUS])
+HERE_AND_THERE = [
+    *(pytest.param(name, place, id=f"{place}-{name}") for place in PLATFORMS for name in MADE),
+    *(
+        pytest.param(name, *p.values, id=f"{p.id}-{name}", marks=p.marks)
+        for p in ON_GPUS
+        for name in ("RattleIntegrator", "Isokinetic", "NoseHoover")
+    ),
+]
 
 
 def every_shape(coupled=True):
@@ -70,8 +77,7 @@ def every_shape(coupled=True):
 
 
 @pytest.mark.filterwarnings("ignore:the forces exert no torque")
-@made
-@platforms
+@pytest.mark.parametrize("name, platform", HERE_AND_THERE)
 def test_constraints_of_every_shape(name, platform):
     """Distances to 2e-5, velocities along them to 2e-5, the total energy to 1 %, at each step."""
     system, x = every_shape(coupled=platform in PLATFORMS)

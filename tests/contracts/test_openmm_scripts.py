@@ -50,7 +50,7 @@ ON_GPUS = [
     pytest.param(name, *p.values, id=f"{name}-{p.id}", marks=p.marks)
     for p in GPUS
     for name in ("simulate_implicit", "simulate_tip4pew", "simulate_npt")
-    if "mixed" in p.id or "none" in p.id or ("single" in p.id and name == "simulate_implicit")
+    if "none" in p.id or ("single" if name == "simulate_implicit" else "mixed") in p.id
 ]
 
 

@@ -10,11 +10,11 @@ import pytest
 from ensemble_runs import twice_kinetic
 from openmm import unit
 from openmm_systems import (
-    GPUS,
     PLATFORMS,
     dumbbell,
     forces_at,
     masses_of,
+    on_gpus,
     residuals,
     started,
     state_of,
@@ -80,7 +80,7 @@ def test_which_steps_are_made_in_parts():
     assert not parts_of_steps(context, integrator)
 
 
-@pytest.mark.parametrize("platform", GPUS)
+@pytest.mark.parametrize("platform", on_gpus("mixed"))
 def test_gpus_place_sites_where_positions_are_constrained(platform):
     system, x, v = prepared("tip4pew")
     integrator = ProjectedIntegrator(1e-3)
@@ -166,7 +166,7 @@ def test_a_step_costs_one_evaluation_of_forces():
         del context
 
 
-@pytest.mark.parametrize("platform", GPUS)
+@pytest.mark.parametrize("platform", on_gpus("mixed"))
 def test_gpus_place_sites_within_steps(platform):
     """As on Reference, as far as forces and lengths of the precision go."""
     system, x, v = prepared("tip4pew")

@@ -204,7 +204,7 @@ def test_names_follow_the_mapping_and_not_the_set():
     assert mine.names == ("turn", "bend[0]", "bend[1]", "bond")
     assert mine.rows.tolist() == [3, 0, 1, 2]
     sample = mine.sample(CHAIN, np.zeros((N, 3)), np.zeros((N, 3)))
-    np.testing.assert_array_equal(sample.value, constraint_set.measure(CHAIN)[mine.rows])
+    np.testing.assert_allclose(sample.value, constraint_set.measure(CHAIN)[mine.rows], rtol=1e-15)
     assert mine.periods == pytest.approx([2 * np.pi, 0, 0, 0])
     assert repr(mine) == "<HeldCoordinates: turn, bend[0], bend[1], bond, beside 0 independent rows of their clusters>"
 

@@ -6,6 +6,8 @@ import json
 
 from committed_pages import FOLDER, page
 
+from kcons.free_energy import Settings
+
 FOUND = json.loads((FOLDER / "free_energy.json").read_text(encoding="utf-8"))
 WAYS = ("proposed", "trapezoidal rule", "spline")
 TEXT = " ".join(page("free_energy.md").split())
@@ -40,6 +42,15 @@ def test_pulls_against_windows():
         assert "{:.1f} ± {:.1f}".format(*found[name]) in TEXT
     assert f"{found['standard errors off']:+.1f} standard errors" in TEXT
     assert abs(found["standard errors off"]) < 3
+
+
+def test_what_recording_costs():
+    found = FOUND["recording"]
+    one, two = found["1 held"], found["2 held"]
+    assert f"every {found['every']} steps, as windows are by default, costs {100 * one['50']:.1f} % of the run" in TEXT
+    assert f"every 10 steps {100 * one['10']:.0f} %" in TEXT
+    assert one["50"] <= 0.05 and two["50"] <= 0.05
+    assert Settings().every == found["every"] == 50
 
 
 def test_where_windows_are_put():

@@ -170,14 +170,15 @@ def test_mixed_and_general_rows() -> None:
         held.Distance([[0, 1], [4, 5], [8, 9], [12, 13]]),
         held.Angle([[0, 1, 2]]),  # compiled: mixed
         held.RadiusOfGyration([[4, 5, 6, 7, 8]]),  # a function: mixed
-        held.LinearVelocity([[10, 11]], [[1.0, 0, 0], [0, 1.0, 0]]),  # velocity rows: general
+        held.LinearVelocity([[10, 11]], [[1.0, 0, 0], [0, 1.0, 0]]),  # velocity rows: mixed
         held.Sphere([3], [9.0, 0, 0]),  # a function alone
+        held.ImplicitSurface([14, 15], lambda r: r[:, 0] - 3.0, target=None),  # a function of two rows at once
     ]
-    shapes = {s.kind: s for s in shapes_of(rows, places(14))}
+    shapes = {s.kind: s for s in shapes_of(rows, places(16))}
     assert set(shapes) == {"lanes", "single", "mixed", "general"}
-    assert shapes["mixed"].rows.tolist() == [0, 1, 2, 4, 5] and shapes["mixed"].clusters == 2
+    assert shapes["mixed"].rows.tolist() == [0, 1, 2, 4, 5, 6] and shapes["mixed"].clusters == 3
     assert shapes["single"].rows.tolist() == [7] and shapes["single"].clusters == 1
-    assert shapes["general"].rows.tolist() == [6] and shapes["general"].clusters == 1
+    assert shapes["general"].rows.tolist() == [8, 9] and shapes["general"].clusters == 2
     assert shapes["lanes"].rows.tolist() == [[3]]
 
 

@@ -94,7 +94,7 @@ def test_few_clusters_of_many_kinds_share_the_sparse_solver() -> None:
         ([held.Angle([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
         ([held.Distance([0, 1]), held.CenterOfMass([[0, 1, 2, 3, 4]])], ("mixed", 1, 4, 4)),
         ([held.RadiusOfGyration([[0, 1, 2], [2, 1, 0]])], ("mixed", 1, 2, 1)),
-        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("general", 1, 1, 1)),
+        ([held.KnifeEdge(0, 1, [0, 0, 1.0])], ("mixed", 1, 1, 1)),
     ],
 )
 def test_table_for_other_rows(rows, expected) -> None:

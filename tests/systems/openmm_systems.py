@@ -16,6 +16,7 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 #: What every test that is parametrised by platform runs on: they carry exact doubles and are on every machine.
 #: Platforms of a GPU, or OpenCL on the CPU, may be there as well; no test depends on whether they are.
 PLATFORMS = ("Reference", "CPU")
+LONG = pytest.mark.validation
 #: With several threads, forces are summed in any order, and no run is like another.
 PROPERTIES = {"CPU": {"Threads": "1", "DeterministicForces": "true"}}
 
@@ -29,6 +30,16 @@ GPUS = [
     if name in ("CUDA", "HIP", "OpenCL")
     for precision in ("single", "mixed", "double")
 ] or [pytest.param("", id="none", marks=pytest.mark.skip(reason="no CUDA, HIP or OpenCL platform (pocl-opencl-icd)"))]
+
+
+def on_gpus(*usual: str) -> list:
+    """Platforms of a GPU: those of a usual run have one of these precisions, the others are for long runs.
+
+    Each Context compiles its program, which takes seconds.
+    """
+    return [
+        p if p.id.endswith((*usual, "none")) else pytest.param(*p.values, id=p.id, marks=[*p.marks, LONG]) for p in GPUS
+    ]
 
 
 def context_of(system, integrator, platform="Reference"):

@@ -104,26 +104,21 @@ def code_digest() -> str:
 
 def pieces(sources: Iterable[bytes]) -> list[bytes]:
     """A hash for each definition and statement of modules, by what it does."""
-    trees = (_Bare().visit(ast.parse(source)) for source in sources)
-    return [hashlib.sha256(ast.unparse(part).encode()).digest() for tree in trees for part in tree.body]
+    trees = (ast.parse(source) for source in sources)
+    return [hashlib.sha256(ast.unparse(part).encode()).digest() for tree in trees for part in _bare(tree).body]
 
 
-class _Bare(ast.NodeTransformer):
-    """Without imports and documentation."""
-
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        super().generic_visit(node)
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            kept = [part for part in body if not _is_text(part)]
-            node.body = kept if kept or isinstance(node, ast.Module) else [ast.Pass()]  # type: ignore[attr-defined]
-        return node
-
-    def visit_Import(self, node: ast.Import) -> None:
-        """Dropped."""
-
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        """Dropped."""
+def _bare(node: Any) -> Any:
+    """Without imports and documentation, in each block of statements."""
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        block = getattr(node, name, None)
+        if not isinstance(block, list):
+            continue
+        kept = [_bare(part) for part in block if not (isinstance(part, ast.Import | ast.ImportFrom) or _is_text(part))]
+        if name == "body" and not kept and not isinstance(node, ast.Module):
+            kept = [ast.Pass()]
+        setattr(node, name, kept)
+    return node
 
 
 def _is_text(part: ast.AST) -> bool:

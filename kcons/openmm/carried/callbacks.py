@@ -39,8 +39,6 @@ from kcons.openmm.integrator.schemes import operations_of, stages_of
 from kcons.openmm.integrator.system_checks import ROW_NAME
 from kcons.openmm.quantities import number
 from kcons.steppers.operations import Exchange
-from kcons.steppers.stages.compensated_steps import Point
-from kcons.steppers.stages.drifts import NonholonomicFlight
 
 #: v is carried as x + v/1024 ps: far less than what makes OpenMM build a new neighbour list, and v is rounded to
 #: 1024/ps times the spacing of numbers at x, as much as x itself is rounded in a step of 1 fs. Powers of two cost
@@ -89,20 +87,12 @@ class Engine:
         self._landed = False
         rows = self.motion.constraint_set.n_rows
         self._impulse, self._push, self._push_before = np.zeros(rows), np.full(rows, np.nan), np.full(rows, np.nan)
-        #: Whether the time of a drift matters.
-        self.timed = self.motion.constraint_set.moving
+        #: Whether the times of a drift matter, or its length.
+        self.timed = self.motion.constraint_set.moving or not self.motion.constraint_set.holonomic.all()
         resting = [c.atoms.ravel() for c in held.constraints if c.family == "FixedAtoms"]
         fixed = np.unique(np.concatenate([*resting, np.zeros(0, np.int64)]))
         #: Which of the carried particles do not move.
         self._fixed = np.searchsorted(self.atoms, fixed)
-        self._flight: NonholonomicFlight | None = None
-        if not self.motion.constraint_set.holonomic.all():
-            with np.errstate(divide="ignore"):
-                weights = (1 / masses)[:, None]
-            weights[fixed] = 0.0
-            self._flight = NonholonomicFlight(self.motion, weights)
-            self._weights = np.repeat(weights, 3, axis=1)
-            self.timed = True
         self._integrator: Callable[[], openmm.CustomIntegrator | None] = lambda: None
         self._lean = False
         self._fractions: tuple[float, ...] = (1.0,)
@@ -179,22 +169,17 @@ class Engine:
         else:
             there[self.atoms] = read
         then, now, h = self._times(self._stage)
-        if self._flight is None:
-            impulse = self._impulse if len(self._fractions) == 1 else None
-            # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
-            moved = self._moved
-            moved.fill(0.0)
-            self.motion.project_positions(
-                there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, out=there,
-                multipliers=impulse,
-            )  # fmt: skip
-            change = moved.copy() if self.whole else moved[self.atoms]
-            fixed = self._fixed
-            change[fixed] = there[self.atoms[fixed]] - read[fixed]
-        else:
-            point = Point(self._start.copy(), (there - self._start) / h, self._weights, exact=False)
-            self._flight.move(point, there, then, now, h)
-            change = (there if self.whole else there[self.atoms]) - read
+        impulse = self._impulse if len(self._fractions) == 1 else None
+        # Velocities take the change as well: from the multipliers, not from positions, whose rounding would add up.
+        moved = self._moved
+        moved.fill(0.0)
+        self.motion.project_positions(
+            there, self._start, time=now, reference_time=then, velocities=moved, dt=1.0, flight=h, out=there,
+            multipliers=impulse,
+        )  # fmt: skip
+        change = moved.copy() if self.whole else moved[self.atoms]
+        fixed = self._fixed
+        change[fixed] = there[self.atoms[fixed]] - read[fixed]
         # What the velocity stage before found belongs to the same positions as this impulse.
         self._push, self._push_before = self._push_before, self._push
         self._push.fill(0.0)

@@ -25,7 +25,7 @@ from kcons.errors import (
 )
 from kcons.openmm.collective.context_rows import ContextRows
 from kcons.openmm.collective.formula_rows import as_rows
-from kcons.openmm.collective.measured_rows import variables_of
+from kcons.openmm.collective.measured_rows import TOLERANCE, variables_of
 from kcons.openmm.collective.row_forces import (
     Rigid,
     Row,
@@ -49,10 +49,6 @@ from kcons.thermostats.freedom import positive
 
 if TYPE_CHECKING:
     from kcons.openmm.integrator.projected import ProjectedIntegrator
-
-
-#: Of sigma, in double precision.
-TOLERANCE = 1e-13
 
 
 class CollectiveRows(GroupRows):
@@ -221,12 +217,15 @@ class CollectiveRows(GroupRows):
         return self.at(context).slopes()
 
     def take_precision(self, program: Program, precision: Precision) -> None:
-        """Tolerances that were left open become what Forces of the platform can tell."""
-        if self.asked_tolerance is None:
-            self.tolerance = max(TOLERANCE, precision.forces)
-            program.set(f"tolerance{self.code}", self.tolerance)
+        """What counts as small is what Forces of the platform can tell."""
         program.set(f"small{self.code}", max(PIVOT, 10 * precision.forces))
         self._forecast.take_precision(program, precision)
+
+    def take_place(self, program: Program, context: openmm.Context) -> None:
+        """A tolerance that was left open becomes what Forces can tell of coordinates of this size."""
+        if self.asked_tolerance is None:
+            self.tolerance = self.at(context).finest
+            program.set(f"tolerance{self.code}", self.tolerance)
 
     def rank(self, context: openmm.Context) -> int:
         """How many degrees of freedom the rows take, beyond the constraints of the System."""
@@ -322,7 +321,7 @@ class CollectiveRows(GroupRows):
         ----------
         context : openmm.Context
         tolerance : float, optional
-            That of the rows unless given.
+            That of the rows at the precision of the context unless given.
         bonds : array_like of int, shape (n, 2), optional
             The bonds of the molecules; those of the System's forces and constraints unless given. An empty list:
             Newton's method alone, whatever becomes of bonds and angles.
@@ -334,7 +333,7 @@ class CollectiveRows(GroupRows):
         InfeasibleError
             Rows that are plain coordinates cannot be reached with bonds and angles as they are; likewise.
         """
-        return self.at(context).apply_positions(self.tolerance if tolerance is None else tolerance, bonds)
+        return self.at(context).apply_positions(tolerance, bonds)
 
     def apply_velocities(self, context: openmm.Context) -> None:
         """Make the velocities of the context tangent to the rows and to the System's constraints.
@@ -416,8 +415,8 @@ class CollectiveRows(GroupRows):
         iterations = int(integrator.getGlobalVariableByName(f"iterations{c}"))
         return ConvergenceError(
             f"step {step}: row {row} ({self.names[row]}) is off by {off[row] * self.scales[row]:.3g} after "
-            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator)}; time step too large "
-            f"(dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
+            f"{iterations} iterations (tolerance {self.tolerance:.3g}){self._digits(integrator.context)}; time step "
+            f"too large (dt = {integrator.getStepSize()}), or a start that is not on the rows: call restore(context)",
             residual=float(residual),
             tolerance=self.tolerance,
             iterations=iterations,
@@ -425,12 +424,12 @@ class CollectiveRows(GroupRows):
             step=step,
         )
 
-    def _digits(self, integrator: openmm.CustomIntegrator) -> str:
+    def _digits(self, context: openmm.Context) -> str:
         """What to do where the tolerance asks for more digits than Forces have."""
-        precision = Precision.of(integrator.context)
-        if self.tolerance >= precision.forces:
+        here = self.at(context)
+        if not self.tolerance < here.finest:
             return ""
-        return f", but Forces have {precision.forces:.0e} in {precision}: leave the tolerance open"
+        return f", but Forces tell no more than {here.finest:.0e} here in {here.precision}: leave the tolerance open"
 
     def __repr__(self) -> str:
         return f"CollectiveRows({', '.join(self.names)})"

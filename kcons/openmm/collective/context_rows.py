@@ -31,8 +31,10 @@ class ContextRows(MeasuredRows):
 
     # -- projections ----------------------------------------------------------------------------
 
-    def apply_positions(self, tolerance: float, bonds: ArrayLike | None = None) -> int:
+    def apply_positions(self, tolerance: float | None = None, bonds: ArrayLike | None = None) -> int:
         """See `CollectiveRows.apply_positions`."""
+        if tolerance is None:
+            tolerance = self.finest if self.rows.asked_tolerance is None else self.rows.asked_tolerance
         scales = np.array(self.rows.scales)
         start, velocities = self.positions, self.velocities
         system_tolerance = self.context.getIntegrator().getConstraintTolerance()

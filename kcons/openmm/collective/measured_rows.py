@@ -13,7 +13,7 @@ import openmm
 from kcons.constraints.target import FloatArray
 from kcons.errors import SingularGeometryError
 from kcons.openmm.collective.row_forces import energy
-from kcons.openmm.integrator.guard import positions_of, velocities_of
+from kcons.openmm.integrator.guard import positions_of, velocities_of, width
 from kcons.openmm.integrator.precision import Precision
 from kcons.openmm.integrator.states.hearing import listeners
 from kcons.openmm.quantities import masses_of
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Rows whose part beside the others is smaller than this (of their own norm) are dependent.
 DEPENDENT = 1e-5
+#: Tolerance of rows in double precision.
+TOLERANCE = 1e-13
 #: Tolerance of the System's constraints where differences are taken, in double precision.
 _TIGHT = 1e-13
 
@@ -199,6 +201,23 @@ class MeasuredRows:
     def precision(self) -> Precision:
         """That of the platform."""
         return Precision.of(self.context)
+
+    @property
+    def finest(self) -> float:
+        """The smallest relative residual that is held: what Forces tell, of coordinates as they see them.
+
+        Where those are single numbers, a row is off by the gradient times what rounding took of them, at random: twice
+        its standard deviation is met by nearly each push.
+        """
+        precision = self.precision
+        if precision.name == "double":
+            return TOLERANCE
+        wide = width(self.context) if self.context.getSystem().usesPeriodicBoundaryConditions() else 0.0
+        moved = self.gradients() * np.maximum(np.abs(self.positions), wide)
+        blur = np.linalg.norm(moved, axis=(1, 2)) / np.array(self.rows.scales)
+        told = 0.8 * precision.seen * float(np.linalg.norm(blur))
+        # A power of two, or it would be another number whenever x is.
+        return max(precision.forces, 2.0 ** np.ceil(np.log2(told)) if 0 < told < np.inf else told)
 
     @property
     def _small(self) -> float:

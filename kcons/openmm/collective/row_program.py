@@ -36,6 +36,7 @@ class GroupRows(Part):
     scales: tuple[float, ...]
     periods: tuple[float, ...]
     tolerance: float
+    asked_tolerance: float | None
     max_iterations: int
     n_rows: int
     _groups: tuple[int, ...]
@@ -180,7 +181,6 @@ class GroupRows(Part):
 
     def land(self, p: Program, h: str) -> None:
         c = self.code
-        rows = range(self.n_rows)
         if self._drives:
             Clock(c).drift(p, h)
         if self._base != "xu":
@@ -202,7 +202,7 @@ class GroupRows(Part):
             p.let(f"held{c}", f"max(held{c}, delta(state{c}-3))", "it does what it did before")
         p.let("failed", f"select(failed, failed, select(held{c}, 0, {c}))", "did it succeed?")
         begins = "delta(stage)"  # not so where constraints are applied alone
-        for k in rows:
+        for k in range(self.n_rows):
             push, impulse = self._of("push", k), self._of("impulse", k)
             before = f"select({begins}, 0, {impulse})"
             if self.lean:  # a drift of velocities that were not made tangent pushes for that as well

@@ -19,7 +19,7 @@ from kcons.errors import CertificateError, ConvergenceError, InputError, NonFini
 from kcons.motion.certificate import MOST, SHARE
 from kcons.openmm.integrator.interface import Integrator
 from kcons.openmm.integrator.part import NEAR, Miss, Part
-from kcons.openmm.integrator.precision import Precision
+from kcons.openmm.integrator.precision import SINGLE, Precision
 from kcons.openmm.integrator.step_counts import refuse_old_positions
 from kcons.openmm.integrator.system_checks import (
     SystemRows,
@@ -66,8 +66,98 @@ def velocities_of(context: openmm.Context) -> FloatArray:
     return np.asarray(context.getState(velocities=True).getVelocities(asNumpy=True)._value)
 
 
+def width(context: openmm.Context) -> float:
+    """Largest coordinate in the periodic box."""
+    return float(np.abs(np.array(_box(context))).sum(axis=0).max())
+
+
 def _box(context: openmm.Context) -> Any:
     return context.getState().getPeriodicBoxVectors()._value
+
+
+class SystemConstraints:
+    """The constraints of the System of one Context, and how closely its platform can hold them.
+
+    Parameters
+    ----------
+    context : openmm.Context
+    integrator : ProjectedIntegrator
+    """
+
+    def __init__(self, context: openmm.Context, integrator: Integrator) -> None:
+        self._context, self._integrator = weakref.ref(context), weakref.ref(integrator)
+        self.precision = Precision.of(context)
+        self.rows = SystemRows.of(context.getSystem(), rounded=self.precision.rounds_lengths)
+
+    @property
+    def context(self) -> openmm.Context:
+        context = self._context()
+        assert context is not None
+        return context
+
+    @property
+    def tolerance(self) -> float:
+        """That of OpenMM's solvers."""
+        integrator = self._integrator()
+        assert integrator is not None
+        return float(integrator.getConstraintTolerance())
+
+    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
+        """What each relative residual may be, given the tolerance and the size of the coordinates.
+
+        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
+        positions there to single numbers then, until the next step.
+        """
+        coarse = (
+            wrapped and self.precision.name == "mixed" and self.context.getSystem().usesPeriodicBoundaryConditions()
+        )
+        place = SINGLE if coarse else self.precision.place
+        inside = width(self.context) if coarse else 0.0
+        reach = np.maximum(np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0), inside) / self.rows.lengths
+        # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
+        # particles are rounded.
+        rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
+        return np.asarray(2 * self.tolerance + rounding + self.rows.slack)
+
+    def check(self, x: FloatArray, step: int | None) -> None:
+        """Raise if a constraint of the System is not fulfilled at positions x."""
+        if not self.rows.n_rows:
+            return
+        miss = np.abs(self.rows.stretches(x))
+        limit = self.limit(x)
+        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
+            limit = self.limit(x, wrapped=True)
+        excess = miss / limit
+        row = int(np.argmax(excess))
+        if not excess[row] <= 1:  # also NaN
+            tolerance = self.tolerance
+            raise ConvergenceError(
+                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
+                f"({self.precision}, which holds {limit[row]:.2g}): the solvers of OpenMM did not converge and "
+                f"do not tell. Take a smaller time step, or {_REMEDY}",
+                residual=float(miss[row]),
+                tolerance=tolerance,
+                row=int(self.rows.numbers[row]),
+                atoms=self.rows.pairs[row],
+                step=step,
+            )
+
+    def hold_positions(self, tolerance: float) -> None:
+        """Bring the positions of the Context onto the constraints of the System."""
+        for _ in range(_CALLS):
+            self.context.applyConstraints(tolerance)
+            x = positions_of(self.context)
+            if not self.rows.n_rows or np.all(np.abs(self.rows.stretches(x)) <= self.limit(x)):
+                return
+
+    def speed_miss(self, x: FloatArray, v: FloatArray) -> Miss | None:
+        """A constraint of the System along which particles move."""
+        rows, tolerance = self.rows, self.tolerance
+        if not rows.n_rows:
+            return None
+        allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
+        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
+        return Miss.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
 
 
 class Guard:
@@ -90,10 +180,10 @@ class Guard:
         check_system(self.system)
         self.in_parts = parts_of_steps(context, integrator)  # whether steps are made in parts
         refuse_forgotten_parts(self.system, integrator.row_groups)
-        self.precision = Precision.of(context)
-        integrator.take_precision(self.precision)
-        refuse_old_positions(integrator, self.system, self.precision)
-        self.rows = SystemRows.of(self.system, rounded=self.precision.rounds_lengths)
+        self.constraints = SystemConstraints(context, integrator)
+        self.rows = self.constraints.rows
+        integrator.take_precision(self.constraints.precision)
+        refuse_old_positions(integrator, self.system, self.constraints.precision)
         #: Whether something in the System moves x between steps.
         self.moving = any("Barostat" in type(force).__name__ for force in forces_of(self.system))
         #: Whether velocities may lack half a kick and a projection until they are read: a thermostat reads them.
@@ -128,45 +218,6 @@ class Guard:
         assert integrator is not None
         return integrator
 
-    # -- constraints of the System --------------------------------------------------------------
-
-    def limit(self, x: FloatArray, *, wrapped: bool = False) -> FloatArray:
-        """What each relative residual may be, given the tolerance and the size of the coordinates.
-
-        `wrapped` for molecules that OpenMM has just moved back into the box: in mixed precision it rounds their
-        positions to single numbers then, until the next step.
-        """
-        coarse = wrapped and self.precision.name == "mixed" and self.system.usesPeriodicBoundaryConditions()
-        place = 2.0**-24 if coarse else self.precision.place
-        reach = np.abs(x[self.rows.pairs]).max(axis=(1, 2), initial=0.0) / self.rows.lengths
-        # The tolerance is that of the solver; OpenMM checks the squares of the distances. The coordinates of two
-        # particles are rounded.
-        rounding = self.precision.solvers + 2 * np.sqrt(3) * place * reach
-        return np.asarray(2 * self.integrator.getConstraintTolerance() + rounding + self.rows.slack)
-
-    def check_rows(self, x: FloatArray, step: int | None) -> None:
-        """Raise if a constraint of the System is not fulfilled at positions x."""
-        if not self.rows.n_rows:
-            return
-        miss = np.abs(self.rows.stretches(x))
-        limit = self.limit(x)
-        if _may_have_crossed(self.context, self.rows.pairs[:, 0], miss > limit):
-            limit = self.limit(x, wrapped=True)
-        excess = miss / limit
-        row = int(np.argmax(excess))
-        if not excess[row] <= 1:  # also NaN
-            tolerance = self.integrator.getConstraintTolerance()
-            raise ConvergenceError(
-                f"{self.rows.name(row)} is off by {miss[row]:.3g} (relative), at a tolerance of {tolerance:g} "
-                f"({self.precision}, which holds {limit[row]:.2g}): the solvers of OpenMM did not converge and "
-                f"do not tell. Take a smaller time step, or {_REMEDY}",
-                residual=float(miss[row]),
-                tolerance=tolerance,
-                row=int(self.rows.numbers[row]),
-                atoms=self.rows.pairs[row],
-                step=step,
-            )
-
     def begin(self) -> None:
         """Before the first step, and where others may have moved x or v: both on the constraints.
 
@@ -183,6 +234,8 @@ class Guard:
         x, v = positions_of(context), velocities_of(context)
         _check_finite(x, v, context.getStepCount(), False)
         try:
+            for part in integrator.parts:
+                part.take_place(integrator.program, context)
             self._put_right(x)
             self._make_tangent(velocities_of(context))
             for part in integrator.parts:
@@ -219,14 +272,14 @@ class Guard:
         asked = [part for part in integrator.parts if not self._steered_away(part)]
         misses = [found for part in asked if (found := part.worst_miss(context, velocities=False)) is not None]
         near = bool(misses) and all(found.near for found in misses)  # those that are far are refused later
-        if not near and not np.any(miss > self.limit(x)):
+        if not near and not np.any(miss > self.constraints.limit(x)):
             return
         if near:
             integrator.applyConstraints(context)
         else:
-            self.hold_positions(integrator.getConstraintTolerance())
+            self.constraints.hold_positions(integrator.getConstraintTolerance())
         now = positions_of(context)
-        self.check_rows(now, None)
+        self.constraints.check(now, None)
         if near or miss[row] > TIDY:
             moved = float(np.sqrt(np.max(np.sum((now - x) ** 2, axis=1))))
             worst = f"{self.rows.name(row)} was off by {miss[row]:.2g} of its length" if len(miss) else ""
@@ -236,14 +289,6 @@ class Guard:
     def _steered_away(self, part: Part) -> bool:
         """Whether a context parameter has moved the rows of a part since the last step, which is where they go then."""
         return self.started and part.steered and self._parameters != dict(self.context.getParameters())
-
-    def hold_positions(self, tolerance: float) -> None:
-        """Bring the positions of the Context onto the constraints of the System."""
-        for _ in range(_CALLS):
-            self.context.applyConstraints(tolerance)
-            x = positions_of(self.context)
-            if not self.rows.n_rows or np.all(np.abs(self.rows.stretches(x)) <= self.limit(x)):
-                return
 
     def _refuse(self, miss: Miss | None) -> None:
         if miss is not None:
@@ -264,19 +309,10 @@ class Guard:
             off = not np.any(np.asarray(integrator.getPerDofVariableByName("impulse")))
         else:
             off = not self.started and bool(integrator.parts and integrator.getGlobalVariableByName("stale"))
-            off = off or self._speed_miss(positions_of(context), v) is not None
+            off = off or self.constraints.speed_miss(positions_of(context), v) is not None
             off = off or any(part.worst_miss(context) is not None for part in integrator.parts)
         if off:
             integrator.applyVelocityConstraints(context)
-
-    def _speed_miss(self, x: FloatArray, v: FloatArray) -> Miss | None:
-        """A constraint of the System along which particles move."""
-        rows, tolerance = self.rows, self.integrator.getConstraintTolerance()
-        if not rows.n_rows:
-            return None
-        allowed = (10 * tolerance + self.precision.solvers) * rows.speeds_of_one(v)
-        allowed += (self.limit(x, wrapped=True) + self.precision.speeds) * np.sqrt(np.mean(v * v))
-        return Miss.worst("velocities", rows.speeds(x, v), allowed, rows.name, lambda k: rows.pairs[k].tolist())
 
     # -- between and after steps ----------------------------------------------------------------
 
@@ -343,8 +379,8 @@ class Guard:
             x = np.asarray(now.getPositions(asNumpy=True)._value)
             v = np.asarray(now.getVelocities(asNumpy=True)._value)
             _check_finite(x, v, step, self.rows.n_rows > 0)
-            self.check_rows(x, step)
-            misses = [] if self.late else [self._speed_miss(x, v)]
+            self.constraints.check(x, step)
+            misses = [] if self.late else [self.constraints.speed_miss(x, v)]
             misses += [part.worst_miss(context, velocities=not self.late) for part in integrator.parts]
             for miss in misses:
                 self.certify(miss, f"at step {step} ")

@@ -170,6 +170,9 @@ class Part(ABC):
     def take_precision(self, program: Program, precision: Precision) -> None:
         """The Context is known, and with it what can be held."""
 
+    def take_place(self, program: Program, context: openmm.Context) -> None:
+        """Positions are known, where others may have set them: before a step, and before anything is checked."""
+
     def begin_run(self) -> None:
         """Called before steps are made."""
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import openmm
 
+#: Unit roundoff of single numbers.
+SINGLE = 2.0**-24
+
 
 @dataclass(frozen=True)
 class Precision:
@@ -49,7 +52,7 @@ class Precision:
     @property
     def place(self) -> float:
         """Unit roundoff of a coordinate: in mixed precision positions are pairs of single numbers."""
-        return {"double": 2.0**-53, "mixed": 2.0**-48, "single": 2.0**-24}[self.name]
+        return {"double": 2.0**-53, "mixed": 2.0**-48, "single": SINGLE}[self.name]
 
     @property
     def solvers(self) -> float:
@@ -70,3 +73,8 @@ class Precision:
     def forces(self) -> float:
         """Relative error of forces and of the values of Forces that are rows, after some hundred operations."""
         return 1e-13 if self.name == "double" else 5e-7
+
+    @property
+    def seen(self) -> float:
+        """Unit roundoff of a coordinate as Forces see it."""
+        return 2.0**-53 if self.name == "double" else SINGLE

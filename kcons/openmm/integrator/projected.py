@@ -130,7 +130,7 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         held = f"constraints of the System to {self.getConstraintTolerance():g} (relative)"
         guard = self._guard
         if guard is not None:
-            held += f", {guard.precision}"
+            held += f", {guard.constraints.precision}"
         elif self.asked_tolerance is None:
             held += ", or what the precision of the Context allows"
         step = "\n".join(f"  {operation}" for operation in self.operations())
@@ -248,14 +248,14 @@ class ProjectedIntegrator(StatesOnConstraints, Calls, Settings):
         start, velocities = positions_of(context), velocities_of(context)
         tolerance = self.getConstraintTolerance() if tolerance is None else tolerance
         try:
-            guard.hold_positions(tolerance)
+            guard.constraints.hold_positions(tolerance)
             if not all(part.solves_alone for part in self.parts):
                 for part in self.parts:
                     part.apply_positions(context)
             elif self.parts:
                 context.setVelocities(np.zeros_like(velocities))
                 self._run_alone(guard, self._plan.alone, self._plan.alone + 1)
-            guard.check_rows(positions_of(context), None)
+            guard.constraints.check(positions_of(context), None)
             for part in self.parts:
                 guard.certify(part.worst_miss(context, velocities=False))
         except KconsError:

@@ -1,7 +1,8 @@
 """Rows of mixed kinds, coupled in any way: sparse elimination with general gradients.
 
 The counterpart of `kcons.solvers.sparse.distances` for clusters that also hold angles, dihedrals, planes and other
-compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.sparse.row_values` says.
+compiled rows. Gradients are stored by slot (one atom of one row), as `kcons.solvers.sparse.row_values` says. Rows of
+velocities are solved with the positions where these are the end of a flight, see `row_functions`.
 """
 
 from __future__ import annotations
@@ -42,13 +43,15 @@ from kcons.solvers.kernels.two_and_four_wide import (
 )
 from kcons.solvers.sparse import step_control
 from kcons.solvers.sparse.elimination import FAST, PIVOT_TOLERANCE, make_pattern, make_triples
-from kcons.solvers.sparse.row_functions import FUNCTION, GivenRows
+from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, VELOCITY, GivenRows
 from kcons.solvers.sparse.row_values import DISTANCE, NOW, REFERENCE, evaluate, miss
 from kcons.solvers.sparse.step_control import MAX_HALVINGS, factor_serves, go_back, hopeless, keep, overshot, refines
 from kcons.solvers.sparse.substitution import update
 
 #: |A v - c| allowed after a projection, in parts of the cluster's largest speed times gradient.
 SPEED_TOLERANCE = 1e-15
+#: How much closer than positions rows of velocities are held: what they are off by is a speed times a short time.
+CLOSER = 16.0
 _EPS = float(np.finfo(float).eps)
 #: Of the pieces of `SparseRows.tables`, those that are named.
 _PIVOTS, _MOVES, _SOLUTION = 16, 20, 21
@@ -108,11 +111,11 @@ class SparseRows(CalledSolver):
             (
                 *(pattern.clusters, atom_numbers, atom_start, slot_atoms, self._given.kinds, links.ravel()),
                 *(pattern.columns, pattern.targets, triple, sides, masses, constraint_set.scale[self.rows]),
-                *(np.ascontiguousarray(constraint_set.target(0.0)[self.rows]), lines),
+                *(np.where(constraint_set.holonomic, constraint_set.target(0.0), 0.0)[self.rows], lines),
                 # By row: accumulated change of the pivot and right-hand side; by entry as in `sparse.substitution`.
                 *(room(2 * n), room(4 * len(pattern.columns))),
                 *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
-                *(room(numbers), room(n), room(numbers)),
+                *(room(numbers), room(n), room(numbers), room(numbers)),
             )
         )
         self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
@@ -243,16 +246,17 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
-    scale, lines, values, inverse_rounding, base, moves, solution,
+    scale, lines, values, inverse_rounding, base, moves, origin, solution,
 ):  # fmt: skip
     """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     zero = quad(0.0, 0.0, 0.0, 0.0)
     for a in range(first_atom, last_atom):
-        store_quad(base, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
+        store_quad(origin, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
         store_quad(moves, 4 * a, zero)
     evaluate(
-        first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, REFERENCE
-    )
+        first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, lattice, periodic, values, lines,
+        REFERENCE,
+    )  # fmt: skip
     for a in range(first_atom, last_atom):
         point = load_point(x_new, 3 * entry(atoms, a))
         store_quad(base, 4 * a, point)
@@ -283,6 +287,8 @@ def _measure(first, last, kinds, parameters, links, wanted, scale, inverse_round
         off = miss(number(values, k), number(wanted, k), period)
         put(state, 2 * k + 1, off)
         e = abs(off) / number(scale, k)
+        if entry(kinds, k) >= VELOCITY:
+            e *= CLOSER
         total += e
         if e > error:
             error = e
@@ -320,6 +326,7 @@ def _positions(  # type: ignore[no-untyped-def]
     lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
     values, inverse_rounding, base, moves = piece(t, h, 17), piece(t, h, 18), piece(t, h, 19), piece(t, h, _MOVES)
     solution, kept_moves, kept_solution = piece(t, h, _SOLUTION), piece(t, h, 22), piece(t, h, 23)
+    origin = piece(t, h, 25)
     if not wanted.size:
         wanted = piece(t, h, 12)
     worst, worst_row, most = 0.0, -1, 0
@@ -327,7 +334,7 @@ def _positions(  # type: ignore[no-untyped-def]
         first, last = clusters[c], clusters[c + 1]
         _begin(
             first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
-            parameters, links, scale, lines, values, inverse_rounding, base, moves, solution,
+            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, solution,
         )  # fmt: skip
         error = np.inf
         best = np.inf
@@ -337,8 +344,9 @@ def _positions(  # type: ignore[no-untyped-def]
         while True:
             previous = error
             evaluate(
-                first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, NOW
-            )
+                first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values,
+                lines, NOW,
+            )  # fmt: skip
             error, total, excess, bad = _measure(
                 first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state
             )
@@ -375,7 +383,7 @@ def _positions(  # type: ignore[no-untyped-def]
                 rolled()
                 along += dot(first_vector(lines, 8 * p), second_vector(lines, 8 * p))
             # A gradient must not have turned by 90 degrees or more within the step.
-            if not (along > 0.0):
+            if not (along > 0.0) and (entry(kinds, k) < VELOCITY or number(parameters, COUNT) != 0.0):
                 return False, np.inf, iteration, k
         if error >= worst:
             worst, worst_row = error, bad
@@ -407,8 +415,9 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             store_quad(speeds, 4 * a, load_point(y, g))
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
         evaluate(
-            first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, REFERENCE
-        )
+            first, last, kinds, links, slot_atoms, parameters, base, moves, base, lattice, periodic, values, lines,
+            REFERENCE,
+        )  # fmt: skip
         largest, total = 0.0, 0.0
         for k in range(first, last):
             goal = wanted[k] if driven else 0.0

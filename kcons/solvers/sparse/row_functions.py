@@ -5,8 +5,13 @@ data: a function ``row(r, p, t, out)`` of the positions r of a row's atoms, its 
 value into ``out[0]`` and the gradient behind it, x, y, z by atom. It is compiled alone when it is first used. Python
 functions come in by the same door; their only parameter is the number of the row in its object.
 
-All parameters lie in one array. It begins with two times, now and at the reference, and with room for what functions
-get and give, from `ROOM` on; then come those of each row, and for a function before them its address and its period.
+A row that is linear in the velocities, a(r, t) . v, is a function of where a flight ends: a . d, at the middle r of the
+way d, which stands behind r. Its gradient by the end is a + (da/dr)^T d/2, of which only a has to be exact, and where d
+is 0 it is a. Steps without the second part take more iterations.
+
+All parameters lie in one array. It begins with two times, now and at the reference, with whether rows of velocities
+count (1) or not (0), and with room for what functions get and give, from `ROOM` on; then come those of each row, and
+for a function before them its address and its period.
 """
 
 from __future__ import annotations
@@ -28,13 +33,16 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.functions.custom import FunctionRows
 from kcons.constraints.functions.formula import Formula
 from kcons.constraints.target import FloatArray
+from kcons.constraints.velocity import CustomVelocity
 from kcons.solvers.sparse.elimination import FAST
 
 FUNCTION = int(RowKind.FUNCTION)
 #: A function of positions relative to the first atom.
 RELATIVE_FUNCTION = FUNCTION + 1
-#: First of the numbers that a function gets and gives.
-ROOM = 2
+#: From here on rows of velocities, of absolute positions and of differences.
+VELOCITY = int(RowKind.VELOCITY)
+#: Where it stands whether rows of velocities count, and the first of the numbers that a function gets and gives.
+COUNT, ROOM = 2, 3
 _NUMBERS = types.CPointer(types.float64)
 ROW = types.void(_NUMBERS, _NUMBERS, types.float64, _NUMBERS)
 _C_ROW = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double, ctypes.c_void_p)
@@ -171,6 +179,51 @@ def _radius_of_gyration(r, p, t, out):
         out[3 + 3 * i] = f * (r[3 * i + 2] - z)
 
 
+def _linear_velocity(r, p, t, out):
+    """p holds how many coefficients there are, and them."""
+    n, speed = int(p[0]), 0.0
+    for i in range(n):
+        speed += p[1 + i] * r[n + i]
+        out[1 + i] = p[1 + i]
+    out[0] = speed
+
+
+def _knife_edge(r, p, t, out):
+    """(1 - s) l.d_back + s l.d_front, l = n x e, e along the blade in the plane; p holds n and s."""
+    bx, by, bz = r[3] - r[0], r[4] - r[1], r[5] - r[2]
+    up = bx * p[0] + by * p[1] + bz * p[2]
+    bx, by, bz = bx - up * p[0], by - up * p[1], bz - up * p[2]
+    length = math.sqrt(bx * bx + by * by + bz * bz)
+    bx, by, bz = bx / length, by / length, bz / length
+    lx, ly, lz = p[1] * bz - p[2] * by, p[2] * bx - p[0] * bz, p[0] * by - p[1] * bx
+    s = p[3]
+    gx, gy, gz = r[6] + s * (r[9] - r[6]), r[7] + s * (r[10] - r[7]), r[8] + s * (r[11] - r[8])
+    out[0] = lx * gx + ly * gy + lz * gz
+    # The blade turns by l.(change of the front less that of the back)/length, and l by that towards -e.
+    half = 0.5 * (bx * gx + by * gy + bz * gz) / length
+    f, g = 1.0 - s + half, s - half
+    out[1], out[2], out[3] = f * lx, f * ly, f * lz
+    out[4], out[5], out[6] = g * lx, g * ly, g * lz
+
+
+def _rolling(r, p, t, out):
+    """h.d_hub - R w.d, of s and d from hub to rim, w = [(s.n) h - (s.h) n]/rho^2; p holds R, h and n."""
+    sx, sy, sz = r[3] - r[0], r[4] - r[1], r[5] - r[2]
+    dx, dy, dz = r[9] - r[6], r[10] - r[7], r[11] - r[8]
+    ahead, up = sx * p[1] + sy * p[2] + sz * p[3], sx * p[4] + sy * p[5] + sz * p[6]
+    forth, rise = dx * p[1] + dy * p[2] + dz * p[3], dx * p[4] + dy * p[5] + dz * p[6]
+    f = p[0] / (ahead * ahead + up * up)
+    turn = f * (up * forth - ahead * rise)
+    out[0] = r[6] * p[1] + r[7] * p[2] + r[8] * p[3] - turn
+    # R w, and half of what R w.d changes by with s: both have parts along h and n only.
+    g = turn * f / p[0]
+    a = f * up - 0.5 * f * rise - g * ahead
+    b = -f * ahead + 0.5 * f * forth - g * up
+    x, y, z = a * p[1] + b * p[4], a * p[2] + b * p[5], a * p[3] + b * p[6]
+    out[1], out[2], out[3] = p[1] + x, p[2] + y, p[3] + z
+    out[4], out[5], out[6] = -x, -y, -z
+
+
 FAMILIES: dict[str, Callable[..., None]] = {
     "Dihedral": _dihedral,
     "Plane": _plane,
@@ -180,6 +233,9 @@ FAMILIES: dict[str, Callable[..., None]] = {
     "Torus": _torus,
     "CenterDistance": _center_distance,
     "RadiusOfGyration": _radius_of_gyration,
+    "LinearVelocity": _linear_velocity,
+    "KnifeEdge": _knife_edge,
+    "Rolling": _rolling,
 }
 
 
@@ -216,22 +272,64 @@ def _of_jitted(function: Any, gradient: Any, width: int, timed: bool) -> Any:
     return row
 
 
+@functools.cache
+def _of_jitted_coefficients(coefficients: Any, width: int, timed: bool, step: float) -> Any:
+    """A row of velocities whose coefficients Numba has compiled, or will; `step` is that of differences."""
+    shape = (width, 3)
+    if timed:
+
+        @nb.njit
+        def found(x, t):
+            return coefficients(x, t)
+    else:
+
+        @nb.njit
+        def found(x, t):
+            return coefficients(x)
+
+    @nb.cfunc(ROW)
+    def row(r, p, t, out):
+        x, way = nb.carray(r, shape), 0.0
+        slope = np.ascontiguousarray(found(x, t)).copy()
+        out[0] = 0.0
+        for i in range(width):
+            for j in range(3):
+                d = r[3 * (width + i) + j]
+                out[0] += slope[i, j] * d
+                out[1 + 3 * i + j] = slope[i, j]
+                way += abs(d)
+        if way > 0.0:
+            for k in range(3 * width):
+                middle = r[k]
+                r[k] = middle + step
+                near = found(x, t)
+                change = 0.0
+                for i in range(width):
+                    for j in range(3):
+                        change += (near[i, j] - slope[i, j]) * r[3 * (width + i) + j]
+                r[k] = middle
+                out[1 + k] += 0.5 * change / step
+
+    return row
+
+
 class PythonRows:
     """The rows of one object whose functions are Python's; what these raise is kept until the kernel has ended."""
 
-    def __init__(self, item: FunctionRows, numbers: FloatArray) -> None:
+    def __init__(self, item: FunctionRows | CustomVelocity, numbers: FloatArray) -> None:
         self.error: BaseException | None = None
         width, count = item.width, 3 * item.width
         start = numbers.ctypes.data
-        row = item.row
+        row: Callable[..., Any] = _velocity_row(item) if isinstance(item, CustomVelocity) else item.row
+        room = count if item.holonomic else 2 * count
 
         def called(r: int, p: int, time: float, out: int) -> None:
             at = (out - start) >> 3
             try:
                 first = (r - start) >> 3
                 # A copy: the function may keep what it sees.
-                place = numbers[first : first + count].reshape(width, 3).copy()
-                value, slope = row(int(numbers[(p - start) >> 3]), place, time)
+                place = numbers[first : first + room].reshape(-1, width, 3).copy()
+                value, slope = row(int(numbers[(p - start) >> 3]), *place, time)
                 numbers[at] = value
                 numbers[at + 1 : at + 1 + count] = slope.reshape(count)
             except BaseException as error:
@@ -240,6 +338,19 @@ class PythonRows:
 
         self._function = _C_ROW(called)
         self.address = ctypes.cast(self._function, ctypes.c_void_p).value
+
+
+def _velocity_row(item: CustomVelocity) -> Callable[..., tuple[float, FloatArray]]:
+    """Its rows as functions of the end of a way; coefficients of a place that comes twice running are found once."""
+    last: dict[int, tuple[bytes, float, FloatArray]] = {}
+
+    def row(k: int, place: FloatArray, way: FloatArray, time: float) -> tuple[float, FloatArray]:
+        here, before = place.tobytes(), last.get(k)
+        if before is None or before[0] != here or before[1] != time:
+            before = last[k] = here, time, item.row(k, place, time).copy()
+        return float(np.vdot(before[2], way)), before[2]
+
+    return row
 
 
 def row_function(item: Constraint, numbers: FloatArray) -> Any:
@@ -254,6 +365,10 @@ def row_function(item: Constraint, numbers: FloatArray) -> Any:
         if item.by_row and gradient is not None and is_jitted(item.function) and is_jitted(gradient):
             return _of_jitted(item.function, gradient, item.width, item.time_dependent)
         return PythonRows(item, numbers)
+    if isinstance(item, CustomVelocity):
+        if is_jitted(item.coefficients):
+            return _of_jitted_coefficients(item.coefficients, item.width, item.time_dependent, 1e-6 * item.length)
+        return PythonRows(item, numbers)
     return _compiled(FAMILIES[item.family])
 
 
@@ -263,7 +378,7 @@ class GivenRows:
     Attributes
     ----------
     kinds : ndarray of uint32, shape (n,)
-        Of each row, `RELATIVE_FUNCTION` included.
+        Of each row, those of functions of differences included.
     numbers : ndarray of float64
         All parameters, as the module says.
     starts : ndarray of int64, shape (n,)
@@ -275,7 +390,7 @@ class GivenRows:
         kinds, starts = np.zeros(constraint_set.n_rows, np.uint32), np.zeros(constraint_set.n_rows, np.int64)
         order = np.full(constraint_set.n_rows, -1)
         order[rows] = np.arange(len(rows))
-        end = ROOM + 6 * widest + 1
+        end = ROOM + 9 * widest + 1
         tables: list[tuple[Constraint, int, FloatArray]] = []
         for item, first in zip(constraint_set.constraints, constraint_set.starts, strict=False):
             mine = slice(first, first + item.n_rows)
@@ -285,7 +400,7 @@ class GivenRows:
             here = here[np.argsort(order[mine][here])]
             table = item.parameters().reshape(item.n_rows, -1)[here]
             kinds[mine] = item.kind
-            if item.kind == FUNCTION:
+            if item.kind in (FUNCTION, VELOCITY):
                 kinds[mine] += item.relative
                 numbered = [here[:, None]] if item.functions else []
                 table = np.hstack([np.tile([0.0, item.period or 0.0], (len(here), 1)), table, *numbered])
@@ -300,7 +415,7 @@ class GivenRows:
         self.functions = []
         for item, first, table in tables:
             self.numbers[first : first + table.size] = table.ravel()
-            if item.kind == FUNCTION:
+            if item.kind in (FUNCTION, VELOCITY):
                 self.functions.append(row_function(item, self.numbers))
                 self.numbers.view(np.int64)[first : first + table.size : table.shape[1]] = self.functions[-1].address
 

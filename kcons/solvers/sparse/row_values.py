@@ -1,4 +1,4 @@
-"""Values and gradients of compiled rows: distances, angles, linear rows, functions.
+"""Values and gradients of compiled rows: distances, angles, linear rows, functions, rows of velocities.
 
 Scalar code for one row at a time. Positions are held as ``base + moves`` so that differences of atoms that
 lie far from the origin keep their digits while moves are small; both as quads (x, y, z, any) by atom.
@@ -17,7 +17,7 @@ import numpy as np
 from kcons.constraints.constraint import RowKind
 from kcons.solvers.kernels.two_and_four_wide import dot, entry, lane, load_quad, number, put, quad, rolled
 from kcons.solvers.sparse.elimination import FAST
-from kcons.solvers.sparse.row_functions import FUNCTION, ROOM, call_row
+from kcons.solvers.sparse.row_functions import COUNT, FUNCTION, ROOM, VELOCITY, call_row
 
 DISTANCE = int(RowKind.DISTANCE)
 ANGLE = int(RowKind.ANGLE)
@@ -124,11 +124,55 @@ def _function(  # type: ignore[no-untyped-def]
     return value
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
+def _velocity(  # type: ignore[no-untyped-def]
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, cell, inverse, periodic, lines, which
+):
+    """The same for a row of velocities, of the way from `origin`; zero throughout where such rows do not count."""
+    if number(parameters, COUNT) == 0.0:
+        for p in range(slot, end):
+            rolled()
+            _put(lines, 8 * p + which, 0.0, 0.0, 0.0)
+        return 0.0
+    at, out = ROOM, ROOM + 6 * (end - slot)
+    x, y, z = 0.0, 0.0, 0.0
+    before, way_before = load_quad(origin, 4 * entry(slot_atoms, slot)), quad(0.0, 0.0, 0.0, 0.0)
+    for p in range(slot, end):
+        rolled()
+        i = 4 * entry(slot_atoms, p)
+        here = load_quad(origin, i)
+        way = (load_quad(base, i) - here) + load_quad(moves, i)
+        if kind == VELOCITY:
+            r = here + 0.5 * way
+            x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
+        elif p > slot:
+            dx, dy, dz = near(here - before, 0.5 * (way - way_before), cell, inverse, periodic)
+            x, y, z = x + dx, y + dy, z + dz
+        before, way_before = here, way
+        put(parameters, at, x)
+        put(parameters, at + 1, y)
+        put(parameters, at + 2, z)
+        half = at + 3 * (end - slot)
+        put(parameters, half, lane(way, 0))
+        put(parameters, half + 1, lane(way, 1))
+        put(parameters, half + 2, lane(way, 2))
+        at += 3
+    # Where the reference is asked for, the way is 0, and the time that of the reference.
+    time = 0.5 * (number(parameters, which) + number(parameters, 1))
+    call_row(parameters, offset, ROOM, offset + 2, time, out)
+    value = number(parameters, out)
+    for p in range(slot, end):
+        rolled()
+        g = out + 1 + 3 * (p - slot)
+        _put(lines, 8 * p + which, number(parameters, g), number(parameters, g + 1), number(parameters, g + 2))
+    return value
+
+
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
-    first, last, kinds, links, slot_atoms, parameters, base, moves, lattice, periodic, values, lines, which
+    first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values, lines, which
 ):
-    """Values and gradients of rows first to last.
+    """Values and gradients of rows first to last; those of velocities for the way from `origin`.
 
     ``links[4 k + 2]`` is the first slot of row k, ``links[4 k + 3]`` its first parameter.
     """
@@ -165,6 +209,11 @@ def evaluate(  # type: ignore[no-untyped-def]
                 change += dot(c, load_quad(moves, i))
                 offset += 3
             value = whole + change
+        elif kind >= VELOCITY:
+            value = _velocity(
+                kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, cell, inverse,
+                periodic, lines, which,
+            )  # fmt: skip
         else:
             end = entry(links, 4 * k + 6)
             value = _function(

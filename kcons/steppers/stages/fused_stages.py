@@ -28,6 +28,7 @@ from kcons.solvers.kernels.array_views import integers, piece
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
 from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.row_functions import COUNT
 from kcons.steppers.stages.compensated_steps import (
     Point,
     add_kick,
@@ -239,7 +240,8 @@ class Flights(Tables):
                 spare, push, h = work[2], work[1], float(fractions[at]) * dt
                 ends, starts = (out, spare) if (len(fractions) - at) % 2 else (spare, out)
             self.took = _UNKNOWN
-            self.motion.project_positions(ends, starts if at else x, time=time, velocities=push, dt=h, out=ends)
+            start = starts if at else x
+            self.motion.project_positions(ends, start, time=time, velocities=push, dt=h, flight=h, out=ends)
             if at + 1 == len(fractions):
                 return self.took
             found = self.many(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, *tables)
@@ -303,7 +305,9 @@ class PackedRows(NamedTuple):
 def packed_rows(motion: Motion, *more: NDArray[Any]) -> PackedRows | None:
     """The tables of all rows, and `more`; None where there are rows that the kernels do not know, or too many."""
     plan, held = motion.plan, motion.constraint_set
-    if plan.driven or held.moving or plan.loose is not None or any(plan.whole):
+    if held.moving or plan.loose is not None or any(plan.whole):
+        return None
+    if plan.driven and held.target(0.0)[~held.holonomic].any():
         return None
     # Where few atoms are held, the engine works on a copy of these, and counts only them.
     compact = plan.constraint_set is not held
@@ -347,7 +351,9 @@ def _solver_like(
     rows = np.sort(solver.rows)
     if isinstance(solver, SingleRows):
         return SingleRows(held, rows, inverse_masses)
-    return SparseRows(held, rows, inverse_masses, late[rows])
+    like = SparseRows(held, rows, inverse_masses, late[rows])
+    like.numbers[COUNT] = 1.0  # all positions here are the ends of flights
+    return like
 
 
 def _worth_it(chains: Chains, others: int) -> bool:

@@ -70,7 +70,7 @@ def test_coordinates_that_cannot_be_held():
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
-    settings = Settings(pull=200, equilibration=20, production=320, relax=3)
+    settings = Settings(pull=200, equilibration=20, production=320, every=10, relax=3)
     sampler().pull(Window(0, "forward", (2.0,), (2.4,), 5), settings, tmp_path / "pull.npz")
     series = Series.load(tmp_path / "pull.npz")
     assert len(series) == 201 and series.off.max() < 1e-10

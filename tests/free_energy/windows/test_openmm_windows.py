@@ -31,7 +31,8 @@ def sampler(coordinates, of=None):
 def test_two_torsions_far_from_the_structure(tmp_path, thermostat):
     windows = pickle.loads(pickle.dumps(sampler({"phi": PHI, "psi": PSI})))
     assert windows.begin()[0] == pytest.approx([np.pi, np.pi], abs=1e-3)
-    settings = Settings(timestep=2.0, thermostat=thermostat, relax=5, pull=20, equilibration=20, production=320)
+    steps = {"relax": 5, "pull": 20, "equilibration": 20, "production": 320, "every": 10}
+    settings = Settings(timestep=2.0, thermostat=thermostat, **steps)
     windows.sample(Window(0, "up", (-1.2, 1.9), (-1.1, 2.0), 7), settings, tmp_path / "window.npz")
     series = Series.load(tmp_path / "window.npz")
     assert len(series) == 32 and series.off.max() < 1e-10
@@ -75,7 +76,7 @@ def test_coordinates_that_cannot_be_held():
 
 
 def test_a_pull_begins_in_equilibrium_and_is_recorded_at_each_step(tmp_path):
-    settings = Settings(pull=100, equilibration=20, production=320, relax=3)
+    settings = Settings(pull=100, equilibration=20, production=320, every=10, relax=3)
     sampler({"phi": PHI}).pull(Window(0, "forward", (-1.2,), (-1.0,), 5), settings, tmp_path / "pull.npz")
     series = Series.load(tmp_path / "pull.npz")
     assert len(series) == 101

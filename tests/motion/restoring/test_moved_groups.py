@@ -92,7 +92,7 @@ def test_a_torsion_from_anywhere_to_anywhere(name: str, given: bool) -> None:
     atoms = molecule(name)
     bonds = bond_table(atoms) if given else None
     for quad in torsions(atoms):
-        for degrees in range(-180, 181, 15):
+        for degrees in range(-180, 181, 45):
             motion = engine(atoms, [held.Dihedral([quad], np.radians(degrees))])
             x = motion.restore_positions(atoms.positions, bonds=bonds)
             fulfilled(motion, x)

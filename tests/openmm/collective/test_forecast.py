@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from openmm_systems import GPUS, loose_alanine, started, state_of, total_energy, water_box
+from openmm_systems import GPUS, loose_alanine, on_gpus, started, state_of, total_energy, water_box
 
 from kcons.openmm import CollectiveRows, ProjectedIntegrator
 from kcons.openmm.integrator.precision import Precision
@@ -43,8 +43,14 @@ def waits(integrator, count, steps):
     return (so_far() - before) / steps
 
 
-@pytest.mark.parametrize("platform", ["Reference", *(p for p in GPUS if str(p.id).endswith("mixed"))])
-@pytest.mark.parametrize(("count", "most"), [(1, 1.2), (4, 4.8)])
+@pytest.mark.parametrize(
+    ("count", "most", "platform"),
+    [
+        (1, 1.2, "Reference"),
+        (4, 4.8, "Reference"),
+        *(pytest.param(4, 4.8, *p.values, id=p.id) for p in GPUS if p.id.endswith("mixed")),
+    ],
+)
 def test_in_mixed_precision_each_row_waits_once(count, most, platform):
     """And every 64th step twice. On a CPU, which waits for nothing, each push is measured."""
     integrator, context, part = alanine_rows(count, platform)
@@ -56,12 +62,13 @@ def test_in_mixed_precision_each_row_waits_once(count, most, platform):
     assert np.abs(part.residuals(context)).max() < 5e-7
 
 
-@pytest.mark.parametrize("platform", GPUS)
+@pytest.mark.parametrize("platform", [p for p in on_gpus("mixed") if "single" not in p.id])
 def test_the_motion_is_the_same(platform):
-    """As with each push measured, to what forces of this precision know, and the energy stays."""
+    """As with each push measured, to what forces of this precision know, and the energy stays.
+
+    In single precision trajectories part by rounding.
+    """
     precision = Precision(*platform.split())
-    if precision.name == "single":
-        pytest.skip("trajectories part by rounding")
     ends, energies = [], []
     for sparing in (0.0, 1.0):
         integrator, context, part = alanine_rows(2, platform, sparing=sparing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import pickle
 
 import numba
@@ -10,14 +11,16 @@ import numpy as np
 import pytest
 from constraint_cases import CASES, MASSES, TIME, scattered
 
-from kcons import ConstraintSet, Motion
-from kcons.constraints import Custom, Distance, RowKind, Sphere
+from kcons import ConstraintSet, Motion, State, System, run
+from kcons.constraints import Custom, CustomVelocity, Distance, RowKind, Sphere
 from kcons.errors import InputError
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.general_clusters import GeneralClusters
 from kcons.solvers.sparse.mixed_rows import SparseRows
+from kcons.solvers.sparse.row_functions import ROOM
 
 FUNCTIONS = [name for name in CASES if CASES[name]().kind == RowKind.FUNCTION]
+VELOCITIES = [name for name in CASES if CASES[name]().kind == RowKind.VELOCITY]
 
 
 @numba.njit
@@ -69,6 +72,110 @@ def test_kernels_agree_with_the_dense_solver(name, far):
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=2e-11 if "ithout" in name else 1e-13 * max(1, far))
     assert np.all(np.abs(whole.value(found[0][0], TIME + 0.01)) <= 2 * whole.tolerance(x, TIME + 0.01))
+
+
+@pytest.mark.parametrize("flight", [0.0, 0.1, -0.1], ids=["no flight", "flight", "backwards"])
+@pytest.mark.parametrize("name", VELOCITIES)
+def test_rows_of_velocities_agree_with_the_dense_solver(name, flight):
+    x, later = scattered(1), TIME + flight
+    fast, dense, whole = both([CASES[name](), Distance([[6, 7]])], x)
+    rng = np.random.default_rng(2)
+    new, y = x + 0.02 * rng.normal(size=x.shape), rng.normal(size=x.shape)
+    wanted = np.where(whole.holonomic, whole.target(later), flight * whole.target(TIME + 0.5 * flight))
+    found = []
+    for solver in (fast, dense):
+        positions, multipliers = new.copy(), np.empty((2, whole.n_rows))
+        assert solver.positions(
+            Request(positions, x, wanted, None, later, TIME, flight=flight != 0), multipliers[0]
+        ).converged
+        tangents = y.copy()
+        assert solver.tangents(Request(tangents, x, whole.target(TIME), None, TIME), multipliers[1]).converged
+        found.append((positions, tangents, multipliers[:, np.argsort(solver.rows)]))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-13)
+    positions, _, (pushes, _) = found[0]
+    middle, way = 0.5 * (x + positions), positions - x
+    slip = (whole.jacobian(middle, TIME + 0.5 * flight) @ way.ravel() - wanted)[~whole.holonomic]
+    assert np.abs(slip).max() <= 1e-14 if flight else np.abs(slip).max() > 1e-3
+    assert (np.abs(pushes[~whole.holonomic]) > 0).all() == (flight != 0)
+
+
+@pytest.mark.parametrize("name", VELOCITIES)
+def test_gradients_of_rows_of_velocities(name):
+    """What a family gives for a flight is the derivative of a((x0 + x1)/2) . (x1 - x0) by x1, but for Python's."""
+    item = CASES[name]()
+    x, rng = scattered(3), np.random.default_rng(4)
+    fast, _, _ = both([item], x)
+    width, given = 3 * item.width, fast._given
+    count = item.n_rows
+    for k, start in zip(range(count), given.starts, strict=True):
+        place, way = x[item.atoms[fast.rows[k]]].ravel(), rng.normal(size=width)
+        address = int(given.numbers.view(np.int64)[start])
+        row = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, ctypes.c_double, ctypes.c_void_p)(address)
+        room = given.numbers.ctypes.data + 8 * ROOM
+
+        def called(middle, way, row=row, start=start, room=room):
+            given.numbers[ROOM : ROOM + 2 * width] = [*middle, *way]
+            row(room, given.numbers.ctypes.data + 8 * (int(start) + 2), TIME, room + 16 * width)
+            return given.numbers[ROOM + 2 * width : ROOM + 3 * width + 1].copy()
+
+        coefficients = item.gradient(x[item.atoms], TIME)[fast.rows[k]].ravel()
+        np.testing.assert_allclose(called(place, 0 * way), [0.0, *coefficients], rtol=1e-14, atol=1e-15)
+        found = called(place, way)
+        assert found[0] == pytest.approx(coefficients @ way, rel=1e-13)
+        step = 1e-5 * np.eye(width)
+        slope = [(called(place + 0.5 * s, way + s)[0] - called(place - 0.5 * s, way - s)[0]) / 2e-5 for s in step]
+        if given.python:
+            slope = coefficients
+        np.testing.assert_allclose(found[1:], slope, rtol=1e-8, atol=1e-8)
+
+
+@numba.njit
+def leaning(r):
+    return np.array([[-r[0, 1], r[0, 0] + r[1, 2], 0.3], [0.0, r[0, 1] * r[1, 0], 1.0]])
+
+
+@numba.njit
+def leaning_with_time(r, t):
+    return np.cos(t) * np.array([[-r[0, 1], r[0, 0] + r[1, 2], 0.3], [0.0, r[0, 1] * r[1, 0], 1.0]])
+
+
+@pytest.mark.parametrize("function", [leaning, leaning_with_time], ids=["at rest", "moving"])
+def test_coefficients_of_numba_are_called_without_python(function):
+    x, timed = scattered(4), function is leaning_with_time
+    fast, _, _ = both([CustomVelocity([[0, 1], [5, 2]], function, time_dependent=timed)], x)
+    slow, _, _ = both([CustomVelocity([[0, 1], [5, 2]], function.py_func, time_dependent=timed)], x)
+    assert not fast._given.python and len(slow._given.python) == 1
+    ends, iterations = [], []
+    for solver in (fast, slow):
+        y = x + 0.1 * np.random.default_rng(1).normal(size=x.shape)
+        found = solver.positions(Request(y, x, np.zeros(2), None, TIME + 0.1, TIME, flight=True))
+        assert found.converged
+        ends.append(y)
+        iterations.append(found.iterations)
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-14)
+    # The kernel knows how the coefficients change on the way: Newton's method, which Python's rows are not.
+    assert iterations[0] <= 4 < iterations[1]
+
+
+def test_coefficients_are_found_once_for_a_place():
+    """A step of a bead asks for the middle of each iteration and for where it ends, which is where the next begins."""
+    places = []
+
+    def coefficients(r):
+        places.append(r.tobytes())
+        return np.array([[-r[0, 1], r[0, 0], 0.0]])
+
+    x = np.array([[1.0, 0.2, 0.0]])
+    motion = Motion(ConstraintSet(CustomVelocity(0, coefficients), x, [1.0]), x)
+    system = System(motion, None)
+    state = State(x, motion.project_velocities(x, [[1.0, 0.0, 0.5]]))
+    state = run(system, state, 0.01, 2)
+    places.clear()
+    run(system, state, 0.01, 10)
+    # The first of these begins where the last call ended, or with one place more.
+    assert len(places) - len(set(places)) <= 1
+    assert len(places) <= 10 * 6
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,8 @@ def evaluated(constraints, x, cell=None, moves=0.0):
     values, lines = np.zeros(n), np.zeros(8 * len(slot_atoms))
     for which in range(2):
         evaluate(
-            0, n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(), lattice, cell is not None,
-            values, lines, which,
+            0, n, kinds, links, slot_atoms, solver.numbers, base.ravel(), change.ravel(), base.ravel(), lattice,
+            cell is not None, values, lines, which,
         )  # fmt: skip
     slots = links.reshape(-1, 4)[:, 2]
     lines = lines.reshape(-1, 8)

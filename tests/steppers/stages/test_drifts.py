@@ -12,6 +12,7 @@ from kcons.constraints import (
     Distance,
     FixedAtoms,
     ImplicitSurface,
+    KnifeEdge,
     LinearVelocity,
     MovingTarget,
     Plane,
@@ -20,7 +21,7 @@ from kcons.constraints import (
 )
 from kcons.errors import ConvergenceError
 from kcons.steppers.stages.compensated_steps import Point
-from kcons.steppers.stages.drifts import FreeFlight, GreatCircles, NonholonomicFlight, rattle_drift
+from kcons.steppers.stages.drifts import FreeFlight, GreatCircles
 
 
 def flown(drift, system, state, h: float, *, exact: bool = True):
@@ -54,17 +55,68 @@ def test_free_flight_absorbs_velocities_along_the_gradients() -> None:
         np.testing.assert_allclose(a, b, rtol=0, atol=5e-14)
 
 
-def test_which_drift_is_taken() -> None:
-    for make, kind in ((rotor, FreeFlight), (growing_rod, FreeFlight), (skate, NonholonomicFlight)):
-        system, _ = make()
-        assert type(rattle_drift(system.motion, system.inverse_masses)) is kind
+def literal_flight(system, state, h: float):
+    """What a flight should be, by dense algebra on all rows at once: x1 and u."""
+    held, x0, t0 = system.motion.constraint_set, state.positions, state.time
+    rolls, weights = ~held.holonomic, np.repeat(system.inverse_masses, 3)
+    pull = weights[:, None] * held.jacobian(x0, t0).toarray().T
+    multipliers = np.zeros(held.n_rows)
+    for _ in range(60):
+        u = state.velocities.ravel() + pull @ multipliers
+        x1 = x0 + h * u.reshape(x0.shape)
+        middle, then = 0.5 * (x0 + x1), t0 + 0.5 * h
+        rows = np.where(rolls[:, None], held.jacobian(middle, then).toarray(), held.jacobian(x1, t0 + h).toarray())
+        speeds = held.jacobian(middle, then) @ u - held.velocity_target(middle, then)
+        multipliers -= np.linalg.lstsq(rows @ pull, np.where(rolls, speeds, held.value(x1, t0 + h) / h), rcond=1e-10)[0]
+    return x1, u.reshape(x0.shape)
+
+
+def wheel():
+    """A wheel of three masses and a hub that rolls, and is pushed at its hub in a direction that turns with it."""
+    turns = np.radians([10, 130, 250])[:, None]
+    x = np.array([0, 0, 1.0]) + np.vstack([np.zeros(3), 0.9 * np.hstack([np.sin(turns), 0 * turns, np.cos(turns)])])
+    held = [
+        Plane([0], [0.0, 0, 1]),
+        Plane([0, 1, 2, 3], [0.0, 1, 0]),
+        Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]),
+    ]
+    system = system_of([*held, Rolling([0], [1], 1.0, [1.0, 0, 0])], x, [0.5, 1.0, 2.0, 1.5])
+    return system, system.initial_state(x, np.array([[1.0, 0, 0], [2, 0, 0.5], [0, 0, 1], [-1, 0, 0]]), project=True)
+
+
+def pivoting_skate():
+    """A blade that touches at its back, so that what keeps it from sliding turns it."""
+    x = np.array([[0.2, -0.1, 0.0], [0.7, 0.3, 0.1]])
+    rows = [Distance([0, 1]), Plane([0, 1], [0.0, 0.1, 1.0]), KnifeEdge(0, 1, [0.0, 0.0, 1.0], contact=0.1)]
+    system = system_of(rows, x, [1.0, 3.0])
+    return system, system.initial_state(x, np.array([[1.0, 0.5, 0], [0.2, 2.0, 0]]), project=True)
+
+
+@pytest.mark.parametrize("h", [0.1, -0.3])
+@pytest.mark.parametrize("make", [skate, pivoting_skate, wheel, lambda: swept(pushed(np.cos)), growing_rod])
+def test_flights_are_those_of_dense_algebra(make, h) -> None:
+    system, state = make()
+    for one, other in zip(flown(system.drift, system, state, h), literal_flight(system, state, h), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=3e-14)
+
+
+@pytest.mark.parametrize("make", [skate, pivoting_skate, wheel])
+def test_velocity_rows_at_rest_go_through_the_compiled_stage(make) -> None:
+    system, state = make()
+    assert [solver.name for solver in system.motion.plan.solvers] == ["mixed"]
+    assert system.flights is not None
+    one = run(system, state, 0.02, 5)
+    slow = make()[0]
+    slow.__dict__["flights"] = None
+    other = run(slow, state, 0.02, 5)
+    np.testing.assert_allclose(one.positions, other.positions, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(one.velocities, other.velocities, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("h", [0.2, -0.2])
 def test_velocity_rows_hold_at_the_middle(h) -> None:
     system, state = skate()
-    drift = NonholonomicFlight(system.motion, system.inverse_masses)
-    x, _ = flown(drift, system, state, h)
+    x, _ = flown(system.drift, system, state, h)
     held = system.motion.constraint_set
     middle, way = 0.5 * (state.positions + x), x - state.positions
     slip = (held.jacobian(middle).toarray() @ way.ravel() / h)[~held.holonomic]
@@ -76,11 +128,9 @@ def test_velocity_rows_leave_other_bodies_to_the_engine() -> None:
     positions = np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0], [5.0, 1.2, 0], [9.0, 9, 9]])
     rows = [LinearVelocity(0, [[0, 0, 1]], target=lambda t: 0.5), Distance([2, 3])]
     system = system_of(rows, positions, np.ones(5))
-    drift = NonholonomicFlight(system.motion, system.inverse_masses)
-    assert drift.atoms.tolist() == [0]
     rng = np.random.default_rng(1)
     state = system.initial_state(positions, rng.normal(size=(5, 3)), project=True)
-    x, _ = flown(drift, system, state, 0.1)
+    x, _ = flown(system.drift, system, state, 0.1)
     assert x[0, 2] == pytest.approx(0.05, abs=1e-16)
     assert np.linalg.norm(x[2] - x[3]) == pytest.approx(1.2, abs=1e-15)
     np.testing.assert_allclose(x[[1, 4]], (positions + 0.1 * state.velocities)[[1, 4]], rtol=0, atol=1e-15)
@@ -89,9 +139,8 @@ def test_velocity_rows_leave_other_bodies_to_the_engine() -> None:
 def test_velocity_row_that_cannot_be_met_names_itself() -> None:
     """A skate that turns by more than it can in one step."""
     system, state = skate()
-    drift = NonholonomicFlight(system.motion, system.inverse_masses)
     with pytest.raises(ConvergenceError) as caught:
-        flown(drift, system, state, 40.0)
+        flown(system.drift, system, state, 40.0)
     assert caught.value.atoms == (0, 1)
 
 
@@ -177,8 +226,7 @@ def swept(*more) -> tuple:
 def test_impulses_act_along_the_gradients_of_the_time_of_the_start(driven, h) -> None:
     """u - v = M^-1 A(x0, t0)^T l: the plane has turned by the end, and pushes where it was."""
     system, state = swept(*([pushed(np.cos)] if driven else []))
-    drift = rattle_drift(system.motion, system.inverse_masses)
-    x, u = flown(drift, system, state, h)
+    x, u = flown(system.drift, system, state, h)
     held = system.motion.constraint_set
     assert np.abs(held.value(x, h)[held.holonomic]).max() <= 1e-14
     np.testing.assert_allclose(x - state.positions, h * u, rtol=0, atol=1e-15)
@@ -194,7 +242,7 @@ def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
     """a((x0 + x1)/2, t0 + h/2) . u = c(t0 + h/2), for coefficients and for speeds that depend on time."""
     speed = lambda t: np.cos(3 * t + 0.4)  # noqa: E731
     system, state = swept(pushed(speed))
-    x, u = flown(rattle_drift(system.motion, system.inverse_masses), system, state, h)
+    x, u = flown(system.drift, system, state, h)
     middle = 0.5 * (state.positions + x)[2, 0]
     assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)
 
