@@ -24,6 +24,7 @@ from kcons.constraints.collective import CenterDistance, CenterOfMass, RadiusOfG
 from kcons.constraints.constraint import Constraint, RowKind
 from kcons.constraints.functions.custom import Custom, ImplicitSurface
 from kcons.constraints.functions.formula import Formula
+from kcons.constraints.functions.velocity_formula import VelocityFormula
 from kcons.constraints.internal import Angle, Dihedral, Distance
 from kcons.constraints.linear import FixedAtoms, LinearCombination, LinearRelation
 from kcons.constraints.surface import Cylinder, Ellipsoid, Line, Plane, Sphere, Torus
@@ -57,6 +58,7 @@ __all__ = [
     "RowKind",
     "Sphere",
     "Torus",
+    "VelocityFormula",
     "from_dict",
 ]
 

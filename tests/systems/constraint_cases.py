@@ -158,6 +158,15 @@ CASES: dict[str, Callable[[], kc.Constraint]] = {
     "LinearRelation": lambda: kc.LinearRelation([0, 3], [1, 2], [0.3, 0.7]),
     "FixedAtoms": lambda: kc.FixedAtoms([6, 1]),
     "FixedAtoms moving": lambda: kc.FixedAtoms([6, 1], lambda t: [[np.sin(t), 0.0, 0.0], [0.0, t**2, np.cos(t)]]),
+    "VelocityFormula": lambda: kc.VelocityFormula(
+        "vz1 - a*sin(b*y1)*vx1 + x1*vy1", [0, 3], {"a": 0.4, "b": [1.0, 2.0]}
+    ),
+    "VelocityFormula of differences": lambda: kc.VelocityFormula(
+        "((x1 - x2)*(vy1 - vy2) - (y1 - y2)*vx1)/sqrt((x1 - x2)**2 + (y1 - y2)**2 + 1)", [[1, 2], [5, 6]]
+    ),
+    "VelocityFormula moving": lambda: kc.VelocityFormula(
+        "cos(w*t)*vx1 + sin(w*t - z1)*vy2", [0, 1], {"w": 0.8}, np.sin
+    ),
     "LinearVelocity": lambda: kc.LinearVelocity([[0, 1], [5, 2]], [[1.0, 2.0, 0.0], [0.0, -1.0, 3.0]], np.sin),
     "KnifeEdge": lambda: kc.KnifeEdge([0, 3], [1, 4], [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], contact=[0.0, 0.3]),
     "Rolling": lambda: kc.Rolling([0, 3], [1, 4], [0.7, 1.5], [1.0, 0.2, 0.1], [0.1, 0.0, 1.0]),

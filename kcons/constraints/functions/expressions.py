@@ -1,7 +1,8 @@
 """Formulas as code: what is written is checked by its names, differentiated by SymPy, and kept in a file.
 
-The file is a module of two functions on plain numbers, or on arrays of one number a row: value and gradient, and what
-accelerations need. It lies where Numba can keep what it compiles of it, so that another process finds both.
+The file is a module of functions on plain numbers, or on arrays of one number a row: value and gradient, and what
+accelerations need; of a formula that is linear in the velocities its coefficients, and what these need. It lies where
+Numba can keep what it compiles of it, so that another process finds both.
 """
 
 from __future__ import annotations
@@ -32,12 +33,13 @@ FUNCTIONS: dict[str, Any] = {
     "abs": np.abs,
 }
 _IN_SYMPY = {"abs": "Abs"}
-_COORDINATE = re.compile(r"([xyz])([1-9]\d*)")
+_COORDINATE = re.compile(r"[xyz]([1-9]\d*)")
+_SPEED = re.compile(r"v[xyz]([1-9]\d*)")
 _OPERATIONS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
 
 
-def parsed(formula: str, parameters: Sequence[str]) -> tuple[ast.expr, set[str]]:
-    """The tree of a formula and the coordinates in it.
+def parsed(formula: str, parameters: Sequence[str], speeds: bool = False) -> tuple[ast.expr, set[int]]:
+    """The tree of a formula, which may have velocities or not, and the atoms in it.
 
     Raises
     ------
@@ -61,10 +63,18 @@ def parsed(formula: str, parameters: Sequence[str]) -> tuple[ast.expr, set[str]]
                         item=name,
                     )
             case ast.Name(id=name):
-                if _COORDINATE.fullmatch(name):
-                    found.add(name)
+                known_as = _COORDINATE.fullmatch(name) or _SPEED.fullmatch(name)
+                if known_as and (speeds or name[0] != "v"):
+                    found.add(int(known_as[1]))
+                elif known_as:
+                    raise InputError(
+                        f"Formula: {name!r} in {formula!r} is a velocity; what is linear in velocities is held by "
+                        "VelocityFormula",
+                        item=name,
+                    )
                 elif name not in (*FUNCTIONS, *parameters, "t", "pi"):
-                    known = ", ".join(["x1, y1, z1, x2, ...", "t", "pi", *parameters])
+                    places = "x1, y1, z1, x2, ..." + (", vx1, vy1, ..." if speeds else "")
+                    known = ", ".join([places, "t", "pi", *parameters])
                     raise InputError(
                         f"Formula: {name!r} in {formula!r} is not known; known are {known}. Give it as a parameter: "
                         f"parameters={{{name!r}: ...}}",
@@ -131,7 +141,7 @@ def undefined_part(tree: ast.expr, names: dict[str, Any]) -> str | None:
     return f"{ast.unparse(tree)} is {value}"
 
 
-def width_of(formula: str, parameters: Sequence[str]) -> int:
+def width_of(formula: str, parameters: Sequence[str], speeds: bool = False) -> int:
     """Atoms a row.
 
     Raises
@@ -139,7 +149,7 @@ def width_of(formula: str, parameters: Sequence[str]) -> int:
     InputError
         As `parsed`; a formula without atoms, or one that leaves some out.
     """
-    numbers = {int(name[1:]) for name in parsed(formula, parameters)[1]}
+    numbers = parsed(formula, parameters, speeds)[1]
     if not numbers:
         raise InputError(
             f"Formula: {formula!r} names no coordinate; x1, y1, z1 are those of the first atom of a row, x2 ... of the "
@@ -157,25 +167,26 @@ def width_of(formula: str, parameters: Sequence[str]) -> int:
 
 
 @cache
-def code_of(formula: str, width: int, parameters: tuple[str, ...]) -> Code:
-    """The code of a formula over so many atoms a row.
+def code_of(formula: str, width: int, parameters: tuple[str, ...], speeds: bool = False) -> Code:
+    """The code of a formula over so many atoms a row; with `speeds`, of one that is linear in their velocities.
 
     Raises
     ------
     InputError
-        As `width_of`; another width; a formula that does not change with the positions.
+        As `width_of`; another width; a formula that does not change with the positions, or is not linear in the
+        velocities.
     UnsupportedError
         SymPy is needed and not there.
     """
-    tree, _ = parsed(formula, parameters)
-    named = width_of(formula, parameters)
+    tree, _ = parsed(formula, parameters, speeds)
+    named = width_of(formula, parameters, speeds)
     if named != width:
         raise InputError(
             f"Formula: {formula!r} names {named} atoms a row, and atoms has {width} a row; give as many as the formula "
             "names",
             item="atoms",
         )
-    return Code(tree, _module(formula, tree, width, parameters))
+    return Code(tree, _module(formula, tree, width, parameters, speeds))
 
 
 class Code:
@@ -186,10 +197,11 @@ class Code:
     row : callable
         ``row(r, p, t, out)`` for `kcons.solvers.sparse.row_functions`, to be compiled.
     first : callable
-        Value and gradient of all rows: of the coordinates, the time and the parameters, an array each.
+        Value and gradient of all rows: of the coordinates, the time and the parameters, an array each. Of velocities
+        their coefficients.
     second : callable
         v^T (d2q/dr2) v, dq/dt and 2 (d2q/dr dt) . v + d2q/dt2, of the coordinates, the velocities, the time and the
-        parameters.
+        parameters. Of velocities v . (d coefficients/dt).
     invariant, moving : bool
         Whether a common shift of all atoms changes nothing; whether the time is in it.
     """
@@ -204,14 +216,14 @@ class Code:
 _NUMPY: dict[str, Any] = {**FUNCTIONS, "copysign": np.copysign, "__builtins__": {"abs": np.abs}}
 
 
-def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...]) -> ModuleType:
+def _module(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], speeds: bool) -> ModuleType:
     """The module of a formula, from its file if there is one."""
-    meant = repr((ast.unparse(tree), width, parameters)).encode()
+    meant = repr((ast.unparse(tree), width, parameters, speeds)).encode()
     key = hashlib.sha256(Path(__file__).read_bytes() + meant).hexdigest()[:24]  # other code writes other files
     folder = _folder()
     path = folder / f"formula_{key}.py"
     if not path.exists():
-        text = _written(formula, tree, width, parameters)
+        text = _written(formula, tree, width, parameters, speeds)
         handle, name = tempfile.mkstemp(dir=folder, suffix=".py")
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)
@@ -247,7 +259,7 @@ def _passing() -> str:
     return tempfile.mkdtemp(prefix="kcons-formulas-")
 
 
-def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...]) -> str:
+def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ...], linear: bool) -> str:
     """The text of a module: exact derivatives with common parts computed once."""
     try:
         import sympy
@@ -280,16 +292,25 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
     functions = {name: getattr(sympy, _IN_SYMPY.get(name, name)) for name in FUNCTIONS}
     value = sympy.sympify(evaluated(tree, {**functions, **symbols, "pi": sympy.pi, "": constant}))
     t = symbols["t"]
-    slope = [value.diff(symbols[name]) for name in axes]
+    steep = [value.diff(symbols[name]) for name in axes]
+    slope = [value.diff(symbols[name]) for name in speeds] if linear else steep
     if all(part == 0 for part in slope):
-        raise InputError(
-            f"Formula: {formula!r} does not change with the positions: its gradient is zero; write one that does",
-            item="formula",
-        )
+        what = "velocities: it has none of them" if linear else "positions: its gradient is zero"
+        raise InputError(f"Formula: {formula!r} does not change with the {what}; write one that does", item="formula")
     along = sum((part * symbols[v] for part, v in zip(slope, speeds, strict=True)), sympy.S.Zero)
     bend = sum((along.diff(symbols[n]) * symbols[v] for n, v in zip(axes, speeds, strict=True)), sympy.S.Zero)
     second = [bend, value.diff(t), 2 * along.diff(t) + value.diff(t, 2)]
-    sums = [sum(slope[axis::3], sympy.S.Zero) for axis in range(3)]
+    if linear:
+        moving = [symbols[name] for name in speeds]
+        rest = sympy.simplify(value.subs(dict.fromkeys(moving, 0)))
+        if rest != 0 or any(part.has(*moving) for part in slope):
+            raise InputError(
+                f"VelocityFormula: {formula!r} is not a sum of velocities times functions of the positions and the time"
+                + (f": {rest} is left without velocities; what the sum is held at is the target" if rest != 0 else ""),
+                item="formula",
+            )
+        second = [bend + along.diff(t)]
+    sums = [sum(steep[axis::3], sympy.S.Zero) for axis in range(3)]
     invariant = width > 1 and all(each == 0 or sympy.expand(each) == 0 for each in sums)
 
     def function(name: str, arguments: Sequence[str], results: Sequence[Any]) -> str:
@@ -299,17 +320,23 @@ def _written(formula: str, tree: ast.expr, width: int, parameters: tuple[str, ..
         shown = ", ".join(printer.doprint(sympy.Float(what) if what.is_Integer else what) for what in last)
         return "\n".join([f"def {name}({', '.join(arguments)}):", *lines, f"    return ({shown},)\n"])
 
-    places = [f"r[{k}]" for k in range(3 * width)] + ["t"] + [f"p[{k}]" for k in range(len(parameters))]
-    row = ["def row(r, p, t, out):", f"    found = first({', '.join(places)})"]
+    # Of velocities: of where a flight ends, see `kcons.solvers.sparse.row_functions`.
+    used = "flight" if linear else "first"
+    places = [f"r[{k}]" for k in range((6 if linear else 3) * width)] + ["t"]
+    places += [f"p[{k}]" for k in range(len(parameters))]
+    row = ["def row(r, p, t, out):", f"    found = {used}({', '.join(places)})"]
     row += [f"    out[{k}] = found[{k}]" for k in range(3 * width + 1)]
     names = ", ".join(sorted({*FUNCTIONS, "copysign"} - {"abs"}))
     head = f"# Written by kcons for {formula!r}.\nfrom math import {names}\n\nimport numba\n"
     flags = '@numba.njit(fastmath={"contract", "arcp", "nsz"}, error_model="numpy")'
+    ahead = [part + bent / 2 for part, bent in zip(slope, steep, strict=True)]
+    flight = flags + "\n" + function("flight", [*axes, *speeds, "t", *parameters], [value, *ahead])
     return "\n\n".join(
         [
             head,
             f"INVARIANT, MOVING = {invariant}, {value.has(t)}",
-            flags + "\n" + function("first", [*axes, "t", *parameters], [value, *slope]),
+            flags + "\n" + function("first", [*axes, "t", *parameters], slope if linear else [value, *slope]),
+            *([flight] if linear else []),
             function("second", [*axes, *speeds, "t", *parameters], second),
             "\n".join(row) + "\n",
         ]

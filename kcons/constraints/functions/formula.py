@@ -61,6 +61,8 @@ class Formula(Constraint):
     held = ANY
     kind = RowKind.FUNCTION
     shared: ClassVar[tuple[str, ...]] = ("formula", "names", "period")
+    #: Whether it is linear in velocities, which have names too.
+    of_speeds: ClassVar[bool] = False
     values: FloatArray
 
     def __init__(
@@ -78,7 +80,7 @@ class Formula(Constraint):
             taken = name in (*FUNCTIONS, "t", "pi") or name.startswith(("_", "vx", "vy", "vz"))
             if not name.isidentifier() or iskeyword(name) or taken or (name[1:].isdigit() and name[0] in "xyz"):
                 raise InputError(f"Formula: {name!r} cannot be the name of a parameter; give another one", item=name)
-        alone = width_of(formula, self.names) == 1
+        alone = width_of(formula, self.names, self.of_speeds) == 1
         super().__init__(np.asarray(atoms).reshape(-1, 1) if alone else atoms, target)
         columns = []
         for name, value in given.items():
@@ -101,7 +103,7 @@ class Formula(Constraint):
 
     def code(self) -> Code:
         """What is computed of the formula."""
-        return code_of(self.formula, self.width, tuple(self.names))
+        return code_of(self.formula, self.width, tuple(self.names), self.of_speeds)
 
     @property
     def moving(self) -> bool:
@@ -152,6 +154,7 @@ class Formula(Constraint):
         def said(k: int, row: str) -> str:
             axes = [f"{axis}{atom}" for atom in range(1, self.width + 1) for axis in "xyz"]
             numbers = dict(zip([*axes, "t", *self.names], [*r[k].ravel(), time, *self.values[k]], strict=True))
+            numbers |= {f"v{axis}": 1.0 for axis in axes}
             part = undefined_part(self.code().tree, {**FUNCTIONS, **numbers, "pi": np.pi, "": np.float64})
             what = part or f"its gradient is {'zero' if size[k] == 0 else 'not finite'}"
             return f"{row}, {self.formula!r}: {what} at the start; move the atoms, or write another formula"
@@ -166,6 +169,7 @@ class Formula(Constraint):
             raise InputError(f"{cls.family} cannot be read: entries {wrong} are missing or unknown", item=wrong[0])
         columns = list(np.asarray(data["values"], dtype=np.float64).T) if data["names"] else []
         parameters = dict(zip(data["names"], columns, strict=True))
-        item = cls(data["formula"], data["atoms"], parameters, data["target"], period=data["period"])
+        period = {name: data[name] for name in cls.shared if name == "period"}
+        item = cls(data["formula"], data["atoms"], parameters, data["target"], **period)
         item.units = data.get("units")
         return item

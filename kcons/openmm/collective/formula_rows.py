@@ -21,7 +21,7 @@ def as_rows(given: Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
     Raises
     ------
     UnsupportedError
-        A formula, or its target, that moves with the time.
+        A formula, or its target, that moves with the time; one of velocities.
     """
     rows: list[Row] = []
     for each in given:
@@ -34,6 +34,8 @@ def as_rows(given: Sequence[Row | openmm.Force | int | Formula]) -> list[Row]:
 
 def formula_rows(item: Formula) -> list[Row]:
     """A `Row` for each row of a formula; positions are taken as OpenMM has them, no images are looked for."""
+    if not item.holonomic:
+        raise UnsupportedError(f"{item!r} holds velocities, not positions; hold it by kcons.openmm.hold")
     if item.moving or isinstance(item.target, MovingTarget):
         raise UnsupportedError(
             f"{item!r} moves with the time, which OpenMM's expressions do not know; hold it by kcons.openmm.hold"

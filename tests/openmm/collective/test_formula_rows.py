@@ -9,7 +9,7 @@ import openmm
 import pytest
 from openmm import unit
 
-from kcons.constraints import Formula
+from kcons.constraints import Formula, VelocityFormula
 from kcons.constraints.functions.expressions import FUNCTIONS, parsed
 from kcons.errors import UnsupportedError
 from kcons.openmm import CollectiveRows, ProjectedIntegrator, Row, hold
@@ -88,3 +88,12 @@ def test_what_moves_is_carried_and_not_expressed():
     assert end[0, 2] == pytest.approx(0.3 + 0.01 * np.sin(5 * 0.04), abs=1e-12)
     still = formula_rows(Formula("z1", 0, target=None))[0]
     assert isinstance(still, Row) and still.target is None
+
+
+def test_velocities_are_carried_and_not_expressed():
+    row = VelocityFormula("x1*vy1 - y1*vx1", 0)
+    system = beads()
+    with pytest.raises(UnsupportedError, match=r"holds velocities, not positions; hold it by kcons.openmm.hold"):
+        CollectiveRows(system, [row], positions=X)
+    end = ran(system, hold(system, row, X))
+    assert abs(np.cross(end[0, :3], end[0, 3:])[2]) < 1e-10
