@@ -143,6 +143,12 @@ def check_pairs(pairs: ArrayLike, n_atoms: int | None = None) -> IntArray:
     return table.astype(np.int64)
 
 
+def refuse_other(value: Any, kind: type | tuple[type, ...], item: str, remedy: str) -> None:
+    """Raise `InputError` for what is no `kind`."""
+    if not isinstance(value, kind):
+        raise InputError(f"{item} is {value!r}; give {remedy}", item=item)
+
+
 def finite_number(value: Any, item: str) -> float:
     """`value` as a float.
 
@@ -153,7 +159,7 @@ def finite_number(value: Any, item: str) -> float:
     """
     refuse_units(value, item)
     try:
-        found = math.nan if np.ndim(value) else float(value)
+        found = math.nan if np.ndim(value) or isinstance(value, str | bytes) else float(value)
     except (TypeError, ValueError):
         found = math.nan
     if not math.isfinite(found):

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from kcons.constraints.arguments import numbers
+from kcons.constraints.arguments import numbers, refuse_other
 from kcons.constraints.constraint import Constraint, IntArray
 from kcons.constraints.contradictions import found_as_given, refuse_contradictions
 from kcons.constraints.periodic.images import find_images
@@ -85,6 +85,7 @@ class ConstraintSet(InCell):
         pbc: bool | Sequence[bool] = True,
         time: float = 0.0,
     ) -> None:
+        refuse_other(constraints, (Constraint, Iterable), "constraints", "a kcons constraint, or a list of them")
         given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         for item in given:
             if not isinstance(item, Constraint):
@@ -107,8 +108,7 @@ class ConstraintSet(InCell):
         _check_atoms(given, x, m)
 
         self.constraints: tuple[Constraint, ...] = ()
-        starts = np.concatenate([[0], np.cumsum([c.n_rows for c in given], dtype=np.int64)])
-        self.starts: IntArray = starts.astype(np.int64)
+        self.starts: IntArray = np.concatenate([[0], np.cumsum([c.n_rows for c in given])]).astype(np.int64)
         weighted = [item.with_masses(m[item.atoms]) for item in given]
         marked, self.images = find_images(weighted, self.starts, x, self.lattice, self.half_width, time)
         y = self.whole(x)

@@ -15,8 +15,23 @@ from zipfile import ZipFile
 
 import numpy as np
 
+from kcons.errors import InputError
+
 #: The record at the end of an archive without comment; the fifth number is how many files there are.
 _LAST_RECORD = Struct("<4s4H2LH")
+
+
+def as_path(value: str | PathLike[str], item: str) -> Path:
+    """The path that `value` names.
+
+    Raises
+    ------
+    InputError
+        It is neither text nor a path.
+    """
+    if not isinstance(value, str | PathLike):
+        raise InputError(f"{item} is {value!r}; give a path", item=item)
+    return Path(value)
 
 
 @contextmanager

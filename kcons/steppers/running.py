@@ -7,8 +7,9 @@ from typing import Any, TypeAlias, overload
 
 import numpy as np
 
-from kcons.constraints.arguments import refuse_units, whole_number
+from kcons.constraints.arguments import finite_number, refuse_other, whole_number
 from kcons.constraints.target import FloatArray
+from kcons.errors import InputError
 from kcons.motion.certificate import checked_every
 from kcons.steppers.rattle import Rattle
 from kcons.steppers.state import State, System
@@ -144,7 +145,8 @@ def run(
     Raises
     ------
     InputError
-        Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units.
+        Negative `steps` or `check_every`, `every` or `record` below 1; a `dt` with units, or that is no finite number;
+        what is no system, state or stepper.
     CertificateError
         A state is off its constraints though its solver said nothing; `error.state` is the last certified one.
     UnsupportedError
@@ -155,9 +157,13 @@ def run(
     """
     steps, every = whole_number(steps, "steps", 0), whole_number(every, "every")
     record = None if record is None else whole_number(record, "record")
-    refuse_units(dt, "dt")
+    dt = finite_number(dt, "dt")
+    refuse_other(system, System, "system", "a kcons.System")
+    refuse_other(state, State, "state", "a kcons.State, such as system.initial_state(positions, velocities)")
     if stepper is None:
         stepper = Rattle()
+    if isinstance(stepper, type) or not hasattr(stepper, "step"):
+        raise InputError(f"stepper is {stepper!r}; give an object, such as kcons.Rattle()", item="stepper")
     stepper.check(system)
     check_every, spare = checked_every(check_every)
     if dt == 0 or not getattr(stepper, "holds", True):

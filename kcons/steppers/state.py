@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kcons.constraints.arguments import as_array, finite_array, lent, numbers
+from kcons.constraints.arguments import as_array, finite_array, lent, numbers, refuse_other
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.errors import CertificateError, InputError, OverdeterminedError
@@ -228,6 +228,9 @@ class System:
         friction: ArrayLike = 0.0,
         far: float = FAR,
     ) -> None:
+        refuse_other(motion, Motion, "motion", "a kcons.Motion")
+        if force is not None and not callable(force):
+            raise InputError(f"force is {force!r}; give a function of positions and time", item="force")
         if not far >= 1:
             raise InputError(f"far is {far}; give a number of 1 or more", item="far")
         self.motion = motion
@@ -235,8 +238,7 @@ class System:
         self.force = force
         self.potential = potential
         self.velocity_dependent = velocity_dependent and force is not None
-        self.n_atoms = motion.n_atoms
-        self._shape = (motion.n_atoms, 3)
+        self.n_atoms, self._shape = motion.n_atoms, (motion.n_atoms, 3)
         self.masses: FloatArray = motion.masses
         fixed = _fixed_atoms(motion)
         bad = ~(np.isfinite(self.masses) & (self.masses > 0))

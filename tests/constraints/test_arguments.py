@@ -303,7 +303,7 @@ def test_whole_numbers(value):
     assert [whole_number(good, "steps") for good in (3, 3.0, np.int32(3))] == [3, 3, 3]
 
 
-@pytest.mark.parametrize("value", [None, "x", np.nan, [1.0], 1j])
+@pytest.mark.parametrize("value", [None, "x", "0.5", np.nan, [1.0], 1j])
 def test_finite_numbers(value):
     with pytest.raises(InputError, match="keep is"):
         finite_number(value, "keep")

@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcons.steppers.files import in_one_piece, plain, stored_arrays, text
+from kcons.errors import InputError
+from kcons.steppers.files import as_path, in_one_piece, plain, stored_arrays, text
+
+
+def test_what_names_a_path(tmp_path: Path) -> None:
+    assert as_path("a/b", "folder") == Path("a/b") and as_path(tmp_path, "folder") == tmp_path
+    for wrong in (3, None, b"a"):
+        with pytest.raises(InputError, match="; give a path"):
+            as_path(wrong, "folder")  # type: ignore[arg-type]
 
 
 def test_a_file_is_there_once_it_is_whole(tmp_path: Path) -> None:

@@ -51,6 +51,17 @@ def test_bad_run_arguments(steps, every) -> None:
         run(system, state, 0.1, steps, every=every)
 
 
+@pytest.mark.parametrize(
+    "item, value", [("dt", "0.1"), ("dt", None), ("dt", [0.1]), ("state", None), ("system", None), ("stepper", Rattle)]
+)
+def test_what_is_no_system_state_time_or_stepper(item, value) -> None:
+    system, state = rotor()
+    given = {"system": system, "state": state, "dt": 0.1, "steps": 1} | {item: value}
+    with pytest.raises(InputError, match=f"{item} is .*give") as caught:
+        run(**given)
+    assert caught.value.item == item
+
+
 def test_run_uses_rattle_unless_told() -> None:
     system, state = molecule()
     assert np.array_equal(

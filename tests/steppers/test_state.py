@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from stepper_systems import SYMMETRIC, gravity, rotor, spherical_pendulum, system_of
 
+from kcons import ConstraintSet, Motion
 from kcons.constraints import Distance, FixedAtoms, MovingTarget
 from kcons.errors import InputError
-from kcons.steppers import BlanesMoan6, State, run
+from kcons.steppers import BlanesMoan6, State, System, run
 
 
 def test_float32_input_is_cast():
@@ -272,3 +273,15 @@ def test_far_may_be_switched_off() -> None:
 def test_bad_far(far) -> None:
     with pytest.raises(InputError, match="far is"):
         rotor(far=far)
+
+
+def test_what_is_no_motion_or_force() -> None:
+    system, _ = rotor()
+    for item, given in (("motion", (None,)), ("force", (system.motion, 3))):
+        with pytest.raises(InputError, match=f"{item} is .*give") as caught:
+            System(*given)
+        assert caught.value.item == item
+    with pytest.raises(InputError, match=r"constraint_set is None; give a kcons\.ConstraintSet"):
+        Motion(None, np.zeros((2, 3)))
+    with pytest.raises(InputError, match="constraints is None; give"):
+        ConstraintSet(None, np.zeros((2, 3)), np.ones(2))

@@ -107,6 +107,28 @@ class Attempts:
         assert self.folder is not None
         return self.folder / PLACE / f"{number:05d}.npz"
 
+    def _read(self, number: int) -> Attempt | None:
+        """What a file has; None if there is none."""
+        if self.folder is None or not self._file(number).exists():
+            return None
+        try:
+            with self._file(number).open("rb") as file:
+                data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
+            head = json.loads(str(data["head"]))
+            point, source = tuple(head["point"]), head["source"]
+            found = Attempt(number, point, source, data["positions"], error=head["error"], memory=data["memory"])
+            found.terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
+            found.energy, found.largest = (float(v) for v in data["numbers"])
+            found.evaluations = head["evaluations"]
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise UnreadableError(f"{self._file(number)} cannot be read ({error}); remove it", item="folder") from error
+        return found
+
+    def tried(self, number: int) -> tuple[Point, int | None] | None:
+        """Point and source of an attempt of an earlier run; None if there is none."""
+        found = self._read(number)
+        return None if found is None else (found.point, found.source)
+
     def kept(self, number: int, point: Point, source: int | None) -> Attempt | None:
         """An attempt of an earlier run; None if there is none.
 
@@ -115,20 +137,8 @@ class Attempts:
         UnreadableError
             Its file is damaged, or of another scan.
         """
-        if self.folder is None or not self._file(number).exists():
-            return None
-        try:
-            with self._file(number).open("rb") as file:
-                data = {name.removesuffix(".npy"): array for name, array in stored_arrays(file).items()}
-            head = json.loads(str(data["head"]))
-            found = Attempt(number, point, source, data["positions"], error=head["error"], memory=data["memory"])
-            found.terms = [tuple(a for a in row if a != _NONE) for row in data["terms"].tolist()]
-            found.energy, found.largest = (float(v) for v in data["numbers"])
-            found.evaluations = head["evaluations"]
-            same = (tuple(head["point"]), head["source"]) == (point, source)
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-            raise UnreadableError(f"{self._file(number)} cannot be read ({error}); remove it", item="folder") from error
-        if not same:
+        found = self._read(number)
+        if found is not None and (found.point, found.source) != (point, source):
             raise UnreadableError(f"{self._file(number)} is of another scan; take another folder", item="folder")
         return found
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from os import PathLike
 
 import numpy as np
 from ase import Atoms
@@ -42,6 +42,7 @@ from kcons.free_energy.scans.model_hessian import Internals
 from kcons.free_energy.scans.relaxation import FIRST, relax
 from kcons.motion.minimisation import minimise
 from kcons.motion.motion import Motion
+from kcons.steppers.files import as_path
 from kcons.thermostats.freedom import positive
 
 #: Energy by which a structure has to be lower to be handed on to the neighbours, in eV (10^-5 hartree).
@@ -140,7 +141,7 @@ def scan(
     values: ArrayLike | Sequence[ArrayLike],
     *,
     held: Constraint | Iterable[Constraint] = (),
-    folder: Path | str | None = None,
+    folder: str | PathLike[str] | None = None,
     fmax: float = 0.01,
     both_ways: bool = True,
     evaluations: int = 200,
@@ -159,7 +160,8 @@ def scan(
     held : sequence of Constraint
         What else is held, at its targets or as it is in `atoms`.
     folder : path, optional
-        Keeps every relaxation as soon as it is done. With the same arguments again, a scan goes on there.
+        Keeps every relaxation as soon as it is done. With the same arguments again, a scan goes on there, and tries
+        points once more that failed.
     fmax : float
         The largest force along the constraints that may be left on an atom, in eV/angstrom.
     both_ways : bool
@@ -191,7 +193,7 @@ def scan(
     fmax, evaluations = positive(fmax, "fmax"), whole_number(evaluations, "evaluations")
     surface = _Surface(atoms, grid, constraints_in(held, "held"))
     settings = {"fmax": fmax, "both_ways": both_ways, "evaluations": evaluations}
-    attempts = Attempts(None if folder is None else Path(folder), atoms, grid, surface.held, settings)
+    attempts = Attempts(None if folder is None else as_path(folder, "folder"), atoms, grid, surface.held, settings)
     return _Wavefront(surface, grid, attempts, settings, progress).run()
 
 
@@ -310,6 +312,7 @@ class _Wavefront:
         self._handed: dict[Point, int] = {}
         self._queue: deque[tuple[Point, int | None]] = deque()
         self._tried: set[tuple[Point, int | None]] = set()
+        self._tried_now: set[Point] = set()
         self._first: KconsError | None = None
 
     def run(self) -> Scan:
@@ -318,7 +321,7 @@ class _Wavefront:
             self._drain()
             if self.scan.best:
                 break
-        while self._reach_the_rest():
+        while self._reach_the_rest() or self._try_again():
             self._drain()
         if not self.scan.best:
             assert self._first is not None
@@ -341,6 +344,7 @@ class _Wavefront:
         attempts = self.scan.attempts
         attempt = self.attempts.kept(len(attempts), point, source)
         if attempt is None:
+            self._tried_now.add(point)
             attempt = Attempt(len(attempts), point, source)
             try:
                 self.surface.relaxed(attempt, None if source is None else attempts[source], self.fmax, self.evaluations)
@@ -380,4 +384,16 @@ class _Wavefront:
             return False
         _, point, number = min(pairs)
         self._queue.append((point, number))
+        return True
+
+    def _try_again(self) -> bool:
+        """Try a point that failed in an earlier run, once in this one, as it was tried first; False if none is left."""
+        attempts = self.scan.attempts
+        again = self.attempts.tried(len(attempts))
+        if again is None:
+            failed = (a for a in attempts if a.point not in self.scan.best and a.point not in self._tried_now)
+            again = next(((a.point, a.source) for a in failed), None)
+        if again is None:
+            return False
+        self._settle(self._made(*again))
         return True

@@ -31,7 +31,7 @@ from kcons.free_energy.profiles.profile import Profile, integrate
 from kcons.free_energy.profiles.pulls import FEWEST, Pulled, pull_free_energy
 from kcons.free_energy.series import Series
 from kcons.free_energy.windows.window import DIRECTIONS, SIDES, Sampler, Settings, Window, approach_of, places_of
-from kcons.steppers.files import in_one_piece, text
+from kcons.steppers.files import as_path, in_one_piece, text
 
 #: Boltzmann's constant in kJ/mol/K.
 BOLTZMANN = 0.00831446261815324
@@ -178,10 +178,10 @@ class Windows:
         approach: ArrayLike = 0.1,
         seed: int = 1,
     ) -> None:
+        self.folder = as_path(folder, "folder")
         self.sampler = sampler
         self.settings = settings or Settings()
         self.both_sides, self.seed = both_sides, seed_number(seed)
-        self.folder = Path(folder)
         self.start, self.periods = sampler.begin()
         self._targets: list[tuple[float, ...]] = []
         self.approach = approach_of(approach, sampler.names)

@@ -133,6 +133,39 @@ def test_where_nothing_succeeds_the_first_error_is_raised():
         scan(chain(4, threefold), TURN, RING, evaluations=2, fmax=1e-6)
 
 
+def test_a_failed_point_is_tried_again_by_the_next_run(tmp_path):
+    """Once in a run; what was tried before is not done again, whatever came of it."""
+    broken = [True]
+
+    def fails(phi):
+        return RuntimeError("no licence") if broken[0] and 50 < np.degrees(phi[0]) < 70 else None
+
+    def scanned():
+        atoms = chain(4, threefold, fails)
+        return scan(atoms, TURN, RING, folder=tmp_path), atoms.calc.calls
+
+    first, _ = scanned()
+    assert set(first.failed) == {(8,)}
+    second, calls = scanned()
+    assert set(second.failed) == {(8,)} and calls == 1 and len(second.attempts) == len(first.attempts) + 1
+    broken[0] = False
+    third, calls = scanned()
+    assert third.failed == {} and len(third.attempts) > len(second.attempts) + 1  # its neighbours from it
+    assert calls == third.evaluations - second.evaluations
+    np.testing.assert_allclose(third.energies, 0.2 * (1 + np.cos(3 * RING)), atol=2e-5)
+    fourth, calls = scanned()
+    assert calls == 0 and np.array_equal(fourth.energies, third.energies)
+
+
+def test_where_nothing_succeeded_the_next_run_tries_again(tmp_path):
+    problem = [ValueError("broken")]
+    for _ in range(2):
+        with pytest.raises(CalculatorError, match="broken"):
+            scan(chain(4, threefold, lambda phi: problem[0]), TURN, RING[:3], folder=tmp_path)
+    problem[0] = None
+    assert scan(chain(4, threefold, lambda phi: problem[0]), TURN, RING[:3], folder=tmp_path).failed == {}
+
+
 class Stop(BaseException):
     """As an interruption does."""
 
@@ -204,7 +237,7 @@ def test_bad_coordinates():
         scan(atoms, TURN, RING, held=CustomVelocity([[0, 1]], lambda r, t: np.ones((len(r), 2, 3))))
     with pytest.raises(InputError, match="fmax is 0; give a positive number"):
         scan(atoms, TURN, RING, fmax=0)
-    for wrong in ({"fmax": "x"}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}):
+    for wrong in ({"fmax": "x"}, {"evaluations": 2.5}, {"held": 3}, {"held": [TURN, None]}, {"folder": 3}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             scan(atoms, TURN, RING, **wrong)
     with pytest.raises(InputError, match="coordinates has None"):

@@ -179,6 +179,8 @@ def test_pulls_give_the_free_energy_of_the_coordinate(tmp_path, both_ways):
 
 
 def test_bad_input(tmp_path):
+    with pytest.raises(InputError, match="folder is 3; give a path"):
+        Windows(Fake(str(tmp_path / "diary")), 3, SETTINGS)
     with pytest.raises(OccupiedError, match=r"windows of other settings; choose another folder"):
         run(tmp_path)
         Windows(Fake(str(tmp_path / "diary")), tmp_path / "out", Settings(production=320, every=10))
