@@ -866,7 +866,7 @@ MUTANTS = [
     (
         "free_energy/scans/attempts.py",
         "if found is not None and (found.point, found.source) != (point, source):",
-        "if found is not None and False:",
+        "if found is None and source == point:",
         "tests/free_energy/scans/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
     # -- free energies from mean forces and works --
