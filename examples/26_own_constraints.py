@@ -3,7 +3,8 @@
     python examples/26_own_constraints.py           a few seconds
     python examples/26_own_constraints.py --full    a minute: longer blocks, 100,000 particles
 
-One particle, a step of RATTLE without forces; then many, the projection of positions and of velocities, for each row.
+One particle or body, a step of RATTLE without forces; then many particles, the projection of positions and velocities,
+for each row.
 Processor time of blocks that are taken in turn in one process; medians, and ratios to the sphere.
 """
 
@@ -17,7 +18,21 @@ import numba
 import numpy as np
 
 from kcons import ConstraintSet, Motion, State, System, run
-from kcons.constraints import Constraint, Custom, Cylinder, Ellipsoid, Formula, Plane, Sphere, Torus
+from kcons.constraints import (
+    Constraint,
+    Custom,
+    CustomVelocity,
+    Cylinder,
+    Distance,
+    Ellipsoid,
+    Formula,
+    KnifeEdge,
+    Plane,
+    Rolling,
+    Sphere,
+    Torus,
+    VelocityFormula,
+)
 
 AXES = np.array([1.0, 2.0, 3.0])
 TORUS = "sqrt((sqrt(x1**2 + y1**2) - R)**2 + z1**2)"
@@ -49,6 +64,32 @@ HELD: dict[str, Callable[[np.ndarray], Constraint]] = {
 }
 
 
+@numba.njit
+def around(r):
+    return np.array([[-r[0, 1] - 0.2 * r[0, 0], r[0, 0] - 0.2 * r[0, 1], 0.0]])
+
+
+UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+TURNS = np.radians([[0], [120], [240]])
+BLADE = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+WHEEL = UP + np.vstack([0 * UP, np.cos(TURNS) * UP + np.sin(TURNS) * ALONG])
+SPIRAL = "x1*vy1 - y1*vx1 - 0.2*(x1*vx1 + y1*vy1)"
+#: Name -> where the atoms of a body that glides or rolls are, and what holds them.
+BODIES: dict[str, tuple[np.ndarray, list[Constraint]]] = {
+    "KnifeEdge, 4 rows": (BLADE, [Distance([[0, 1]]), Plane([0, 1], UP), KnifeEdge(0, 1, UP, contact=0.5)]),
+    "Rolling, 11 rows": (
+        WHEEL,
+        [
+            *(Plane([0], UP), Plane([0, 1, 2, 3], [0.0, 1.0, 0.0])),
+            *(Distance([[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]), Rolling(0, 1, 1.0, ALONG)),
+        ],
+    ),
+    "VelocityFormula": (ALONG[None], [Plane([0], UP), VelocityFormula(SPIRAL, 0)]),
+    "CustomVelocity, Numba": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around)]),
+    "CustomVelocity, Python": (ALONG[None], [Plane([0], UP), CustomVelocity(0, around.py_func)]),
+}
+
+
 def start(name: str, n: int) -> tuple[Motion, np.ndarray, np.ndarray]:
     """A motion of n particles on their surfaces, positions and velocities along them."""
     rng = np.random.default_rng(0)
@@ -60,7 +101,12 @@ def start(name: str, n: int) -> tuple[Motion, np.ndarray, np.ndarray]:
 
 def one_particle(name: str) -> Callable[[int], float]:
     """Microseconds of a step, over so many steps."""
-    motion, x, v = start(name, 1)
+    if name in BODIES:
+        x, held = BODIES[name]
+        motion = Motion(ConstraintSet(held, x, np.ones(len(x))), x)
+        v = motion.project_velocities(x, np.random.default_rng(0).normal(size=x.shape))
+    else:
+        motion, x, v = start(name, 1)
     system, state = System(motion, lambda x, t: np.zeros_like(x)), State(x, v)
 
     def block(steps: int) -> float:
@@ -109,7 +155,8 @@ def show(title: str, unit: str, found: dict[str, float]) -> None:
 def main() -> None:
     full = "--full" in sys.argv[1:]
     n, turns = (100_000, 7) if full else (1_000, 3)
-    show("One particle", "µs a step", medians({name: one_particle(name) for name in HELD}, 1000 if full else 50, turns))
+    one = {name: one_particle(name) for name in (*HELD, *BODIES)}
+    show("One particle, or one body", "µs a step", medians(one, 1000 if full else 50, turns))
     compiled = [name for name in HELD if name not in ("Custom, Python", "Custom, no gradient")]
     show(f"{n:,} particles", "ns a row", medians({name: many_particles(name, n) for name in compiled}, 3, turns))
 
