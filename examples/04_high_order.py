@@ -111,7 +111,7 @@ def work_precision(full: bool, console: Console) -> dict[str, Any]:
     """The curves of all systems."""
     names = [n for n, m in METHODS.items() if isinstance(m, CoreStepper) and (full or m.usual)]
     systems: dict[str, Any] = {}
-    for name in SYSTEMS if full else SYSTEMS[:1]:
+    for name in SYSTEMS if full else SYSTEMS[-1:]:
         test_system = test_systems.build(name)
         reference = test_system.reference()
         curves, seconds = {}, {}
@@ -181,7 +181,7 @@ def show(result: dict[str, Any], console: Console) -> None:
     for name in systems:
         for heading in (f"{name}\nforces", "RATTLE\n/this", "CPU\ntime"):
             table.add_column(heading, justify="right", no_wrap=True)
-    for stepper in systems[SYSTEMS[0]]["curves"]:
+    for stepper in next(iter(systems.values()))["curves"]:
         scheme = METHODS[stepper].stepper
         cells = []
         for name in systems:
@@ -269,7 +269,7 @@ def main() -> None:
         result = json_files.read(options.show)
     else:
         environment = measure.environment()
-        measure.warm_up(test_systems.build("butane"))
+        measure.warm_up(test_systems.build(SYSTEMS[-1]))
         result = {
             "environment": environment,
             "goal": GOAL,

@@ -18,7 +18,7 @@ from kcons import Motion
 from kcons.errors import ConvergenceError
 
 #: Some of those of the long run; in the last an atom of a pair is fixed, which is rare.
-FAST = (*range(90), 144)
+FAST = (*range(60), 144)
 
 
 def test_a_share_of_the_cases():

@@ -94,7 +94,11 @@ def test_stress_across_the_boundary_and_with_dependent_rows():
     assert other.get_stress(include_ideal_gas=True) == pytest.approx(stress, rel=1e-10, abs=1e-16)
 
 
-@pytest.mark.parametrize("cls", [NPTBerendsen, Inhomogeneous_NPTBerendsen], ids=lambda c: c.__name__)
+@pytest.mark.parametrize(
+    "cls",
+    [NPTBerendsen, pytest.param(Inhomogeneous_NPTBerendsen, marks=pytest.mark.validation)],
+    ids=lambda c: c.__name__,
+)
 def test_berendsen_barostat_reaches_its_pressure(cls, monkeypatch):
     atoms, held = dumbbells(60, side=40.0)
     target = 1.2 * 60 * units.kB * TEMPERATURE / atoms.get_volume()

@@ -256,7 +256,10 @@ def uniform(name, n, error, method="spline", seeds=2):
     return math.sqrt(np.mean(np.square(found)))
 
 
-@pytest.mark.parametrize(("name", "to", "error"), [("Lennard-Jones", 10, 0.009), ("Morse", 11, 0.09)])
+@pytest.mark.parametrize(
+    ("name", "to", "error"),
+    [("Lennard-Jones", 10, 0.009), pytest.param("Morse", 11, 0.09, marks=pytest.mark.validation)],
+)
 def test_half_of_the_windows_are_enough_where_a_profile_is_steep_on_one_side(name, to, error):
     """Each window is sampled equally long. Splines are the better method for equal distances here."""
     assert adapted(name, 7, to, error)[to] < uniform(name, 2 * to, error)

@@ -30,7 +30,7 @@ def start(masses, *, removed=0, seed=6):
 MASSES = np.repeat([1.0, 3.0, 0.4], 2)
 
 
-@pytest.mark.parametrize(("force", "removed"), [(quartic, 0), (springs, 2)])
+@pytest.mark.parametrize(("force", "removed"), [pytest.param(quartic, 0, marks=pytest.mark.validation), (springs, 2)])
 def test_compression_is_minus_g_minus_one_times_alpha(force, removed):
     flow = Thermostat(MASSES, force, momentum_removed=removed)
     x, v = start(MASSES, removed=removed)

@@ -247,8 +247,7 @@ def test_driven_velocities_hold_at_the_middle_of_the_time(h) -> None:
     assert np.array([np.cos(h), np.sin(h), middle]) @ u[2] == pytest.approx(speed(0.5 * h), abs=1e-14)
 
 
-@pytest.mark.parametrize("dt", [0.005, 0.001, 0.0001])
-@pytest.mark.parametrize("slope", [0.0, 0.17])
+@pytest.mark.parametrize("slope, dt", [(0.0, 0.0001), (0.17, 0.005), (0.17, 0.001)])
 def test_a_wheel_starts_to_roll_from_rest(slope, dt) -> None:
     """Velocities are known to what rounding of the positions leaves of them, also where they vanish."""
     along, up = np.array([np.cos(slope), 0, -np.sin(slope)]), np.array([np.sin(slope), 0, np.cos(slope)])
