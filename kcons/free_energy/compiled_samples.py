@@ -66,7 +66,7 @@ class CompiledSamples:
             self._numbers[: self._d, 0] = own.target()[own_order]
 
     def sample(self, state: Sequence[FloatArray], time: float, lattice: FloatArray | None) -> FloatArray | None:
-        """Of each coordinate value, multiplier, kinetic part, gradient and |sigma|, and ln det Z, shape (6, d).
+        """Value, multiplier, kinetic part, gradient, |sigma|, ln det Z and mean kinetic part, shape (7, d).
 
         Parameters
         ----------
@@ -81,14 +81,18 @@ class CompiledSamples:
         ndarray or None
             None where rows depend on each other, or something is not finite.
         """
-        out = np.empty((6, self._d))
+        out = np.empty((7, self._d))
         if self._moving:
             self._numbers[: self._d, 0] = self._sets[0].target(time)[self._order]
             self._numbers[:, 2] = self._accelerations(time)
         rows = (self._atoms, self._inverse_masses, self._table, self._numbers)
         cell = NO_LATTICE if lattice is None else lattice
         x, v, f = state
-        return out if _sample(x, v, f, *rows, cell, lattice is not None, out) else None
+        if not _sample(x, v, f, *rows, cell, lattice is not None, out):
+            return None
+        if self._moving:
+            out[6] = np.nan  # velocities have a mean of their own
+        return out
 
     def _accelerations(self, time: float) -> FloatArray:
         """Second derivatives of the targets, shape (n_rows,)."""
@@ -330,6 +334,38 @@ def _changes_of_z(table, legs, shares, directions, lattice, out):  # type: ignor
 
 
 @nb.njit(cache=True, error_model="numpy")
+def _mean_kinetic(table, legs, slopes, shares, product, inverse_masses, lattice, out):  # type: ignore[no-untyped-def]
+    """Add the mean of -v^T q'' v over velocities with <v v^T> = M_par^+ of all rows; False where these depend.
+
+    M_par^+ is M^-1 less the squares of fields that span M^-1 A^T, orthonormal in the metric of the masses.
+    """
+    rows, n = len(table), len(inverse_masses)
+    if not _factor(product) > 0:
+        return False
+    fields = np.zeros((rows, n, 3))
+    for row in range(rows):
+        for k in range(table[row, 0]):
+            atom = table[row, 1 + k]
+            for c in range(3):
+                fields[row, atom, c] += slopes[row, k, c] * inverse_masses[atom]
+        for j in range(row):
+            for a in range(n):
+                for c in range(3):
+                    fields[row, a, c] -= product[row, j] * fields[j, a, c]
+        for a in range(n):
+            for c in range(3):
+                fields[row, a, c] /= product[row, row]
+        _bent(table, legs, shares, fields[row], lattice, 1.0, out)
+    unit = np.zeros((n, 3))
+    for a in range(n):
+        for c in range(3):
+            unit[a, c] = 1.0
+            _bent(table, legs, shares, unit, lattice, -inverse_masses[a], out)
+            unit[a, c] = 0.0
+    return True
+
+
+@nb.njit(cache=True, error_model="numpy")
 def _sample(x, v, f, atoms, inverse_masses, table, numbers, lattice, periodic, out):  # type: ignore[no-untyped-def]
     d, n, rows = out.shape[1], len(atoms), len(table)
     near, speed = np.empty((n, 3)), np.empty((n, 3))
@@ -384,8 +420,13 @@ def _sample(x, v, f, atoms, inverse_masses, table, numbers, lattice, periodic, o
                 for c in range(3):
                     directions[s, a, c] += unit[i] * kept[i, a, c]
     _changes_of_z(table, legs, shares, directions, lattice, out[3])
+    expected = np.zeros(d)
+    if not _mean_kinetic(table, legs, slopes, shares, product, inverse_masses, lattice, expected):
+        return False
+    _solve(z, expected)
     total = log_det_z
     for i in range(d):
         out[1, i], out[2, i], out[5, i] = still[i] + kinetic[i], kinetic[i], log_det_z
-        total += out[1, i] + out[2, i] + out[3, i]
+        out[6, i] = expected[i]
+        total += out[1, i] + out[2, i] + out[3, i] + out[6, i]
     return np.isfinite(total)

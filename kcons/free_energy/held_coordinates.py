@@ -44,6 +44,9 @@ class Sample(NamedTuple):
         The largest |sigma| of the coordinates.
     turned : ndarray
         dU/dq of the rigid turn of a torsion's group; NaN where there is none.
+    mean_kinetic : ndarray
+        The mean of `kinetic` over canonical velocities, by kT; NaN where not all that is held in the clusters of the
+        coordinates are independent distances, angles and torsions at rest.
     """
 
     time: float
@@ -54,6 +57,7 @@ class Sample(NamedTuple):
     gradient: FloatArray
     off: float
     turned: FloatArray
+    mean_kinetic: FloatArray
 
 
 class HeldCoordinates:
@@ -191,8 +195,8 @@ class HeldCoordinates:
         turned = np.array([np.nan if turn is None else turn.force(whole[0], whole[2]) for turn in self._turns])
         found = None if self._compiled is None else self._compiled.sample(whole, time, self._source.lattice)
         if found is not None:
-            value, moving, kinetic, gradient, off, log_det_z = found
-            return Sample(time, value, moving, kinetic, float(log_det_z[0]), gradient, max(off.tolist()), turned)
+            value, moving, kinetic, gradient, off, log_det_z, mean = found
+            return Sample(time, value, moving, kinetic, float(log_det_z[0]), gradient, max(off.tolist()), turned, mean)
         for array, (_, item) in zip(whole, named, strict=True):
             finite = np.isfinite(array[self.atoms]).all(axis=1)
             if not finite.all():
@@ -212,7 +216,8 @@ class HeldCoordinates:
         off = value - self._named(self._own.target(time))
         off -= self.periods * np.round(off / np.where(self.periods, self.periods, np.inf))
         largest = float(np.abs(off).max())
-        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, largest, turned)
+        unknown = np.full(len(self), np.nan)
+        return Sample(time, value, moving, moving - still, metric.log_det_z, gradient, largest, turned, unknown)
 
     def directions(self, x: ArrayLike, time: float = 0.0) -> FloatArray:
         """Displacements that change one coordinate by one, and no other nor any constraint, shape (d, n_atoms, 3).

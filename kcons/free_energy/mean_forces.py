@@ -58,7 +58,9 @@ class MeanForce:
 def local_mean_force(series: Series, kT: float) -> FloatArray:
     """What is averaged with the weights of the series to give dF/dq, shape (n, d): lambda + kT G.
 
-    Of an isokinetic run the part of lambda that is quadratic in the velocities is taken g/(g - 1) times.
+    The part of lambda that is quadratic in the velocities is replaced by its mean over canonical velocities where that
+    is known: those of a run have a wrong temperature in fast modes, to second order in the step. Where it is not known,
+    this part is taken g/(g - 1) times of an isokinetic run.
 
     Parameters
     ----------
@@ -72,13 +74,14 @@ def local_mean_force(series: Series, kT: float) -> FloatArray:
         `kT` that is not positive, or g = 1.
     """
     force = series.multiplier + positive(kT, "kT") * series.gradient
-    g = series.isokinetic_degrees_of_freedom
+    known, g = np.isfinite(series.mean_kinetic), series.isokinetic_degrees_of_freedom
     if g == 1:
         raise InputError(
             "1 degree of freedom under an isokinetic thermostat has no temperature; at least 2 are needed",
             item="isokinetic_degrees_of_freedom",
         )
-    return force + series.kinetic / (g - 1) if g else force
+    of_run = series.kinetic / (g - 1) if g else 0.0
+    return force + np.where(known, kT * series.mean_kinetic - series.kinetic, of_run)
 
 
 def mean_force(series: Series, kT: float, *, discard: int = 0) -> MeanForce:

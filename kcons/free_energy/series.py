@@ -16,7 +16,7 @@ from kcons.steppers.files import in_one_piece, stored_arrays
 from kcons.steppers.state import State, System
 
 #: What a sample has for each coordinate, and once.
-_VECTORS = ("value", "multiplier", "kinetic", "gradient", "turned")
+_VECTORS = ("value", "multiplier", "kinetic", "gradient", "turned", "mean_kinetic")
 _NUMBERS = ("time", "log_det_z", "off")
 
 
@@ -37,7 +37,7 @@ class Series:
     Attributes
     ----------
     time, log_det_z, off : ndarray, shape (n,)
-    value, multiplier, kinetic, gradient, turned : ndarray, shape (n, d)
+    value, multiplier, kinetic, gradient, turned, mean_kinetic : ndarray, shape (n, d)
 
     Examples
     --------
@@ -130,6 +130,10 @@ class Series:
         return self._vectors("turned")
 
     @property
+    def mean_kinetic(self) -> FloatArray:
+        return self._vectors("mean_kinetic")
+
+    @property
     def weights(self) -> FloatArray:
         """(det Z)^(-1/2) by its largest value, shape (n,): what turns averages into those without the coordinates held.
 
@@ -179,7 +183,8 @@ class Series:
             g, seconds = int(data["isokinetic_degrees_of_freedom"]), float(data.get("seconds", 0.0))
             series = cls(names, data["periods"], g, seconds)
             d = len(series.names)
-            data = {"turned": np.full_like(data["value"], np.nan)} | dict(data)
+            unknown = np.full_like(data["value"], np.nan)
+            data = {"turned": unknown, "mean_kinetic": unknown} | dict(data)
             columns = [data[f].reshape(-1) for f in _NUMBERS] + [data[f].reshape(-1, d) for f in _VECTORS]
             for row in zip(*columns, strict=True):
                 known: dict[str, Any] = dict(zip((*_NUMBERS, *_VECTORS), row, strict=True))

@@ -865,8 +865,8 @@ MUTANTS = [
     ),
     (
         "free_energy/scans/attempts.py",
-        'same = (tuple(head["point"]), head["source"]) == (point, source)',
-        "same = True",
+        "if found is not None and (found.point, found.source) != (point, source):",
+        "if found is None and source == point:",
         "tests/free_energy/scans/test_attempts.py::test_an_attempt_of_another_scan_is_refused",
     ),
     # -- free energies from mean forces and works --

@@ -79,6 +79,7 @@ def test_the_same_as_the_general_formulas(name, periodic):
         )
     assert max(abs(known.multiplier).max(), abs(known.kinetic).max(), abs(known.gradient).max()) < 50
     assert abs(known.kinetic).max() > 0.1 and known.off > 1e-4
+    assert np.isnan(sample.mean_kinetic).all() == (name == "targets that move") and np.isnan(known.mean_kinetic).all()
 
 
 def test_only_distances_angles_and_torsions_are_compiled():

@@ -14,7 +14,7 @@ KT = 0.8
 SAMPLES = 1000
 
 
-def series_of(coordinates, others, masses, configurations, force, *, kT=KT, seed=0, sphere=False) -> Series:
+def series_of(coordinates, others, masses, configurations, force, *, kT=KT, seed=0, sphere=False, known=False):
     """Samples at the configurations, with velocities of kT (or, on a `sphere`, of one kinetic energy)."""
     rng = np.random.default_rng(seed)
     constraint_set = ConstraintSet([*others, *coordinates.values()], configurations[0], masses)
@@ -26,7 +26,9 @@ def series_of(coordinates, others, masses, configurations, force, *, kT=KT, seed
         if sphere:
             g = motion.degrees_of_freedom
             v *= np.sqrt((g - 1) * kT / np.sum(masses[:, None] * v * v))
-        series.append(held.sample(x, v, force(x)))
+        sample = held.sample(x, v, force(x))
+        # Means over velocities would leave nothing to average in most of these tests.
+        series.append(sample if known else sample._replace(mean_kinetic=np.full(len(held), np.nan)))
     return series
 
 
@@ -138,6 +140,11 @@ def test_one_end_to_end_length_beside_two_bonds(sphere):
         result = mean_force(series, KT)
     assert abs(result.force[0] - exact) < 3 * result.error[0] < 0.06
     assert abs(series.gradient[0, 0]) * KT > 3 * result.error[0]
+    # The mean over velocities is known here, and then no velocities matter, of whatever thermostat.
+    for given in (KT, 5 * KT):
+        known = series_of(coordinates, [Distance([[0, 1], [1, 2]])], masses, shape[None], pull, kT=given, known=True)
+        known.isokinetic_degrees_of_freedom = 6 if sphere else 0
+        np.testing.assert_allclose(local_mean_force(known, KT), [[exact]], rtol=0, atol=1e-8)
 
 
 def test_two_coordinates_with_z_off_the_diagonal():
@@ -204,7 +211,8 @@ def test_of_two_estimates_the_mixture_that_fluctuates_least():
     def found(turned):
         series = Series(["phi"], 2 * np.pi)
         for k, (force, turn) in enumerate(zip(5 + common + 10 * fast, turned, strict=True)):
-            series.append(Sample(float(k), still, np.array([force]), zero, 0.0, zero, 0.0, np.array([turn])))
+            sample = Sample(float(k), still, np.array([force]), zero, 0.0, zero, 0.0, np.array([turn]), zero + np.nan)
+            series.append(sample)
         return mean_force(series, KT)
 
     alone = found(np.full(4000, np.nan))

@@ -57,7 +57,8 @@ class Fake:
         apart = self.shift if window.side == "up" else -self.shift
         for k in range(settings.production // settings.every):
             force = slope(q) + apart + self.noise * rng.normal()
-            series.append(Sample(float(k), np.array([q]), np.array([force]), np.zeros(1), 0.0, np.zeros(1), 0.0, NONE))
+            at, zero = np.array([q]), np.zeros(1)
+            series.append(Sample(float(k), at, np.array([force]), zero, 0.0, zero, 0.0, NONE, NONE))
         series.save(file)
 
     def pull(self, window, settings, file):
@@ -69,5 +70,5 @@ class Fake:
         series = Series(self.names)
         for q in (window.start[0], window.target[0]):
             force, log_z = work / (window.target[0] - window.start[0]), np.log(4.0) if q > 0 else 0.0
-            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0, NONE))
+            series.append(Sample(q, np.array([q]), np.array([force]), np.zeros(1), log_z, np.zeros(1), 0.0, NONE, NONE))
         series.save(file)
