@@ -31,7 +31,7 @@ from kcons.constraints.compilation import announcer
 from kcons.constraints.constraint import Constraint
 from kcons.errors import InputError, did_you_mean
 from kcons.steppers import BlanesMoan6, Rattle, Stepper
-from kcons.thermostats import Isokinetic, Langevin, NoseHooverChain
+from kcons.thermostats import CellRescaling, CellSystem, ConstantPressure, Isokinetic, Langevin, NoseHooverChain
 
 FloatArray = NDArray[np.float64]
 
@@ -126,9 +126,13 @@ def surfaces() -> None:
 
 
 def thermostats() -> None:
-    """Langevin, isokinetic and Nosé-Hoover dynamics on bond lengths"""
+    """Langevin, isokinetic and Nosé-Hoover dynamics on bond lengths, and a barostat"""
     kinds = Isokinetic(1.0, momentum="free"), NoseHooverChain(1.0, 1.0, momentum="free"), Langevin(1.0, 1.0, 1)
     _use(ZIGZAG[:2], Distance([[0, 1]]), copies=MANY, steppers=kinds)
+    x = _copies(ZIGZAG[:2], 2)
+    system = CellSystem(Motion(ConstraintSet(Distance([[0, 1], [2, 3]]), x, np.ones(4), cell=100.0 * np.eye(3)), x))
+    stepper = ConstantPressure(Langevin(1.0, 1.0, 1), CellRescaling(1.0, 1.0, 1.0, every=1))
+    run(system, system.initial_state(x), 1e-3, 1, stepper=stepper)
 
 
 def ase() -> None:

@@ -12,7 +12,15 @@ from kcons.errors import InputError, UnsupportedError
 from kcons.motion import Motion
 from kcons.steppers import run
 from kcons.thermostats import Langevin, thermal_velocities
-from kcons.thermostats.pressure import CellSystem, PressureObserver, find_pieces, instantaneous_pressure
+from kcons.thermostats.pressure import (
+    CellSystem,
+    MonteCarloBarostat,
+    PressureObserver,
+    find_pieces,
+    instantaneous_pressure,
+)
+from kcons.thermostats.pressure.barostat import Place, Trial
+from kcons.thermostats.pressure.pieces import lattice_of
 
 SIDE = 12.0
 
@@ -78,6 +86,36 @@ def test_means_agree():
     assert abs(blocks.mean()) < 3.5 * error
     assert error < 0.2 * np.abs(values[0] - values[1]).max()
     assert seen[0].volumes[0] == pytest.approx(SIDE**3)
+
+
+@pytest.mark.parametrize("kind", ["isotropic", "anisotropic"])
+def test_the_mean_stress_along_each_axis_is_the_pressure(kind):
+    """The slope of ln of the distribution that trials sample is V (P_kk - P)/kT + 1, along each axis.
+
+    Its mean is zero, by parts: the mean of V (P_kk - P) is -kT, whatever the forces.
+    """
+    system, state = started()
+    pressure, thermal, h = 0.02, 1.3, 1e-5
+    barostat = MonteCarloBarostat(pressure, kind=kind)
+    pieces = barostat.pieces(system, state.positions)
+    before = Place(system.cell, state.positions, system.energy(state.positions, 0.0, 0))
+    stress = np.diag(instantaneous_pressure(system, state, thermal_energy=thermal))
+    found = []
+    for mode in range(len(barostat.strains)):
+        slopes = []
+        for e in (h, -h):
+            e = e * np.eye(len(barostat.strains))[mode]
+            matrix = barostat.strains.matrix(e, None)
+            y = state.positions + pieces.moved(state.positions, matrix - np.eye(3), lattice_of(system))
+            system.set_cell(before.cell @ matrix, y)
+            after = Place(system.cell, y, system.energy(y, 0.0, 0))
+            slopes.append(barostat._log_chance(pieces, before, after, Trial(e, mode), thermal))
+            system.set_cell(before.cell, state.positions)
+        found.append((slopes[0] - slopes[1]) / (2 * h))
+    if kind == "isotropic":
+        stress = np.array([stress.mean()])
+    assert found == pytest.approx(SIDE**3 * (stress - pressure) / thermal + 1, rel=1e-7)
+    assert np.ptp(stress) > 1e-3 or kind == "isotropic"
 
 
 def test_bonds_make_pieces():
