@@ -123,6 +123,7 @@ TABLE = {
     "random_cells.json": Measurement(CORE, ("python tests/contracts/random_cells.py --cases 10000 --out F",), 6),
     "report": Measurement((*ASE, "openmm", "comparison"), ("kcons compare --all --out F",), 105),
     "scans.json": Measurement((*ASE, "free_energy"), script("28_relaxed_scan"), None),
+    "solvated_peptide.json": Measurement((*BATHS, "comparison/averages"), script("40_peptide_steps"), 30),
     "stability.json": Measurement(
         (*CORE, "comparison/stability"), ("kcons stability --out stability", "cp stability/stability.json F"), None
     ),

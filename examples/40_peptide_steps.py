@@ -218,6 +218,29 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(f"{spent / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
 
 
+def draw(result: dict[str, Any], path: str) -> None:
+    """What turns are off by, and what an independent sample of the energy costs."""
+    from matplotlib.figure import Figure
+
+    picture = Figure((9, 3.6), layout="constrained")
+    turns, cost = picture.subplots(1, 2)
+    for method, (colour, marker) in long_steps_report.STYLES.items():
+        seen = sorted((run for run in runs_of(result) if run.method == method), key=lambda run: run.step)
+        title, steps = long_steps.METHODS[method].title.replace("the same", "Langevin"), [run.step for run in seen]
+        style = {"marker": marker, "color": colour, "label": title}
+        off, error = 100 * np.transpose([run.kinds["turn"] for run in seen])
+        turns.errorbar(steps, off, error, capsize=2, **style)
+        cost.loglog(steps, [run.correlation for run in seen], **style)
+    turns.axhline(0, color="grey", linewidth=0.8)
+    turns.set(xscale="log", xlabel="step / fs", ylabel="T of turns off by / %")
+    cost.set(xlabel="step / fs", ylabel="evaluations with PME for a sample of U")
+    for panel in (turns, cost):
+        panel.set_xticks((2, 4, 8, 16, 32), ("2", "4", "8", "16", "32"))
+        panel.set_xticks((), minor=True)
+    turns.legend(frameon=False, fontsize="small")
+    picture.savefig(path, dpi=150)
+
+
 def main() -> None:
     parser = scripts.options(__doc__, full="long runs")
     parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
@@ -226,8 +249,7 @@ def main() -> None:
         result = json_files.read(options.show)
         show(result, console)
         if options.draw:
-            drawn = long_steps_report.figure(runs_of(result), layers.ASE_UNITS)
-            drawn.savefig(options.draw, dpi=150)
+            draw(result, options.draw)
         return
     show(scripts.continued(options.out, measure, quick=not options.full), console)
 

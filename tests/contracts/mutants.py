@@ -452,8 +452,8 @@ MUTANTS = [
     ),
     (
         "solvers/sparse/row_values.py",
-        "time = 0.5 * (number(parameters, which) + number(parameters, 1))",
-        "time = number(parameters, which)",
+        "time = 0.5 * (time + number(parameters, 1))",
+        "time = number(parameters, 0)",
         "tests/steppers/stages/test_drifts.py::test_driven_velocities_hold_at_the_middle_of_the_time",
     ),
     (

@@ -96,76 +96,54 @@ def angle(u, w):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _function(  # type: ignore[no-untyped-def]
-    kind, slot, end, slot_atoms, parameters, offset, base, moves, cell, inverse, periodic, lines, which
+    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, cell, inverse, periodic, lines, which
 ):
-    """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots."""
-    at, x, y, z = ROOM, 0.0, 0.0, 0.0
-    j = entry(slot_atoms, slot)
-    for p in range(slot, end):
-        rolled()
-        i = entry(slot_atoms, p)
-        if kind == FUNCTION:
-            r = load_quad(base, 4 * i) + load_quad(moves, 4 * i)
-            x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
-        else:
-            dx, dy, dz = _difference(i, j, base, moves, cell, inverse, periodic)
-            x, y, z = x + dx, y + dy, z + dz
-            j = i
-        put(parameters, at, x)
-        put(parameters, at + 1, y)
-        put(parameters, at + 2, z)
-        at += 3
-    call_row(parameters, offset, ROOM, offset + 2, number(parameters, which), at)
-    value = number(parameters, at)
+    """Value of a row that is a function, see `row_functions`; the gradient goes into the lines of its slots.
+
+    A row of velocities is taken at the middle of the way from `origin`, and is zero throughout where it does not count.
+    """
+    size = 3 * (end - slot)
+    rolls = kind >= VELOCITY
+    at, out = ROOM, ROOM + 2 * size
+    if rolls and number(parameters, COUNT) == 0.0:
+        for p in range(ROOM, out + size + 1):
+            rolled()
+            put(parameters, p, 0.0)
+    else:
+        x, y, z = 0.0, 0.0, 0.0
+        before, change_before = quad(0.0, 0.0, 0.0, 0.0), quad(0.0, 0.0, 0.0, 0.0)
+        for p in range(slot, end):
+            rolled()
+            i = 4 * entry(slot_atoms, p)
+            here, change = load_quad(base, i), load_quad(moves, i)
+            if rolls:
+                start = load_quad(origin, i)
+                way = (here - start) + change
+                here, change = start, 0.5 * way
+                put(parameters, at + size, lane(way, 0))
+                put(parameters, at + size + 1, lane(way, 1))
+                put(parameters, at + size + 2, lane(way, 2))
+            if kind in (FUNCTION, VELOCITY):
+                r = here + change
+                x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
+            elif p > slot:
+                dx, dy, dz = near(here - before, change - change_before, cell, inverse, periodic)
+                x, y, z = x + dx, y + dy, z + dz
+            before, change_before = here, change
+            put(parameters, at, x)
+            put(parameters, at + 1, y)
+            put(parameters, at + 2, z)
+            at += 3
+        time = number(parameters, which)
+        if rolls:  # where the reference is asked for, the way is 0, and the time that of the reference
+            time = 0.5 * (time + number(parameters, 1))
+        call_row(parameters, offset, ROOM, offset + 2, time, out)
+    at = out
     for p in range(slot, end):
         rolled()
         _put(lines, 8 * p + which, number(parameters, at + 1), number(parameters, at + 2), number(parameters, at + 3))
         at += 3
-    return value
-
-
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
-def _velocity(  # type: ignore[no-untyped-def]
-    kind, slot, end, slot_atoms, parameters, offset, base, moves, origin, cell, inverse, periodic, lines, which
-):
-    """The same for a row of velocities, of the way from `origin`; zero throughout where such rows do not count."""
-    if number(parameters, COUNT) == 0.0:
-        for p in range(slot, end):
-            rolled()
-            _put(lines, 8 * p + which, 0.0, 0.0, 0.0)
-        return 0.0
-    at, out = ROOM, ROOM + 6 * (end - slot)
-    x, y, z = 0.0, 0.0, 0.0
-    before, way_before = load_quad(origin, 4 * entry(slot_atoms, slot)), quad(0.0, 0.0, 0.0, 0.0)
-    for p in range(slot, end):
-        rolled()
-        i = 4 * entry(slot_atoms, p)
-        here = load_quad(origin, i)
-        way = (load_quad(base, i) - here) + load_quad(moves, i)
-        if kind == VELOCITY:
-            r = here + 0.5 * way
-            x, y, z = lane(r, 0), lane(r, 1), lane(r, 2)
-        elif p > slot:
-            dx, dy, dz = near(here - before, 0.5 * (way - way_before), cell, inverse, periodic)
-            x, y, z = x + dx, y + dy, z + dz
-        before, way_before = here, way
-        put(parameters, at, x)
-        put(parameters, at + 1, y)
-        put(parameters, at + 2, z)
-        half = at + 3 * (end - slot)
-        put(parameters, half, lane(way, 0))
-        put(parameters, half + 1, lane(way, 1))
-        put(parameters, half + 2, lane(way, 2))
-        at += 3
-    # Where the reference is asked for, the way is 0, and the time that of the reference.
-    time = 0.5 * (number(parameters, which) + number(parameters, 1))
-    call_row(parameters, offset, ROOM, offset + 2, time, out)
-    value = number(parameters, out)
-    for p in range(slot, end):
-        rolled()
-        g = out + 1 + 3 * (p - slot)
-        _put(lines, 8 * p + which, number(parameters, g), number(parameters, g + 1), number(parameters, g + 2))
-    return value
+    return number(parameters, out)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -209,16 +187,11 @@ def evaluate(  # type: ignore[no-untyped-def]
                 change += dot(c, load_quad(moves, i))
                 offset += 3
             value = whole + change
-        elif kind >= VELOCITY:
-            value = _velocity(
+        else:
+            value = _function(
                 kind, slot, entry(links, 4 * k + 6), slot_atoms, parameters, offset, base, moves, origin, cell, inverse,
                 periodic, lines, which,
             )  # fmt: skip
-        else:
-            end = entry(links, 4 * k + 6)
-            value = _function(
-                kind, slot, end, slot_atoms, parameters, offset, base, moves, cell, inverse, periodic, lines, which
-            )
         put(values, k, value)
 
 
