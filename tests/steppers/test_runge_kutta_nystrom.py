@@ -33,11 +33,16 @@ def test_observed_order(stepper, problem: GlobalError) -> None:
     check_order(stepper, problem)
 
 
+def titled(each: object) -> str:
+    """The same name in every process."""
+    return named(each) if callable(each) else repr(each)
+
+
 #: A skate, which is not integrable, and an atom that is driven.
 SKATE, DRIVEN = VELOCITY_ROWS
 
 
-@pytest.mark.parametrize("stepper, problem", [(BlanesMoan4(), SKATE), (BlanesMoan6(), DRIVEN)], ids=repr)
+@pytest.mark.parametrize("stepper, problem", [(BlanesMoan4(), SKATE), (BlanesMoan6(), DRIVEN)], ids=titled)
 def test_observed_order_with_velocity_rows(stepper, problem: GlobalError) -> None:
     check_order(stepper, problem)
 
@@ -46,7 +51,7 @@ def test_observed_order_with_velocity_rows(stepper, problem: GlobalError) -> Non
 @pytest.mark.parametrize(
     "stepper, problem",
     [(BlanesMoan6(), SKATE), (BlanesMoan4(), DRIVEN), (BlanesMoan6a(), SKATE), (BlanesMoan6a(), DRIVEN)],
-    ids=repr,
+    ids=titled,
 )
 def test_observed_order_with_velocity_rows_of_the_others(stepper, problem: GlobalError) -> None:
     check_order(stepper, problem)
