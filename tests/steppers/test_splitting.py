@@ -207,7 +207,7 @@ def test_steppers_without_march_and_steps_of_zero() -> None:
     still = run(system, state, 0.0, 5)
     assert np.array_equal(still.positions, state.positions) and still.step == 5
     assert run(system, state, 0.02, 0) is state
-    with pytest.raises(InputError, match="time step is nan"):
+    with pytest.raises(InputError, match="dt is nan"):
         run(system, state, float("nan"), 3)
 
 
