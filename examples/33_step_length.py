@@ -30,7 +30,6 @@ from kcons.comparison import (
     ASE_UNITS,
     environment,
     fluid,
-    json_files,
     layers,
     long_steps,
     long_steps_report,
@@ -243,18 +242,5 @@ def show(result: dict[str, Any], console: Console) -> None:
     console.print(f"\n{taken / 60:.0f} min of {machine['cpu']}; commit {machine['commit'][:10]}, {machine['date']}")
 
 
-def main() -> None:
-    parser = scripts.options(__doc__, full="long runs")
-    parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
-    options, console = parser.parse_args(), Console(width=120)
-    if options.show:
-        result = json_files.read(options.show)
-        show(result, console)
-        if options.draw:
-            draw(result, options.draw)
-        return
-    show(scripts.continued(options.out, measure, quick=not options.full), console)
-
-
 if __name__ == "__main__":
-    main()
+    scripts.script_of_parts(__doc__, measure, show, draw, width=120)

@@ -32,7 +32,6 @@ from kcons.comparison import (
     FittedForces,
     Potential,
     environment,
-    json_files,
     layers,
     long_steps,
     long_steps_report,
@@ -327,18 +326,5 @@ def draw(result: dict[str, Any], path: str) -> None:
     picture.savefig(path, dpi=150)
 
 
-def main() -> None:
-    parser = scripts.options(__doc__, full="long runs")
-    parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
-    options, console = parser.parse_args(), Console(width=200)
-    if options.show:
-        result = json_files.read(options.show)
-        show(result, console)
-        if options.draw:
-            draw(result, options.draw)
-        return
-    show(scripts.continued(options.out, measure, quick=not options.full), console)
-
-
 if __name__ == "__main__":
-    main()
+    scripts.script_of_parts(__doc__, measure, show, draw, width=200)

@@ -30,7 +30,6 @@ from kcons.cli.progress import Bars
 from kcons.comparison import (
     Potential,
     environment,
-    json_files,
     layers,
     long_steps,
     long_steps_report,
@@ -241,18 +240,5 @@ def draw(result: dict[str, Any], path: str) -> None:
     picture.savefig(path, dpi=150)
 
 
-def main() -> None:
-    parser = scripts.options(__doc__, full="long runs")
-    parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
-    options, console = parser.parse_args(), Console(width=160)
-    if options.show:
-        result = json_files.read(options.show)
-        show(result, console)
-        if options.draw:
-            draw(result, options.draw)
-        return
-    show(scripts.continued(options.out, measure, quick=not options.full), console)
-
-
 if __name__ == "__main__":
-    main()
+    scripts.script_of_parts(__doc__, measure, show, draw, width=160)

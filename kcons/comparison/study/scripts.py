@@ -9,6 +9,7 @@ from time import process_time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Console
 
 from kcons.comparison.study import json_files
 from kcons.comparison.study.machine import stamp
@@ -146,3 +147,35 @@ def continued(out: Path | None, measure: Callable[..., dict[str, Any]], *, quick
     kept = Kept(out, stamp(quick=quick))
     earlier = {name: value for name, value in kept.earlier().items() if name not in kept.head}
     return measure(quick=quick, keep=kept.put, earlier=earlier or None)
+
+
+def script_of_parts(
+    about: str | None,
+    measure: Callable[..., dict[str, Any]],
+    show: Callable[[dict[str, Any], Console], None],
+    draw: Callable[[dict[str, Any], str], None],
+    *,
+    width: int,
+) -> None:
+    """`continued` as a command: ``--full --out F`` measures, ``--show F`` prints, ``--show F --draw P`` draws as well.
+
+    Parameters
+    ----------
+    about : str
+    measure : callable
+        As for `continued`.
+    show, draw : callable
+        Get the results, and the console or the name of the picture.
+    width : int
+        Of the console, in characters.
+    """
+    parser = options(about, full="long runs")
+    parser.add_argument("--draw", metavar="PNG", help="with --show: the curves, into this file")
+    chosen, console = parser.parse_args(), Console(width=width)
+    if not chosen.show:
+        show(continued(chosen.out, measure, quick=not chosen.full), console)
+        return
+    result = json_files.read(chosen.show)
+    show(result, console)
+    if chosen.draw:
+        draw(result, chosen.draw)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from io import StringIO
 from itertools import count
 from pathlib import Path
@@ -83,3 +84,28 @@ def test_slope_has_the_error_of_correlated_noise() -> None:
     # Eight degrees of freedom: the root mean square of the errors is known to 1.8 %, the deviation to 3.5 %.
     assert np.sqrt(np.mean(found[:, 1] ** 2)) == pytest.approx(found[:, 0].std(), rel=0.16)
     assert scripts.slope(t, 2.0 - t) == pytest.approx((-1.0, 0.0), abs=1e-12)
+
+
+def test_a_script_of_parts_measures_shows_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[object, int | str]] = []
+
+    def measure(*, quick: bool, keep, earlier) -> dict:
+        keep({"parts": {"one": 1}})
+        return {"quick": quick}
+
+    def command(*words: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["script", *map(str, words)])
+        scripts.script_of_parts(
+            "What it does.",
+            measure,
+            lambda result, console: shown.append((result, console.width)),
+            lambda result, path: shown.append((result["parts"], path)),
+            width=77,
+        )
+
+    out = tmp_path / "results.json"
+    command("--full", "--out", out)
+    command("--show", out)
+    command("--show", out, "--draw", "P")
+    assert shown[0] == ({"quick": False}, 77)
+    assert [result["parts"] for result, _ in shown[1:3]] == 2 * [{"one": 1}] and shown[3:] == [({"one": 1}, "P")]
