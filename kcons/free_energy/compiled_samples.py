@@ -17,6 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.in_cell import joined
 from kcons.constraints.target import FloatArray
 from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.sparse.row_values import angle
 
 #: Rows from which on matrices that are dense cost more than they save.
 MOST_ROWS = 60
@@ -171,12 +172,7 @@ def _slopes(width, F, G, H, out):  # type: ignore[no-untyped-def]
         a = _mixed(1.0 / q, F, 0.0, F)
         b, c, e = _mixed(-1.0, a, 0.0, a), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     elif width == 3:
-        normal = _cross(F, G)
-        area = np.sqrt(_dot(normal, normal))
-        q = np.arctan2(area, _dot(F, G))
-        n = _mixed(1.0 / area, normal, 0.0, normal)
-        a, c = _cross(F, n), _cross(n, G)
-        a, c = _mixed(1.0 / _dot(F, F), a, 0.0, a), _mixed(1.0 / _dot(G, G), c, 0.0, c)
+        q, a, c = angle(F, G)
         b, e = _mixed(-1.0, a, -1.0, c), (0.0, 0.0, 0.0)
     else:
         P, Q = _cross(F, G), _cross(H, G)

@@ -208,9 +208,7 @@ class Guard:
 
     @property
     def context(self) -> openmm.Context:
-        context = self._context()
-        assert context is not None
-        return context
+        return self.constraints.context
 
     @property
     def integrator(self) -> Integrator:
