@@ -17,6 +17,7 @@ from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.periodic.in_cell import joined
 from kcons.constraints.target import FloatArray
 from kcons.solvers.kernels.nearest_image import NO_LATTICE, nearest_image
+from kcons.solvers.sparse.row_functions import dihedral
 from kcons.solvers.sparse.row_values import angle
 
 #: Rows from which on matrices that are dense cost more than they save.
@@ -164,6 +165,9 @@ def _legs(x, row, lattice, periodic):  # type: ignore[no-untyped-def]
 # -- rows ---------------------------------------------------------------------------------------------------
 
 
+_torsion = nb.njit(cache=True, error_model="numpy")(dihedral)
+
+
 @nb.njit(cache=True, error_model="numpy")
 def _slopes(width, F, G, H, out):  # type: ignore[no-untyped-def]
     """The value of a row; its gradient by each atom is put into `out`, shape (4, 3)."""
@@ -175,13 +179,13 @@ def _slopes(width, F, G, H, out):  # type: ignore[no-untyped-def]
         q, a, c = angle(F, G)
         b, e = _mixed(-1.0, a, -1.0, c), (0.0, 0.0, 0.0)
     else:
-        P, Q = _cross(F, G), _cross(H, G)
-        g = np.sqrt(_dot(G, G))
-        q = np.arctan2(_dot(_cross(Q, P), G) / g, _dot(P, Q))
-        p, s = 1.0 / _dot(P, P), 1.0 / _dot(Q, Q)
-        a, e = _mixed(-g * p, P, 0.0, P), _mixed(g * s, Q, 0.0, Q)
-        along = _mixed(_dot(F, G) / g * p, P, -_dot(H, G) / g * s, Q)
-        b, c = _mixed(1.0, along, -1.0, a), _mixed(-1.0, along, -1.0, e)
+        r, seen = np.zeros(12), np.empty(13)
+        for i in range(3):
+            r[i], r[3 + i], r[9 + i] = F[i] + G[i], G[i], H[i]
+        _torsion(r, r, 0.0, seen)
+        q = seen[0]
+        a, b = (seen[1], seen[2], seen[3]), (seen[4], seen[5], seen[6])
+        c, e = (seen[7], seen[8], seen[9]), (seen[10], seen[11], seen[12])
     for i in range(3):
         out[0, i], out[1, i], out[2, i], out[3, i] = a[i], b[i], c[i], e[i]
     return q

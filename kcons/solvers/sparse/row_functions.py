@@ -71,7 +71,7 @@ def call_row(typingctx, numbers, function, r, p, time, out):
 # -- families -----------------------------------------------------------------------------------------------
 
 
-def _dihedral(r, p, t, out):
+def dihedral(r, p, t, out):
     """Of i, j, k, l from f = i - j, g = j - k, h = l - k. Blondel & Karplus, J. Comput. Chem. 17, 1132 (1996)."""
     fx, fy, fz = r[0] - r[3], r[1] - r[4], r[2] - r[5]
     gx, gy, gz = r[3] - r[6], r[4] - r[7], r[5] - r[8]
@@ -225,7 +225,7 @@ def _rolling(r, p, t, out):
 
 
 FAMILIES: dict[str, Callable[..., None]] = {
-    "Dihedral": _dihedral,
+    "Dihedral": dihedral,
     "Plane": _plane,
     "Sphere": _sphere,
     "Cylinder": _cylinder,
