@@ -1,7 +1,7 @@
 """Constant pressure on constraints: fluids of rigid molecules, a molecular crystal and a slab.
 
 python examples/34_constant_pressure.py                 short runs
-python examples/34_constant_pressure.py --full          those of docs/constant_pressure.md: half an hour
+python examples/34_constant_pressure.py --full          those of docs/constant_pressure.md: an hour and a half
 python examples/34_constant_pressure.py --full NAME...  some of them
 python examples/34_constant_pressure.py --show FILE     the tables of the page from a file of results
 
@@ -12,8 +12,6 @@ same file.
 
 from __future__ import annotations
 
-import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +25,7 @@ from ase.calculators.emt import EMT
 
 from kcons import ConstraintSet
 from kcons.ase import ConstrainedLangevin, constrain, draw_velocities
-from kcons.comparison import environment, json_files
+from kcons.comparison import scripts, volumes
 from kcons.constraints import Distance, Plane
 from kcons.motion import Motion
 from kcons.steppers import run
@@ -50,18 +48,25 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results" / "constant_pressure.js
 
 CUTOFF = 2.0
 TEMPERATURE, BAR = 300.0, units.bar
+#: What keeps the shape of a box that changes more than its volume.
+STIFF = 800
+#: What is not kept of a run.
+SERIES = ("volumes", "energies", "shapes")
 DUMBBELL = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-METHANE = 0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+METHANE, METHANES = (
+    0.63 * np.array([[0.0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
+    "methane, 10 distances of rank 9",
+)
 #: Shape, molecules, first side of the box, depth of the potential, temperature, pressure.
 FLUIDS = {
     "dumbbells": (DUMBBELL, 32, 8.6, 1.0, 2.0, 1.0),
-    "methane, 10 distances of rank 9": (METHANE, 20, 9.6, 0.3, 2.0, 0.5),
+    METHANES: (METHANE, 20, 9.6, 0.3, 2.0, 0.5),
 }
 
 
 @numba.njit
 def sites(x, h, size, depth, cutoff):  # type: ignore[no-untyped-def]
-    """Energy, forces and virial of sites of different molecules, cut off smoothly, in a box of side lengths h."""
+    """Energy, forces and virial of sites of different molecules, cut off smoothly, in a lower triangular cell h."""
     n = len(x)
     forces, virial, energy = np.zeros((n, 3)), np.zeros((3, 3)), 0.0
     s6 = cutoff**-6
@@ -72,7 +77,10 @@ def sites(x, h, size, depth, cutoff):  # type: ignore[no-untyped-def]
             r2 = 0.0
             for k in range(3):
                 d[k] = x[i, k] - x[j, k]
-                d[k] -= h[k] * np.rint(d[k] / h[k])
+            for k in range(2, -1, -1):
+                whole = np.rint(d[k] / h[k, k])
+                for m in range(k + 1):
+                    d[m] -= whole * h[k, m]
                 r2 += d[k] * d[k]
             if r2 >= cutoff * cutoff:
                 continue
@@ -89,30 +97,40 @@ def sites(x, h, size, depth, cutoff):  # type: ignore[no-untyped-def]
 
 
 class Sites:
-    """Energy, forces and stress of `sites`, as functions of positions, time and cell."""
+    """Energy, forces and stress of `sites`, as functions of positions, time and cell.
 
-    def __init__(self, size: int, depth: float) -> None:
-        self.size, self.depth = size, depth
+    `stiff` is for a liquid in a cell that changes more than its volume: it keeps the shape, and knows nothing of the
+    volume.
+    """
+
+    def __init__(self, size: int, depth: float, stiff: float = 0.0) -> None:
+        self.size, self.depth, self.stiff = size, depth, stiff
         self._known: tuple[bytes, Any] = (b"", None)
 
     def _found(self, x, h):
         # An energy and forces at one place are one evaluation.
         key = x.tobytes() + h.tobytes()
         if key != self._known[0]:
-            self._known = key, sites(np.ascontiguousarray(x), np.diag(h).copy(), self.size, self.depth, CUTOFF)
+            self._known = key, sites(np.ascontiguousarray(x), np.ascontiguousarray(h), self.size, self.depth, CUTOFF)
         return self._known[1]
 
     def force(self, x, t, h):
         return self._found(x, h)[1]
 
     def potential(self, x, t, h):
-        return self._found(x, h)[0]
+        return self._found(x, h)[0] + self.shape(h)
 
     def stress(self, x, t, h):
-        return -self._found(x, h)[2] / np.linalg.det(h)
+        volume = np.linalg.det(h)
+        squares = h.T @ h
+        shape = 2 * self.stiff * (squares - np.trace(squares) / 3 * np.eye(3)) / volume ** (2 / 3)
+        return (shape - self._found(x, h)[2]) / volume
+
+    def shape(self, h):
+        return self.stiff * ((h**2).sum() / np.linalg.det(h) ** (2 / 3) - 3)
 
 
-def fluid(name: str, seed: int) -> tuple[CellSystem, np.ndarray]:
+def fluid(name: str, seed: int, stiff: float = 0.0) -> tuple[CellSystem, np.ndarray, Sites]:
     """Molecules on a simple lattice, turned at random."""
     shape, n, side, depth, _, _ = FLUIDS[name]
     rng, m = np.random.default_rng(seed), len(shape)
@@ -125,17 +143,25 @@ def fluid(name: str, seed: int) -> tuple[CellSystem, np.ndarray]:
     rows = Distance((pairs + m * np.arange(n)[:, None, None]).reshape(-1, 2), np.tile(lengths, n))
     masses = np.tile(1.0 + np.arange(m) % 2, n)
     held = ConstraintSet(rows, x, masses, cell=np.full(3, side))
-    forces = Sites(m, depth)
-    return CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress), x
+    forces = Sites(m, depth, stiff)
+    return CellSystem(Motion(held, x), forces.force, forces.potential, forces.stress), x, forces
 
 
 def run_fluid(
-    name: str, barostat: str, thermostat: str, steps: int, *, hotter: float = 1.0, denser: float = 1.0, seed: int = 1
+    name: str,
+    barostat: str,
+    thermostat: str,
+    steps: int,
+    kind: str = "isotropic",
+    *,
+    hotter: float = 1.0,
+    denser: float = 1.0,
+    seed: int = 1,
 ) -> dict[str, Any]:
     """Volumes and energies, one in ten steps, the first tenth left out."""
     _, n, _, _, temperature, pressure = FLUIDS[name]
     temperature, pressure = temperature * hotter, pressure * denser
-    system, x = fluid(name, seed)
+    system, x, forces = fluid(name, seed, 0.0 if kind == "isotropic" else STIFF)
     steppers = {
         "Langevin": partial(Langevin, temperature, 1.0, seed),
         "Nose-Hoover": partial(NoseHooverChain, temperature, period=1.0, momentum="conserved"),
@@ -145,7 +171,8 @@ def run_fluid(
         "Monte Carlo": partial(MonteCarloBarostat, pressure),
         "rescaling": partial(CellRescaling, pressure, 0.5, 1.0),
     }
-    press = presses[barostat](every=10, seed=seed, cutoff=CUTOFF)
+    every = 10 if kind == "isotropic" else 5
+    press = presses[barostat](every=every, seed=seed, cutoff=CUTOFF, kind=kind)
     stepper = ConstantPressure(steppers[thermostat](), press)
     zero = thermostat != "Langevin"
     state = system.initial_state(x, thermal_velocities(system, x, temperature, seed, zero_momentum=zero))
@@ -153,34 +180,28 @@ def run_fluid(
     state = run(system, state, 0.0005, 2000, stepper=ConstantPressure(Langevin(temperature, 5.0, seed), press))
     v = thermal_velocities(system, state.positions, temperature, seed, zero_momentum=zero)
     state = stepper.start(system, system.initial_state(state.positions, v))
-    volumes, energies = [], []
+    seen = []
 
-    def note(seen):
-        volumes.append(float(np.linalg.det(seen.cell)))
-        energies.append(float(system.potential(seen.positions, 0.0)))
+    def note(state):
+        shape = forces.shape(state.cell)
+        seen.append((np.linalg.det(state.cell), system.potential(state.positions, 0.0), shape))
 
     state = run(system, state, 0.004, steps, stepper=stepper, observers=[note], every=10)
-    first = len(volumes) // 10
-    return {
-        "fluid": name,
-        "barostat": barostat,
-        "thermostat": thermostat,
-        "temperature": temperature,
-        "pressure": pressure,
-        "steps": steps,
-        "molecules": n,
-        "acceptance": float(press.acceptance(state)[0]),
-        "volumes": volumes[first:],
-        "energies": energies[first:],
-    }
+    named = barostat if kind == "isotropic" else f"{barostat}, {kind}"
+    about = name, named, thermostat, temperature, pressure, steps, n
+    return told_of(seen[len(seen) // 10 :], *about) | {"acceptance": float(press.acceptance(state)[0])}
+
+
+def told_of(seen: list[Any], *about: Any) -> dict[str, Any]:
+    """A run with its series of volumes, energies, and of these those of the shape of the box."""
+    names = "fluid", "barostat", "thermostat", "temperature", "pressure", "steps", "molecules"
+    return dict(zip(names, about, strict=True)) | dict(zip(SERIES, np.array(seen, dtype=float).T, strict=True))
 
 
 # -- the same dumbbells in OpenMM -----------------------------------------------------------------------------------
 
 #: kJ/mol/K, and bar in kJ/mol/nm^3.
 GAS, PER_BAR = 0.00831446261815324, 16.6053906717
-#: What keeps the shape of a box that changes more than its volume, in kJ/mol; it knows nothing of the volume.
-STIFF = 800
 SHAPE = f"{STIFF}*((ax^2+bx^2+by^2+cx^2+cy^2+cz^2)/v^(2/3)-3)"
 
 
@@ -194,7 +215,7 @@ def run_in_openmm(
 
     shape, n, side, depth, temperature, pressure = FLUIDS["dumbbells"]
     temperature, pressure = temperature * hotter, pressure * denser
-    _, x = fluid("dumbbells", seed)
+    _, x, _ = fluid("dumbbells", seed)
     system = openmm.System()
     energy = f"4*{depth}*(r^-12-r^-6)-4*{depth}*(s^2-s)+24*{depth}*(2*s^2-s)/{CUTOFF}*(r-{CUTOFF}); s={CUTOFF**-6}"
     force = openmm.CustomNonbondedForce(energy)
@@ -232,71 +253,18 @@ def run_in_openmm(
     integrator.setVelocitiesToTemperature(context, kelvin, seed)
     v, masses = context.getState(velocities=True).getVelocities(asNumpy=True)._value, 1.0 + np.arange(len(x)) % 2
     context.setVelocities(v - masses @ v / masses.sum())
-    volumes, energies, shapes = [], [], []
+    seen = []
     for _ in range(steps // 10):
         integrator.step(10)
-        seen = context.getState(energy=True)
-        volumes.append(seen.getPeriodicBoxVolume()._value)
-        energies.append(seen.getPotentialEnergy()._value)
-        shapes.append(
-            STIFF * ((seen.getPeriodicBoxVectors(asNumpy=True)._value ** 2).sum() / volumes[-1] ** (2 / 3) - 3)
-        )
+        state = context.getState(energy=True)
+        volume, box = state.getPeriodicBoxVolume()._value, state.getPeriodicBoxVectors(asNumpy=True)._value
+        seen.append((volume, state.getPotentialEnergy()._value, STIFF * ((box**2).sum() / volume ** (2 / 3) - 3)))
     integrator.check()
-    first = len(volumes) // 5  # the start is far too wide
-    return {
-        "fluid": "dumbbells in OpenMM",
-        "barostat": barostat,
-        "thermostat": ensemble,
-        "temperature": temperature,
-        "pressure": pressure,
-        "steps": steps,
-        "molecules": n,
-        "volumes": volumes[first:],
-        "energies": energies[first:],
-        "shapes": shapes[first:],
-    }
+    kept = seen[len(seen) // 5 :]  # the start is far too wide
+    return told_of(kept, "dumbbells in OpenMM", barostat, ensemble, temperature, pressure, steps, n)
 
 
-# -- statistics -----------------------------------------------------------------------------------------------------
-
-
-def mean_and_error(values: Any) -> tuple[float, float]:
-    values = np.asarray(values)
-    if len(values) < 32:  # of short runs no error is known
-        return float(values.mean()), float("nan")
-    return float(values.mean()), float(values.std() * np.sqrt(autocorrelation_time(values) / len(values)))
-
-
-def compressed(volumes: Any) -> tuple[float, float]:
-    """<dV^2>/<V>, and its error from that of the squares."""
-    volumes = np.asarray(volumes)
-    squares = (volumes - volumes.mean()) ** 2
-    mean, error = mean_and_error(squares)
-    return mean / float(volumes.mean()), error / float(volumes.mean())
-
-
-def slope(one: dict[str, Any], two: dict[str, Any]) -> tuple[float, float, float]:
-    """ln of the ratio of two distributions along H = U + P V or V: the slope found, its error, and the exact one.
-
-    The estimate of greatest likelihood (Shirts, J. Chem. Theory Comput. 9, 909 (2013)); for two pressures along V, for
-    two temperatures along the enthalpy. Samples are thinned to independent ones.
-    """
-    if one["temperature"] == two["temperature"]:
-        values = [np.array(found["volumes"]) for found in (one, two)]
-        exact = -(two["pressure"] - one["pressure"]) / one["temperature"]
-    else:
-        values = [np.array(f["energies"]) + f["pressure"] * np.array(f["volumes"]) for f in (one, two)]
-        exact = 1 / one["temperature"] - 1 / two["temperature"]
-    values = [v[:: int(np.ceil(autocorrelation_time(v)))] for v in values]
-    x = np.concatenate(values)
-    side = np.repeat([0.0, 1.0], [len(v) for v in values])
-    design = np.stack([np.ones_like(x), x - x.mean()], axis=1)
-    beta = np.zeros(2)
-    for _ in range(50):
-        p = 1 / (1 + np.exp(-design @ beta))
-        hessian = design.T @ (design * (p * (1 - p))[:, None])
-        beta += np.linalg.solve(hessian, design.T @ (side - p))
-    return float(beta[1]), float(np.sqrt(np.linalg.inv(hessian)[1, 1])), exact
+# -- from one pressure or temperature to another --------------------------------------------------------------------
 
 
 def judged(one: dict[str, Any], two: dict[str, Any]) -> float | None:
@@ -322,6 +290,30 @@ def judged(one: dict[str, Any], two: dict[str, Any]) -> float | None:
         if "Less than 3 bins" not in str(error):
             raise
         return None
+
+
+def means(run_: dict[str, Any]) -> dict[str, Any]:
+    """Of a run, instead of its series."""
+    rest = {key: value for key, value in run_.items() if key not in SERIES}
+    kappa = [value / run_["temperature"] for value in volumes.compressed(run_["volumes"])]
+    volume, energy = (volumes.mean_and_error(v) for v in (run_["volumes"], run_["energies"] - run_["shapes"]))
+    return rest | {"volume": volume, "energy": energy, "compressibility": kappa}
+
+
+def only(run_: Any) -> dict[str, Any]:
+    return means(run_())
+
+
+def compared(run_: Any) -> dict[str, Any]:
+    """A run, and the slopes to one at 1.3 times its pressure and one at 1.1 times its temperature."""
+    first = run_()
+    told = means(first) | {"slopes": {}}
+    for name, more in (("denser", {"denser": 1.3}), ("hotter", {"hotter": 1.1})):
+        other = run_(**more, seed=2)
+        found, error, exact = volumes.slope_between(first, other)
+        line = {"found": found, "error": error, "exact": exact, "physical_validation": judged(first, other)}
+        told["slopes"][name] = line
+    return told
 
 
 # -- a molecular crystal, a slab ------------------------------------------------------------------------------------
@@ -362,7 +354,7 @@ def crystal(steps: int, seed: int) -> dict[str, Any]:
     state = system.initial_state(x, thermal_velocities(system, x, thermal, seed))
     state = run(system, state, 0.004, steps, stepper=stepper, observers=[note], every=10)
     kept = np.array(seen)[len(seen) // 5 :]
-    side, stress = ([mean_and_error(column) for column in part.T] for part in (kept[:, :3], kept[:, 3:6]))
+    side, stress = ([volumes.mean_and_error(column) for column in part.T] for part in (kept[:, :3], kept[:, 3:6]))
     return {
         "steps": steps,
         "acceptance": float(barostat.acceptance(state)[0]),
@@ -393,7 +385,7 @@ def slab(steps: int) -> dict[str, Any]:
     return {
         "steps": steps,
         "perfect": flat,
-        "side": mean_and_error(sides[len(sides) // 5 :]),
+        "side": volumes.mean_and_error(sides[len(sides) // 5 :]),
         "spread of heights": heights,
     }
 
@@ -408,27 +400,10 @@ def cost(molecules: int, turns: int) -> dict[str, Any]:
     """
     system, x = diatomics(round((molecules / 4) ** (1 / 3)))
     thermal, dt = 0.3, 0.004
-    alone = Langevin(thermal, 1.0, 1)
-    both = ConstantPressure(alone, CellRescaling(0.5, 0.5, 0.01))
+    both = ConstantPressure(Langevin(thermal, 1.0, 1), CellRescaling(0.5, 0.5, 0.01))
     state = system.initial_state(x, thermal_velocities(system, x, thermal, 1), project=True)
-    every = both.barostat.every
-    state = run(system, state, dt, 350, stepper=both)  # trials are then made in the midst of a turn
-    ratios, ends = [], {}
-    for _ in range(turns):
-        spent = {alone: 0.0, both: 0.0}
-        for k in range(6):
-            for stepper in (alone, both) if k % 2 else (both, alone):
-                system.set_cell(state.cell, state.positions)
-                begun = time.process_time()
-                ends[stepper] = run(system, state, dt, every, stepper=stepper, check_every=0)
-                spent[stepper] += time.process_time() - begun
-            state = ends[both]
-        ratios.append(spent[both] / spent[alone])
-    low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75])
-    # Of a median of normal values: 1.25 standard errors, and 1.35 standard deviations from quarter to quarter.
-    error = 1.25 / 1.35 * (high - low) / np.sqrt(turns)
-    told = {"barostat": "rescaling", "every": every, "molecules": molecules, "turns": turns}
-    return told | {"ratio": float(middle), "error": float(error)}
+    told = {"barostat": "rescaling", "molecules": molecules}
+    return told | volumes.added_cost(system, state, dt, both, turns)
 
 
 #: Barostats of OpenMM, and the ensembles of our integrators beside which each is run.
@@ -436,54 +411,32 @@ BESIDE = (("flexible", "Langevin"), ("anisotropic", "Nose-Hoover"), ("membrane",
 
 RUNS: dict[str, Any] = {
     **{
-        f"{name}, {b}, {t}": partial(
-            run_fluid, name, b, t, 120_000 if (name, t) == ("dumbbells", "Langevin") else 60_000
-        )
-        for name in FLUIDS
-        for b, t in (("Monte Carlo", "Langevin"), ("rescaling", "Langevin"), ("rescaling", "isokinetic"))
-    },
-    "dumbbells, Monte Carlo, Nose-Hoover": partial(run_fluid, "dumbbells", "Monte Carlo", "Nose-Hoover", 60_000),
-    **{
-        f"dumbbells, {b}, Langevin, {what}": partial(run_fluid, "dumbbells", b, "Langevin", 120_000, **more, seed=2)
+        f"dumbbells, {b}, Langevin": partial(compared, partial(run_fluid, "dumbbells", b, "Langevin", 120_000))
         for b in ("Monte Carlo", "rescaling")
-        for what, more in (("denser", {"denser": 1.3}), ("hotter", {"hotter": 1.1}))
     },
     **{
-        f"OpenMM, {b}, {e}{what}": partial(run_in_openmm, e, b, 60_000, **more, seed=seed)
+        f"{name}, {b}, {t}": partial(only, partial(run_fluid, name, b, t, 60_000))
+        for name, b, t in (
+            ("dumbbells", "rescaling", "isokinetic"),
+            *((METHANES, b, "Langevin") for b in ("Monte Carlo", "rescaling")),
+            (METHANES, "rescaling", "isokinetic"),
+            ("dumbbells", "Monte Carlo", "Nose-Hoover"),
+        )
+    },
+    **{
+        f"dumbbells, {b}, {kind}, Langevin": partial(
+            compared, partial(run_fluid, "dumbbells", b, "Langevin", 240_000, kind)
+        )
+        for b, kind in (("Monte Carlo", "flexible"), ("rescaling", "flexible"), ("rescaling", "anisotropic"))
+    },
+    **{
+        f"OpenMM, {b}, {e}": partial(compared, partial(run_in_openmm, e, b, 600_000 if b == "flexible" else 60_000))
         for b, e in BESIDE
-        for what, more, seed in (("", {}, 1), (", denser", {"denser": 1.3}, 2), (", hotter", {"hotter": 1.1}, 2))
     },
     **{f"cost, rescaling, {n}": partial(cost, n, turns) for n, turns in ((108, 60), (500, 20))},
     **{f"crystal {seed}": partial(crystal, 60_000, seed) for seed in (1, 2)},
     "slab": partial(slab, 20_000),
 }
-
-
-#: What is not kept of a run.
-SERIES = ("volumes", "energies", "shapes")
-
-
-def summary(found: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Means and errors of what was run, with slopes between pressures and temperatures; water stays as it was."""
-    told = json_files.read(RESULTS)
-    told |= {"environment": environment(), "slopes": []}
-    for name, one in found.items():
-        rest = {key: value for key, value in one.items() if key not in SERIES}
-        if "volumes" in one:
-            kappa = compressed(one["volumes"])
-            own = np.array(one["energies"]) - one.get("shapes", 0.0)
-            rest["volume"], rest["energy"] = mean_and_error(one["volumes"]), mean_and_error(own)
-            rest["compressibility"] = [value / one["temperature"] for value in kappa]
-        told["runs"][name] = rest
-    names = [f"dumbbells, {b}, Langevin" for b in ("Monte Carlo", "rescaling")]
-    names += [f"OpenMM, {b}, {e}" for b, e in BESIDE]
-    for name in names:
-        for what in ("denser", "hotter"):
-            first, other = found[name], found[f"{name}, {what}"]
-            value, error, exact = slope(first, other)
-            line = {"run": name, "to": what, "found": value, "error": error, "exact": exact}
-            told["slopes"].append({**line, "physical_validation": judged(first, other)})
-    return told
 
 
 def told(pair: Any, digits: int, scale: float = 1.0) -> str:
@@ -494,22 +447,22 @@ def percent(one: dict[str, Any]) -> str:
     return f"{100 * (one['ratio'] - 1):.1f} ± {100 * one['error']:.1f} %"
 
 
-def show(path: str) -> None:
+def show(result: dict[str, Any]) -> None:
     """Tables for the page."""
-    result = json_files.read(path)
-    runs, slopes = result["runs"], result["slopes"]
+    runs = {name: result["runs"][name] for name in RUNS if name in result["runs"]}
     print("| fluid | barostat | thermostat | V/N | U/N | κ |\n| --- | --- | --- | --- | --- | --- |")
-    for name, one in runs.items():
-        if "volume" in one and not name.endswith(("denser", "hotter")):
+    for one in runs.values():
+        if "volume" in one:
             n = one["molecules"]
             row = told(one["volume"], 3, 1 / n), told(one["energy"], 3, 1 / n), told(one["compressibility"], 2)
             print(f"| {one['fluid']} | {one['barostat']} | {one['thermostat']} | {' | '.join(row)} |")
     print("\n| run | to | slope found | exact | physical_validation |\n| --- | --- | --- | --- | --- |")
-    for one in slopes:
-        what = "1.3 P, along V" if one["to"] == "denser" else "1.1 T, along U + P V"
-        off, found = one["physical_validation"], told((one["found"], one["error"]), 4)
-        said = "too few values" if off is None else f"{off:.1f} σ"
-        print(f"| {one['run']} | {what} | {found} | {one['exact']:.4f} | {said} |")
+    for name, one in runs.items():
+        for to, line in one.get("slopes", {}).items():
+            what = "1.3 P, along V" if to == "denser" else "1.1 T, along U + P V"
+            off, found = line["physical_validation"], told((line["found"], line["error"]), 4)
+            said = "too few values" if off is None else f"{off:.1f} σ"
+            print(f"| {name} | {what} | {found} | {line['exact']:.4f} | {said} |")
     print("\n| barostat | molecules | a step costs more by |\n| --- | --- | --- |")
     for name, one in runs.items():
         if name.startswith("cost, rescaling"):
@@ -523,24 +476,11 @@ def show(path: str) -> None:
     print(f"Slab: {told(runs['slab']['side'], 4)} beside {runs['slab']['perfect']:.4f}.")
 
 
-def main(arguments: list[str]) -> None:
-    """Short runs of a few, or full ones."""
-    if arguments[:1] == ["--show"]:
-        show(arguments[1])
-        return
-    if "--full" in arguments:
-        names = [name for name in arguments if name in RUNS] or list(RUNS)
-        found = {}
-        for name in names:
-            found[name] = RUNS[name]()
-            print(name, {k: v for k, v in found[name].items() if k not in SERIES}, flush=True)
-        if len(names) == len(RUNS):
-            json_files.write(RESULTS, summary(found))
-        return
+def short_runs() -> None:
     print("A fluid of 32 rigid dumbbells at kT = 2, P = 1 (reduced units):")
     for barostat in ("Monte Carlo", "rescaling"):
         one = run_fluid("dumbbells", barostat, "Langevin", 600)
-        volume, error = mean_and_error(one["volumes"])
+        volume, error = volumes.mean_and_error(one["volumes"])
         print(
             f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {one['acceptance']:.0%} of trials accepted"
         )
@@ -554,4 +494,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    scripts.script_of_runs(__doc__, RUNS, short_runs, show, RESULTS)

@@ -1,7 +1,7 @@
 """Rigid TIP3P water at constant pressure, by OpenMM as a force engine, beside OpenMM's own barostat.
 
 python examples/38_constant_pressure_water.py                 a short run
-python examples/38_constant_pressure_water.py --full          those of docs/constant_pressure.md: half an hour
+python examples/38_constant_pressure_water.py --full          those of docs/constant_pressure.md: hours
 python examples/38_constant_pressure_water.py --full NAME...  some of them
 python examples/38_constant_pressure_water.py --show FILE     the tables of the page from a file of results
 
@@ -10,8 +10,6 @@ Fluids of other molecules, a crystal and a slab: examples/34_constant_pressure.p
 
 from __future__ import annotations
 
-import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ import numpy as np
 from ase import units
 
 from kcons import ConstraintSet
-from kcons.comparison import environment, json_files
+from kcons.comparison import scripts, volumes
 from kcons.constraints import Distance
 from kcons.motion import Motion
 from kcons.steppers import run
@@ -40,21 +38,6 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results" / "constant_pressure.js
 # -- rigid water ----------------------------------------------------------------------------------------------------
 
 WATERS, TEMPERATURE, BAR = 64, 300.0, units.bar
-
-
-def mean_and_error(values: Any) -> tuple[float, float]:
-    values = np.asarray(values)
-    if len(values) < 32:  # of short runs no error is known
-        return float(values.mean()), float("nan")
-    return float(values.mean()), float(values.std() * np.sqrt(autocorrelation_time(values) / len(values)))
-
-
-def compressed(volumes: Any) -> tuple[float, float]:
-    """<dV^2>/<V>, and its error from that of the squares."""
-    volumes = np.asarray(volumes)
-    squares = (volumes - volumes.mean()) ** 2
-    mean, error = mean_and_error(squares)
-    return mean / float(volumes.mean()), error / float(volumes.mean())
 
 
 def water_system(waters: int = WATERS, cutoff: float = 0.55) -> Any:
@@ -133,15 +116,28 @@ class Engine:
         return (up - down) / (6 * e * np.linalg.det(h)) * np.eye(3)
 
 
+def held_water(box: Any, x: np.ndarray, side: float) -> tuple[CellSystem, np.ndarray]:
+    """Constraints of the core instead of those of OpenMM, which gives the forces; positions that fulfil them."""
+    x = minimised(box, x)
+    rows = [box.getConstraintParameters(k) for k in range(box.getNumConstraints())]
+    for k in reversed(range(len(rows))):
+        box.removeConstraint(k)
+    masses = np.array([box.getParticleMass(k)._value for k in range(box.getNumParticles())])
+    row = Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows])
+    held = ConstraintSet(row, x, masses, cell=np.full(3, side))
+    engine = Engine(box)
+    return CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress), x
+
+
 def run_water(
     barostat: str, thermostat: str, steps: int, every: int = 25, seed: int = 1, skip: int = 200
 ) -> dict[str, Any]:
     """Densities in g/cm3, one in 25 steps of 2 fs, the first `skip` of them left out."""
     system, x, side = water_system()
-    masses = np.array([system.getParticleMass(k)._value for k in range(system.getNumParticles())])
-    density = masses.sum() / units.mol * 1e24
+    mass = sum(system.getParticleMass(k)._value for k in range(system.getNumParticles()))
+    density = mass / units.mol * 1e24
     thermal = units.kB * TEMPERATURE
-    volumes = []
+    seen = []
     if barostat == "OpenMM":
         import openmm
 
@@ -157,18 +153,10 @@ def run_water(
         context.setVelocitiesToTemperature(TEMPERATURE, seed)
         for _ in range(steps // 25):
             integrator.step(25)
-            volumes.append(1e3 * context.getState().getPeriodicBoxVolume()._value)
+            seen.append(1e3 * context.getState().getPeriodicBoxVolume()._value)
         acceptance = None
     else:
-        x = minimised(system, x)
-        rows = [system.getConstraintParameters(k) for k in range(system.getNumConstraints())]
-        for k in reversed(range(len(rows))):
-            system.removeConstraint(k)
-        held = ConstraintSet(
-            Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows]), x, masses, cell=np.full(3, side)
-        )
-        engine = Engine(system)
-        ours = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+        ours, x = held_water(system, x, side)
         steppers = {
             "Langevin": partial(Langevin, thermal, 0.001 / units.fs, seed),
             "isokinetic": partial(Isokinetic, thermal, momentum="conserved"),
@@ -180,12 +168,12 @@ def run_water(
         press = presses[barostat](every=every, seed=seed, cutoff=5.5)
         v = thermal_velocities(ours, x, thermal, seed, zero_momentum=True)
         stepper = ConstantPressure(steppers[thermostat](), press)
-        note = lambda state: volumes.append(float(np.linalg.det(state.cell)))  # noqa: E731
+        note = lambda state: seen.append(float(np.linalg.det(state.cell)))  # noqa: E731
         state = stepper.start(ours, ours.initial_state(x, v, project=True))
         state = run(ours, state, 2 * units.fs, steps, stepper=stepper, observers=[note], every=25)
         acceptance = float(press.acceptance(state)[0])
-    volumes = np.array(volumes[skip:])
-    kappa, error = compressed(volumes)
+    kept = np.array(seen[skip:])
+    kappa, error = volumes.compressed(kept)
     return {
         "barostat": barostat,
         "thermostat": thermostat,
@@ -193,9 +181,9 @@ def run_water(
         "every": every,
         "picoseconds": steps * 0.002,
         "acceptance": acceptance,
-        "density": mean_and_error(density / volumes),
+        "density": volumes.mean_and_error(density / kept),
         "compressibility": [kappa / thermal * BAR, error / thermal * BAR],
-        "correlation_ps": autocorrelation_time(volumes) * 0.05 if len(volumes) >= 32 else None,
+        "correlation_ps": autocorrelation_time(kept) * 0.05 if len(kept) >= 32 else None,
     }
 
 
@@ -205,46 +193,24 @@ def run_water(
 def cost(molecules: int, turns: int) -> dict[str, Any]:
     """Processor time of a step with a Monte Carlo barostat over that of one without, at the default frequency."""
     box, x, side = water_system(molecules, 0.55 if molecules == WATERS else 0.9)
-    x = minimised(box, x)
-    rows = [box.getConstraintParameters(k) for k in range(box.getNumConstraints())]
-    for k in reversed(range(len(rows))):
-        box.removeConstraint(k)
-    masses = np.array([box.getParticleMass(k)._value for k in range(box.getNumParticles())])
-    row = Distance([r[:2] for r in rows], [10 * r[2]._value for r in rows])
-    held = ConstraintSet(row, x, masses, cell=np.full(3, side))
-    engine = Engine(box)
-    system = CellSystem(Motion(held, x), engine.force, engine.potential, engine.stress)
+    system, x = held_water(box, x, side)
     thermal, dt = units.kB * TEMPERATURE, 2 * units.fs
-    alone = Langevin(thermal, 0.001 / units.fs, 1)
-    both = ConstantPressure(alone, MonteCarloBarostat(BAR))
+    both = ConstantPressure(Langevin(thermal, 0.001 / units.fs, 1), MonteCarloBarostat(BAR))
     state = system.initial_state(x, thermal_velocities(system, x, thermal, 1), project=True)
-    every = both.barostat.every
-    state = run(system, state, dt, 350, stepper=both)  # trials are then made in the midst of a turn
-    ratios, ends = [], {}
-    for _ in range(turns):
-        spent = {alone: 0.0, both: 0.0}
-        for k in range(6):
-            for stepper in (alone, both) if k % 2 else (both, alone):
-                system.set_cell(state.cell, state.positions)
-                begun = time.process_time()
-                ends[stepper] = run(system, state, dt, every, stepper=stepper, check_every=0)
-                spent[stepper] += time.process_time() - begun
-            state = ends[both]
-        ratios.append(spent[both] / spent[alone])
-    low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75])
-    # Of a median of normal values: 1.25 standard errors, and 1.35 standard deviations from quarter to quarter.
-    error = 1.25 / 1.35 * (high - low) / np.sqrt(turns)
-    told = {"barostat": "Monte Carlo", "every": every, "molecules": molecules, "turns": turns}
-    return told | {"ratio": float(middle), "error": float(error)}
+    told = {"barostat": "Monte Carlo", "molecules": molecules}
+    return told | volumes.added_cost(system, state, dt, both, turns)
 
 
+#: The same length each, so that none weighs more than others.
+SEEDS = (3, 5, 11, 13, 17, 19, 23, 29)
 RUNS: dict[str, Any] = {
-    "water, OpenMM": partial(run_water, "OpenMM", "Langevin", 600_000, 10, seed=3),
-    "water, Monte Carlo": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10, seed=3),
-    "water, OpenMM, again": partial(run_water, "OpenMM", "Langevin", 600_000, 10, seed=5),
-    "water, Monte Carlo, again": partial(run_water, "Monte Carlo", "Langevin", 500_000, 10, seed=5),
-    "water, rescaling": partial(run_water, "rescaling", "Langevin", 200_000),
-    "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 100_000),
+    **{
+        f"water, {b}, seed {seed}": partial(run_water, b, "Langevin", steps, 10, seed=seed)
+        for seed in SEEDS
+        for b, steps in (("OpenMM", 600_000), ("Monte Carlo", 500_000))
+    },
+    "water, rescaling": partial(run_water, "rescaling", "Langevin", 500_000),
+    "water, isokinetic": partial(run_water, "Monte Carlo", "isokinetic", 400_000),
     "water, Monte Carlo, every 100": partial(run_water, "Monte Carlo", "Langevin", 150_000, 100, seed=7),
     **{f"cost, Monte Carlo, {n}": partial(cost, n, turns) for n, turns in ((WATERS, 60), (216, 20))},
 }
@@ -254,26 +220,28 @@ def told(pair: Any, digits: int, scale: float = 1.0) -> str:
     return f"{scale * pair[0]:.{digits}f} ± {scale * pair[1]:.{digits}f}"
 
 
-def weighted(pairs: list[Any]) -> tuple[float, float]:
-    """One mean of several with errors."""
-    value, error = np.array(pairs).T
-    w = error**-2
-    return float((w * value).sum() / w.sum()), float(w.sum() ** -0.5)
-
-
-def show(path: str) -> None:
+def show(result: dict[str, Any]) -> None:
     """Tables for the page."""
-    runs = json_files.read(path)["runs"]
-    print("| 64 TIP3P waters | thermostat | ns | density, g/cm³ | κ, 10⁻⁵/bar |\n| --- | --- | --- | --- | --- |")
+    runs = result["runs"]
+    print("| 64 TIP3P waters | thermostat | runs | ns | density, g/cm³ | scatter | κ, 10⁻⁵/bar |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     water = [one for name, one in runs.items() if name.startswith("water")]
+    found = {}
     for b in ("OpenMM", "Monte Carlo", "rescaling"):
         for t in ("Langevin", "isokinetic"):
             same = [one for one in water if (one["barostat"], one["thermostat"]) == (b, t)]
             if same:
-                time_ = sum(one["picoseconds"] for one in same) / 1000
-                density, kappa = (weighted([one[key] for one in same]) for key in ("density", "compressibility"))
+                time = sum(one["picoseconds"] for one in same) / 1000
+                density, kappa = (volumes.pooled([one[k] for one in same]) for k in ("density", "compressibility"))
+                found[b, t] = density
                 name = "OpenMM's own" if b == "OpenMM" else b
-                print(f"| {name} | {t} | {time_:.1f} | {told(density, 4)} | {told(kappa, 2, 1e5)} |")
+                scatter = f"{density[2]:.2f}" if len(same) > 1 else ""
+                row = f"{len(same)} | {time:.1f} | {told(density, 4)} | {scatter} | {told(kappa, 2, 1e5)}"
+                print(f"| {name} | {t} | {row} |")
+    ours, theirs = found["Monte Carlo", "Langevin"], found["OpenMM", "Langevin"]
+    # Errors are made larger by the scatter of runs where it is more than they tell.
+    error = np.hypot(*(one[1] * max(1.0, one[2]) for one in (ours, theirs))) / theirs[0]
+    print(f"\nDensity of ours over OpenMM's, less one: {100 * (ours[0] / theirs[0] - 1):.2f} ± {100 * error:.2f} %.")
     seldom = runs["water, Monte Carlo, every 100"]
     often = [one["correlation_ps"] for one in water if one["barostat"] == "Monte Carlo" and one["every"] == 10]
     one, other = np.mean(often), seldom["correlation_ps"]
@@ -285,24 +253,10 @@ def show(path: str) -> None:
             print(f"| {one['barostat']} | {one['molecules']} TIP3P waters, OpenMM | {cost} |")
 
 
-def main(arguments: list[str]) -> None:
-    """A short run, or full ones."""
-    if arguments[:1] == ["--show"]:
-        show(arguments[1])
-        return
-    if "--full" in arguments:
-        names = [name for name in arguments if name in RUNS] or list(RUNS)
-        found = {}
-        for name in names:
-            found[name] = RUNS[name]()
-            print(name, found[name], flush=True)
-        if len(names) == len(RUNS):
-            result = json_files.read(RESULTS)
-            json_files.write(RESULTS, {**result, "environment": environment(), "runs": {**result["runs"], **found}})
-        return
+def short() -> None:
     one = run_water("Monte Carlo", "Langevin", 1000, skip=10)
     print(f"64 TIP3P waters after 2 ps: {one['density'][0]:.2f} g/cm3, {one['acceptance']:.0%} of trials accepted")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    scripts.script_of_runs(__doc__, RUNS, short, show, RESULTS)

@@ -16,7 +16,7 @@ from kcons.errors import with_extra
 
 #: What documents and examples use, by the module that has it; imported when it is asked for.
 _MODULES = {
-    "averages": ("layers", "long_steps", "long_steps_report", "sampling"),
+    "averages": ("layers", "long_steps", "long_steps_report", "sampling", "volumes"),
     "test_systems": ("fluid",),
     "solvers_alone": ("scaling", "solver_precision"),
     "study": ("json_files", "scripts"),

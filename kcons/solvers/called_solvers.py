@@ -111,19 +111,22 @@ def words_of(solvers: Sequence[CalledSolver]) -> IntArray:
     """By what `solve_positions`, `solve_tangents` and `add` know solvers, to be kept as long as it is used."""
     words: list[int] = []
     for solver in solvers:
-        words += [_address(*each) for each in zip(solver.kernels, (_POSITIONS, _TANGENTS, _APPLY), strict=True)]
+        words += [address_of(*each) for each in zip(solver.kernels, (_POSITIONS, _TANGENTS, _APPLY), strict=True)]
         for array in (solver.tables, solver.numbers):
             words += [array.ctypes.data, array.size]
     return np.array(words, dtype=np.int64)
 
 
-def _address(kernel: Any, signature: Any) -> int:
+def address_of(kernel: Any, signature: Any) -> int:
+    """Where the compiled function is that a kernel has for a signature; it stays there as long as the kernel."""
     kernel.compile(signature.args)
     found = kernel.overloads[signature.args]
     return int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name))
 
 
-def _caller(signature: Any) -> Any:
+def caller_of(signature: Any) -> Any:
+    """What calls, inside kernels, the function of this signature that is at an address, with a tuple of arguments."""
+
     @intrinsic
     def function(typingctx, address, given):  # type: ignore[no-untyped-def]
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
@@ -141,7 +144,7 @@ def _caller(signature: Any) -> Any:
     return function
 
 
-_call_positions, _call_tangents, _call_apply = (_caller(kind) for kind in (_POSITIONS, _TANGENTS, _APPLY))
+_call_positions, _call_tangents, _call_apply = (caller_of(kind) for kind in (_POSITIONS, _TANGENTS, _APPLY))
 
 
 @intrinsic

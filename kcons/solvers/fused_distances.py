@@ -1,10 +1,11 @@
 """Distance rows of every shape behind one pair of kernels, for kernels that do more than solve in one call.
 
-A kernel that is called from Python pays for each array that it is given, and one that calls solvers of many kinds is
+A kernel that is called from Python pays for each array that it is given, and one that knows solvers of many kinds is
 compiled for each of their combinations. Here all that the solvers need lies in one array: rigid triangles, eight at a
 time (`solvers.rigid_triangles`), long chains (`chains.chains`), and whatever else is held by sparse elimination
-(`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes. Rows that
-are no distances have solvers that are called by address (`solvers.called_solvers`).
+(`kcons.solvers.sparse.distances`), which knows every shape and is the fastest for few rows of many shapes. The array
+names the functions of those that are there by their addresses, so that each is compiled once. Rows that are no
+distances have solvers that are called in the same way (`solvers.called_solvers`).
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.target import FloatArray
 from kcons.solvers import called_solvers
-from kcons.solvers.called_solvers import CalledSolver, words_of
+from kcons.solvers.called_solvers import CalledSolver, address_of, caller_of, words_of
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.chains.sweeps import project
 from kcons.solvers.distance_clusters import resolved
@@ -40,9 +42,18 @@ _LENGTHS, _PAIRS, _ATOMS, _MOVES = 0, 1, 3, 16
 _CORNERS, _SLOTS, _SIDES, _WEIGHTS, _UNDO, _PINNED, _PLACES, _KIND, _LATTICE, _CHAINS = range(20, 30)
 _CHAIN_PIECES = 12
 _CALLED = _CHAINS + _CHAIN_PIECES
-MORE = _CALLED + 1
+_FUNCTIONS = _CALLED + 1
+MORE = _FUNCTIONS + 1
 
-Packed = tuple[FloatArray, int | None, int | None, int | None, int | None]
+_POINTS, _NUMBERS = types.float64[:, ::1], types.float64[::1]
+#: Of what brings positions onto lengths, (x, x_ref, v, inv_dt, tables): iterations, or -1.
+_POSITIONS = types.int64(_POINTS, _POINTS, _POINTS, types.float64, _NUMBERS)
+#: Of what makes vectors tangent, (x, v, tables).
+_TANGENTS = types.boolean(_POINTS, _POINTS, _NUMBERS)
+_call_positions, _call_tangents = caller_of(_POSITIONS), caller_of(_TANGENTS)
+#: Which function is where in the piece of their addresses; 0 stands for none.
+_OTHERS, _MOVE_OTHERS, _TRIANGLES, _BOUND = range(4)
+_KINDS = 4
 
 
 def packed(
@@ -57,7 +68,7 @@ def packed(
     numbers: IntArray | None = None,
     late: NDArray[np.bool_] | None = None,
     called: Sequence[CalledSolver] = (),
-) -> Packed:
+) -> FloatArray:
     """What `packed_positions` and `packed_tangents` need to know.
 
     Parameters
@@ -83,10 +94,8 @@ def packed(
 
     Returns
     -------
-    tables : ndarray of float64
+    ndarray of float64
         Begins with where each piece starts and ends, as integers.
-    triangles, others, chains, called : int or None
-        Whether there are rows of each kind: 1, or None.
     """
     pieces: list[NDArray[Any]]
     if len(pairs):
@@ -102,10 +111,11 @@ def packed(
         pieces += triangles.tables()
     pieces += [pinned.astype(np.uint32), places.ravel(), np.zeros(1, dtype=np.int64), NO_LATTICE.ravel()]
     pieces += [np.zeros(0)] * _CHAIN_PIECES if chains is None else chains.tables(numbers)
-    pieces += [words_of(called), *more]
-    there = triangles is not None, len(pairs) > 0, chains is not None, len(called) > 0
-    first, second, third, last = (1 if each else None for each in there)
-    return in_one_array(pieces), first, second, third, last
+    there = len(pairs) > 0, len(pairs) > 0, triangles is not None, chains is not None
+    functions = [address_of(each, _POSITIONS) if held else 0 for each, held in zip(_POSITION_PARTS, there, strict=True)]
+    functions += [address_of(each, _TANGENTS) if held else 0 for each, held in zip(_TANGENT_PARTS, there, strict=True)]
+    pieces += [words_of(called), np.array(functions, dtype=np.int64), *more]
+    return in_one_array(pieces)
 
 
 def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
@@ -116,16 +126,126 @@ def set_lattice(tables: FloatArray, lattice: FloatArray | None) -> None:
     header[header[2 * _KIND]] = kind
 
 
-# What is None is pruned before compilation: systems without triangles, or with nothing else, do not wait for the other.
+@nb.njit(cache=True, nogil=True)
+def _place_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+    t, h, u = tables, integers(tables), halves(tables)
+    failed, _, iterations, _ = distances.solve_positions(
+        False, x, x_ref, piece(t, h, 0), lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN, piece(h, h, 2),
+        piece(u, h, 3), piece(h, h, 4), piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9),
+        piece(t, h, 10), piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15),
+        piece(t, h, 16), piece(t, h, 17), piece(t, h, 18), piece(t, h, 19),
+    )  # fmt: skip
+    return -1 if failed else iterations
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
+def _move_others(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+    """What `_place_others` has found, and -1 if the lengths are not yet what the positions resolve."""
+    t, h, u = tables, integers(tables), halves(tables)
+    distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
+    lattice, periodic = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN
+    return 0 if resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, periodic) else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _place_triangles(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+    t, h, u = tables, integers(tables), halves(tables)
+    landed, _, iterations, _ = project_triangles(
+        x, x_ref, v, inv_dt, None, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
+        piece(t, h, _SIDES), lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], t[:0], piece(t, h, _UNDO),
+    )  # fmt: skip
+    return iterations if landed else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _restore_triangles(points, at, kept, tables):  # type: ignore[no-untyped-def]
+    """Points of triangles as they were before these were solved, from number `at` of the `kept` points of each."""
+    h, u = integers(tables), halves(tables)
+    groups = piece(u, h, _SLOTS).size // WIDTH
+    restore_points(points, piece(u, h, _CORNERS), piece(tables, h, _UNDO), groups, 3, kept, at)
+
+
+@nb.njit(cache=True, nogil=True)
+def _place_chains(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
+    """As `Chains.positions` does it."""
+    t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
+    lattice, kind = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]]
+    most = 0
+    for again in range(_MAX_ROUNDS + 1):
+        landed, _, iterations, _ = project(
+            x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1), piece(b, h, _CHAINS + 2),
+            piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6),
+            piece(h, h, _CHAINS + 7), piece(t, h, _CHAINS + 8), lattice, kind, t[:0], piece(t, h, _CHAINS + 10),
+            piece(t, h, _CHAINS + 11),
+        )  # fmt: skip
+        if again == 0:
+            if not landed:
+                _restore_triangles(x, 0, 6, tables)
+                _restore_triangles(v, 3, 6, tables)
+                return -1
+            most = iterations
+        if not landed or resolved(
+            x, piece(u, h, _CHAINS + 9).reshape(-1, 2), piece(t, h, _CHAINS + 8), lattice, kind != OPEN
+        ):
+            break
+    return most
+
+
+@nb.njit(cache=True, nogil=True)
+def _turn_others(x, v, tables):  # type: ignore[no-untyped-def]
+    t, h, u = tables, integers(tables), halves(tables)
+    failed, _, _, _ = distances.solve_tangents(
+        x, v, t, False, lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN, piece(h, h, 2), piece(u, h, 3),
+        piece(h, h, 4), piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9),
+        piece(t, h, 10), piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15),
+        piece(t, h, 16), piece(t, h, 17),
+    )  # fmt: skip
+    return not failed
+
+
+@nb.njit(cache=True, nogil=True)
+def _slow_others(x, v, tables):  # type: ignore[no-untyped-def]
+    """What `_turn_others` has found."""
+    distances.apply(v, piece(halves(tables), integers(tables), _ATOMS), piece(tables, integers(tables), _MOVES))
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _turn_triangles(x, v, tables):  # type: ignore[no-untyped-def]
+    t, h, u = tables, integers(tables), halves(tables)
+    converged, _, _, _ = project_triangles(
+        v, x, t[:0].reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
+        t[:0], lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], t[:0], piece(t, h, _UNDO),
+    )  # fmt: skip
+    return converged
+
+
+@nb.njit(cache=True, nogil=True)
+def _turn_chains(x, v, tables):  # type: ignore[no-untyped-def]
+    t, h, u, b = tables, integers(tables), halves(tables), octets(tables)
+    none = t[:0]
+    converged, _, _, _ = project(
+        v, x, none.reshape(0, 3), 0.0, True, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1), piece(b, h, _CHAINS + 2),
+        piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6),
+        piece(h, h, _CHAINS + 7), none, lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]], none,
+        piece(t, h, _CHAINS + 10), piece(t, h, _CHAINS + 11),
+    )  # fmt: skip
+    if not converged:
+        _restore_triangles(v, 0, 3, tables)
+    return converged
+
+
+_POSITION_PARTS = _place_others, _move_others, _place_triangles, _place_chains
+_TANGENT_PARTS = _turn_others, _slow_others, _turn_triangles, _turn_chains
+
+
+@nb.njit(cache=True, nogil=True)
+def packed_positions(x, x_ref, v, inv_dt, tables):  # type: ignore[no-untyped-def]
     """Bring `x` onto the lengths along the gradients at `x_ref`, and change `v` by that times `inv_dt`.
 
     Parameters
     ----------
-    tables, triangles, others, chains, called
+    tables
         From `packed`.
 
     Returns
@@ -134,112 +254,67 @@ def packed_positions(x, x_ref, v, inv_dt, tables, triangles, others, chains, cal
         Iterations; -1 where there is no solution, with `x` and `v` as they were but for fixed atoms.
     """
     t, h, u = tables, integers(tables), halves(tables)
-    lattice, kind = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]]
     pinned, places = piece(u, h, _PINNED), piece(t, h, _PLACES)
     for k in range(pinned.size):
         for axis in range(3):
             x[pinned[k], axis] = places[3 * k + axis]
-    b, first = octets(tables), True
+    functions, words = piece(h, h, _FUNCTIONS), piece(h, h, _CALLED)
+    given = x, x_ref, v, inv_dt, tables
     # Nothing is written before all is solved, except that triangles and chains undo what they wrote.
     most = 0
-    for turn in range(_MAX_ROUNDS + 1):
-        if others is not None:
-            failed, _, iterations, _ = distances.solve_positions(
-                False, x, x_ref, piece(t, h, 0), lattice, kind != OPEN, piece(h, h, 2), piece(u, h, 3),
-                piece(h, h, 4), piece(t, h, 5), piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9),
-                piece(t, h, 10), piece(t, h, 11), piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15),
-                piece(t, h, 16), piece(t, h, 17), piece(t, h, 18), piece(t, h, 19),
-            )  # fmt: skip
-            if failed:
-                return most if turn else -1
-            most = max(most, iterations)
-        if called is not None and turn == 0:
-            iterations = called_solvers.solve_positions(
-                piece(h, h, _CALLED), x, x_ref, v, inv_dt, t[:0], lattice, kind != OPEN
-            )
-            if iterations < 0:
-                return -1
-            most = max(most, iterations)
-        if triangles is not None and turn == 0:
-            landed, _, iterations, _ = project_triangles(
-                x, x_ref, v, inv_dt, None, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
-                piece(t, h, _SIDES), lattice, kind, t[:0], piece(t, h, _UNDO),
-            )  # fmt: skip
-            if not landed:
-                return -1
-            most = max(most, iterations)
-        if chains is not None and turn == 0:
-            # As `Chains.positions` does it.
-            for again in range(_MAX_ROUNDS + 1):
-                landed, _, iterations, _ = project(
-                    x, x_ref, v, inv_dt, None, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
-                    piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4),
-                    piece(t, h, _CHAINS + 5), piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7),
-                    piece(t, h, _CHAINS + 8), lattice, kind, t[:0], piece(t, h, _CHAINS + 10),
-                    piece(t, h, _CHAINS + 11),
-                )  # fmt: skip
-                if again == 0:
-                    first, most = landed, max(most, iterations)
-                if not landed or resolved(
-                    x, piece(u, h, _CHAINS + 9).reshape(-1, 2), piece(t, h, _CHAINS + 8), lattice, kind != OPEN
-                ):
-                    break
-            if not first:
-                if triangles is not None:
-                    groups, undo = piece(u, h, _SLOTS).size // WIDTH, piece(t, h, _UNDO)
-                    restore_points(x, piece(u, h, _CORNERS), undo, groups, 3, 6, 0)
-                    restore_points(v, piece(u, h, _CORNERS), undo, groups, 3, 6, 3)
-                return -1
-        if others is None:
-            break
-        distances.apply_both(x, v, inv_dt, piece(u, h, _ATOMS), piece(t, h, _MOVES))
+    if functions[_OTHERS] != 0:
+        most = _call_positions(functions[_OTHERS], given)
+        if most < 0:
+            return -1
+    if words.size:
+        lattice, periodic = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN
+        iterations = called_solvers.solve_positions(words, x, x_ref, v, inv_dt, t[:0], lattice, periodic)
+        if iterations < 0:
+            return -1
+        most = max(most, iterations)
+    if functions[_TRIANGLES] != 0:
+        iterations = _call_positions(functions[_TRIANGLES], given)
+        if iterations < 0:
+            return -1
+        most = max(most, iterations)
+    if functions[_BOUND] != 0:
+        iterations = _call_positions(functions[_BOUND], given)
+        if iterations < 0:
+            return -1
+        most = max(most, iterations)
+    if functions[_OTHERS] != 0:
         # Large multipliers have a rounding that shows in the positions; another round takes it away.
-        if resolved(x, piece(u, h, _PAIRS).reshape(-1, 2), piece(t, h, _LENGTHS), lattice, kind != OPEN):
-            break
+        for _ in range(_MAX_ROUNDS):
+            if _call_positions(functions[_MOVE_OTHERS], given) == 0:
+                return most
+            iterations = _call_positions(functions[_OTHERS], given)
+            if iterations < 0:
+                return most
+            most = max(most, iterations)
+        _call_positions(functions[_MOVE_OTHERS], given)
     return most
 
 
 @nb.njit(cache=True, nogil=True)
-def packed_tangents(x, v, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
+def packed_tangents(x, v, tables):  # type: ignore[no-untyped-def]
     """Project `v` so that no length changes; whether that was possible, `v` otherwise as it was."""
     t, h, u = tables, integers(tables), halves(tables)
-    lattice, kind = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]]
     pinned = piece(u, h, _PINNED)
     for k in range(pinned.size):
         for axis in range(3):
             v[pinned[k], axis] = 0.0
-    if others is not None:
-        failed, _, _, _ = distances.solve_tangents(
-            x, v, t, False, lattice, kind != OPEN, piece(h, h, 2), piece(u, h, 3), piece(h, h, 4), piece(t, h, 5),
-            piece(u, h, 6), piece(u, h, 7), piece(u, h, 8), piece(t, h, 9), piece(t, h, 10), piece(t, h, 11),
-            piece(t, h, 12), piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, 16), piece(t, h, 17),
-        )  # fmt: skip
-        if failed:
-            return False
-    if called is not None and not called_solvers.solve_tangents(
-        piece(h, h, _CALLED), v, x, t[:0], lattice, kind != OPEN
-    ):
+    functions, words = piece(h, h, _FUNCTIONS)[_KINDS:], piece(h, h, _CALLED)
+    given = x, v, tables
+    if functions[_OTHERS] != 0 and not _call_tangents(functions[_OTHERS], given):
         return False
-    if triangles is not None:
-        converged, _, _, _ = project_triangles(
-            v, x, t[:0].reshape(0, 3), 0.0, True, piece(u, h, _CORNERS), piece(u, h, _SLOTS), piece(t, h, _WEIGHTS),
-            t[:0], lattice, kind, t[:0], piece(t, h, _UNDO),
-        )  # fmt: skip
-        if not converged:
+    if words.size:
+        lattice, periodic = lattice_piece(t, h, _LATTICE), h[h[2 * _KIND]] != OPEN
+        if not called_solvers.solve_tangents(words, v, x, t[:0], lattice, periodic):
             return False
-    if chains is not None:
-        b, none = octets(tables), t[:0]
-        converged, _, _, _ = project(
-            v, x, none.reshape(0, 3), 0.0, True, piece(h, h, _CHAINS), piece(u, h, _CHAINS + 1),
-            piece(b, h, _CHAINS + 2), piece(b, h, _CHAINS + 3), piece(u, h, _CHAINS + 4), piece(t, h, _CHAINS + 5),
-            piece(t, h, _CHAINS + 6), piece(h, h, _CHAINS + 7), none, lattice, kind, none,
-            piece(t, h, _CHAINS + 10), piece(t, h, _CHAINS + 11),
-        )  # fmt: skip
-        if not converged:
-            if triangles is not None:
-                groups = piece(u, h, _SLOTS).size // WIDTH
-                restore_points(v, piece(u, h, _CORNERS), piece(t, h, _UNDO), groups, 3, 3, 0)
-            return False
-    if others is not None:
-        distances.apply(v, piece(u, h, _ATOMS), piece(t, h, _MOVES))
+    if functions[_TRIANGLES] != 0 and not _call_tangents(functions[_TRIANGLES], given):
+        return False
+    if functions[_BOUND] != 0 and not _call_tangents(functions[_BOUND], given):
+        return False
+    if functions[_OTHERS] != 0:
+        _call_tangents(functions[_MOVE_OTHERS], given)
     return True

@@ -6,5 +6,6 @@
 - `long_steps`, `long_steps_report`: bias against evaluations of expensive forces
 - `step_zero`: averages at step zero
 - `trajectory_temperatures`: those of a trajectory of any engine
+- `volumes`: series at constant pressure, and what a barostat costs
 - `report`: tables, plots and files
 """

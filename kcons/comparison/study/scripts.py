@@ -12,8 +12,8 @@ import numpy as np
 from rich.console import Console
 
 from kcons.comparison.study import json_files
-from kcons.comparison.study.machine import stamp
-from kcons.comparison.study.study import Kept
+from kcons.comparison.study.machine import environment, stamp
+from kcons.comparison.study.study import Kept, picked
 from kcons.comparison.study.tables import Table, terminal
 from kcons.constraints.target import FloatArray
 
@@ -179,3 +179,44 @@ def script_of_parts(
     show(result, console)
     if chosen.draw:
         draw(result, chosen.draw)
+
+
+def script_of_runs(
+    about: str | None,
+    runs: Mapping[str, Callable[[], dict[str, Any]]],
+    short: Callable[[], None],
+    show: Callable[[dict[str, Any]], None],
+    out: Path,
+) -> None:
+    """Runs of which each stands for itself, as a command: ``--full NAME ...`` puts those into the file, or all.
+
+    A run is in the file as soon as it is done, beside what the file holds already, with the machine and the commit it
+    was made by; without ``--full`` a short one is shown and nothing written.
+
+    Parameters
+    ----------
+    about : str
+    runs : mapping of name to callable
+    short : callable
+    show : callable
+        Gets the results, for ``--show FILE``.
+    out : Path
+        Where results go unless ``--out`` says so.
+    """
+    parser = options(about, full="long runs")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="with --full: those to run, all by default")
+    chosen = parser.parse_args()
+    file = chosen.out or out
+    if chosen.show:
+        show(json_files.read(chosen.show))
+        return
+    if not chosen.full:
+        short()
+        return
+    for name in picked(chosen.names or None, runs, "run", "--full"):
+        here = environment()
+        own = {key: here[key] for key in ("commit", "date", "cpu", "simd")}
+        found = {**runs[name](), "environment": own}
+        earlier = json_files.read(file) if file.exists() else {"runs": {}}
+        json_files.write(file, {**earlier, "environment": here, "runs": {**earlier["runs"], name: found}})
+        print(name, json_files.text(found, None), flush=True)

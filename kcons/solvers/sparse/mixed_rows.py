@@ -11,13 +11,14 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from kcons.constraints.compilation import plain_if_small
 from kcons.constraints.constraint import IntArray
 from kcons.constraints.constraint_set import ConstraintSet
 from kcons.constraints.target import FloatArray
-from kcons.solvers.called_solvers import CalledSolver
+from kcons.solvers.called_solvers import CalledSolver, address_of, caller_of
 from kcons.solvers.cluster_solver import Request
 from kcons.solvers.kernels.aligned_memory import in_one_array, part_of, room
 from kcons.solvers.kernels.array_views import halves, integers, piece
@@ -54,7 +55,18 @@ SPEED_TOLERANCE = 1e-15
 CLOSER = 16.0
 _EPS = float(np.finfo(float).eps)
 #: Of the pieces of `SparseRows.tables`, those that are named.
-_PIVOTS, _MOVES, _SOLUTION = 16, 20, 21
+_PIVOTS, _MOVES, _SOLUTION, _FUNCTIONS = 16, 20, 21, 26
+#: Signatures of what `_positions` and `_tangents` call by address, so that it is compiled once and not into both.
+_INDICES, _NUMBERS = types.uint32[::1], types.float64[::1]
+_RANGE = types.int64, types.int64
+_EVALUATE = types.none(
+    *(*_RANGE, _INDICES, _INDICES, _INDICES, _NUMBERS, _NUMBERS, _NUMBERS, _NUMBERS, types.float64[:, :, ::1]),
+    *(types.boolean, _NUMBERS, _NUMBERS, types.int64),
+)
+_FACTOR = types.none(*_RANGE, *(5 * (_INDICES,)), *(5 * (_NUMBERS,)))
+_FORWARD = types.none(*_RANGE, _INDICES, _INDICES, _NUMBERS, _NUMBERS)
+_BACKWARD = types.none(*_RANGE, _INDICES, _INDICES, _INDICES, *(6 * (_NUMBERS,)))
+_call_evaluate, _call_factor, _call_forward, _call_backward = map(caller_of, (_EVALUATE, _FACTOR, _FORWARD, _BACKWARD))
 
 
 class SparseRows(CalledSolver):
@@ -116,6 +128,7 @@ class SparseRows(CalledSolver):
                 *(room(2 * n), room(4 * len(pattern.columns))),
                 *(room(n), room(n), room(n), room(numbers), room(numbers), room(n)),
                 *(room(numbers), room(n), room(numbers), room(numbers)),
+                _addresses(),
             )
         )
         self._pivots, self._solution = part_of(self.tables, _PIVOTS), part_of(self.tables, _SOLUTION)
@@ -133,6 +146,11 @@ class SparseRows(CalledSolver):
         if not outcome.converged:
             return len(self.rows)
         return int(np.count_nonzero(self._pivots))
+
+
+def _addresses() -> IntArray:
+    kernels = (evaluate, _EVALUATE), (_factor, _FACTOR), (_forward, _FORWARD), (_backward, _BACKWARD)
+    return np.array([address_of(*each) for each in kernels], dtype=np.int64)
 
 
 @nb.njit(cache=True)
@@ -246,17 +264,17 @@ def _backward(first, last, links, columns, slot_atoms, lines, state, entries, pi
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", inline="always")
 def _begin(  # type: ignore[no-untyped-def]
     first, last, first_atom, last_atom, x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds, parameters, links,
-    scale, lines, values, inverse_rounding, base, moves, origin, solution,
+    scale, lines, values, inverse_rounding, base, moves, origin, solution, functions,
 ):  # fmt: skip
     """Gradients at the reference, and the reciprocal of what rounding leaves of each row."""
     zero = quad(0.0, 0.0, 0.0, 0.0)
     for a in range(first_atom, last_atom):
         store_quad(origin, 4 * a, load_point(x_ref, 3 * entry(atoms, a)))
         store_quad(moves, 4 * a, zero)
-    evaluate(
+    _call_evaluate(functions[0], (
         first, last, kinds, links, slot_atoms, parameters, origin, moves, origin, lattice, periodic, values, lines,
         REFERENCE,
-    )  # fmt: skip
+    ))  # fmt: skip
     for a in range(first_atom, last_atom):
         point = load_point(x_new, 3 * entry(atoms, a))
         store_quad(base, 4 * a, point)
@@ -326,7 +344,7 @@ def _positions(  # type: ignore[no-untyped-def]
     lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
     values, inverse_rounding, base, moves = piece(t, h, 17), piece(t, h, 18), piece(t, h, 19), piece(t, h, _MOVES)
     solution, kept_moves, kept_solution = piece(t, h, _SOLUTION), piece(t, h, 22), piece(t, h, 23)
-    origin = piece(t, h, 25)
+    origin, functions = piece(t, h, 25), piece(h, h, _FUNCTIONS)
     if not wanted.size:
         wanted = piece(t, h, 12)
     worst, worst_row, most = 0.0, -1, 0
@@ -334,8 +352,9 @@ def _positions(  # type: ignore[no-untyped-def]
         first, last = clusters[c], clusters[c + 1]
         _begin(
             first, last, atom_start[c], atom_start[c + 1], x_new, x_ref, lattice, periodic, atoms, slot_atoms, kinds,
-            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, solution,
+            parameters, links, scale, lines, values, inverse_rounding, base, moves, origin, solution, functions,
         )  # fmt: skip
+        matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
         error = np.inf
         best = np.inf
         factored = False
@@ -343,10 +362,10 @@ def _positions(  # type: ignore[no-untyped-def]
         halvings = 0
         while True:
             previous = error
-            evaluate(
+            _call_evaluate(functions[0], (
                 first, last, kinds, links, slot_atoms, parameters, base, moves, origin, lattice, periodic, values,
                 lines, NOW,
-            )  # fmt: skip
+            ))  # fmt: skip
             error, total, excess, bad = _measure(
                 first, last, kinds, parameters, links, wanted, scale, inverse_rounding, values, state
             )
@@ -371,11 +390,13 @@ def _positions(  # type: ignore[no-untyped-def]
                 keep(4 * atom_start[c], 4 * atom_start[c + 1], moves, kept_moves)
                 keep(first, last, solution, kept_solution)
             if factor_serves(factored, error, previous):
-                _forward(first, last, links, columns, state, entries)
+                _call_forward(functions[2], (first, last, links, columns, state, entries))
             else:
-                _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
+                _call_factor(functions[1], matrix)
                 factored = True
-            _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+            _call_backward(
+                functions[3], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+            )
             iteration += 1
         for k in range(first, last):
             along = 0.0
@@ -404,7 +425,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
     triple, sides, masses = piece(u, h, 8), piece(u, h, 9), piece(t, h, 10)
     lines, state, entries, pivots = piece(t, h, 13), piece(t, h, 14), piece(t, h, 15), piece(t, h, _PIVOTS)
     values, base, moves = piece(t, h, 17), piece(t, h, 19), piece(t, h, _MOVES)
-    solution, speeds = piece(t, h, _SOLUTION), piece(t, h, 24)
+    solution, speeds, functions = piece(t, h, _SOLUTION), piece(t, h, 24), piece(h, h, _FUNCTIONS)
     driven = wanted.size > 0
     worst, worst_row, most = 0.0, -1, 0
     for c in range(len(clusters) - 1):
@@ -414,10 +435,10 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             store_quad(base, 4 * a, load_point(x, g))
             store_quad(speeds, 4 * a, load_point(y, g))
             store_quad(moves, 4 * a, quad(0.0, 0.0, 0.0, 0.0))
-        evaluate(
+        _call_evaluate(functions[0], (
             first, last, kinds, links, slot_atoms, parameters, base, moves, base, lattice, periodic, values, lines,
             REFERENCE,
-        )  # fmt: skip
+        ))  # fmt: skip
         largest, total = 0.0, 0.0
         for k in range(first, last):
             goal = wanted[k] if driven else 0.0
@@ -438,12 +459,15 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             solution[k] = 0.0
         if not (total < np.inf):
             return False, np.inf, 0, _first_not_finite(first, last, state)
-        _factor(first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots)
+        matrix = first, last, links, columns, targets, triple, sides, masses, lines, state, entries, pivots
+        _call_factor(functions[1], matrix)
         allowed = SPEED_TOLERANCE * largest
         previous = np.inf
         iteration = 0
         while True:
-            _backward(first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+            _call_backward(
+                functions[3], (first, last, links, columns, slot_atoms, lines, state, entries, pivots, moves, solution)
+            )
             iteration += 1
             error, total = 0.0, 0.0
             bad = first
@@ -463,7 +487,7 @@ def _tangents(alone, x, y, wanted, lattice, periodic, tables, parameters):  # ty
             if not refines(iteration, error, previous, allowed):
                 break
             previous = error
-            _forward(first, last, links, columns, state, entries)
+            _call_forward(functions[2], (first, last, links, columns, state, entries))
         if error > 1e3 * allowed:
             return False, error, iteration, bad
         if error >= worst:

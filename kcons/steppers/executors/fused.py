@@ -70,9 +70,9 @@ def fused_steps(
                 tables, cell = flights.tables(), held.lattice
             out = new(shape)
             if later is None:
-                found = one(what, dt, x, v, u, last, first, f, out, *tables)
+                found = one(what, dt, x, v, u, last, first, f, out, tables)
             else:
-                found = many(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, *tables)
+                found = many(what, fractions, dt, 0, x, v, u, work, last, first, f, True, out, tables)
             if found == UNENDED:
                 flights.refuse()
                 return _at(before, start, made - 1), made - 1
@@ -101,9 +101,9 @@ def fused_steps(
             if held.lattice is not cell or given.lattice is not cell:
                 tables = flights.tables()
         if later is None:
-            status = one(END, dt, x, v, v, last, 0.0, f, x, *tables)
+            status = one(END, dt, x, v, v, last, 0.0, f, x, tables)
         else:
-            status = many(END, NO_FRACTIONS, dt, 0, x, v, v, work, last, 0.0, f, False, x, *tables)
+            status = many(END, NO_FRACTIONS, dt, 0, x, v, v, work, last, 0.0, f, False, x, tables)
         far = status and flights.ended(status, x, v, f, time, number + steps, tables)
     except ConvergenceError as error:
         raise explained(error, system, _at(here, start, made), dt, number + made + 1) from error
@@ -146,7 +146,7 @@ def _further(
             now = time + (passed.ends[-1] * dt + left_over)
             f = system.accepted(system.force(out if shift is None else out + shift, now), number, False)
         x, out = out, np.empty(x.shape)
-        found = flights.many(FLY, stage.lengths, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, *tables)
+        found = flights.many(FLY, stage.lengths, dt, 0, x, u, u, work, 0.0, kick * dt, f, False, out, tables)
         if found < 0:
             now = time + (stage.ends[-1] * dt + left_over)
             found = flights.landed(found, stage.lengths, dt, x.copy(), u, work, f, out, now, number, tables)

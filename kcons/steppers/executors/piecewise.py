@@ -9,12 +9,11 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.errors import ConvergenceError, ImageError, InputError, NonFiniteError
-from kcons.solvers.fused_distances import Packed
 from kcons.steppers.executors.frame import Frame
 from kcons.steppers.operations import Damp, Fly, Kick, Operation, Settle
-from kcons.steppers.stages.compensated_steps import NO_WORK, Point, check_finite
+from kcons.steppers.stages.compensated_steps import Point, check_finite
 from kcons.steppers.stages.drifts import Drift
-from kcons.steppers.stages.fused_stages import END
+from kcons.steppers.stages.fused_stages import END, NO_FRACTIONS
 from kcons.steppers.state import State, System
 from kcons.steppers.stepper import explained
 
@@ -96,7 +95,7 @@ class ArrayStep:
         system, flights, x = self.system, self.system.flights, self.x
         if flights is None:
             return system.motion.project_velocities(x, v, time=self.now, out=v)
-        found = flights.one(END, 0.0, x, v, v, 0.0, 0.0, system.weights, x, *flights.tables())
+        found = flights.one(END, 0.0, x, v, v, 0.0, 0.0, system.weights, x, flights.tables())
         if found:
             flights.ended(found, x, v, system.weights, self.now, self.number, flights.tables())
         return v
@@ -130,7 +129,7 @@ class SplittingStep(ArrayStep):
         circles = system.great_circles if exact else None
         self.flight: Drift = system.drift if circles is None else circles
         self.flights = None if exact else system.flights
-        self.tables: Packed = (NO_WORK, None, None, None, None) if self.flights is None else self.flights.tables()
+        self.tables = NO_FRACTIONS if self.flights is None else self.flights.tables()
         self.point = Point(self.x, self.v, system.weights, exact=many or exact)
         self.out = self.x
         #: Whether a drift has come after the last forces.

@@ -23,7 +23,7 @@ from kcons.solvers.called_solvers import CalledSolver
 from kcons.solvers.chains.open_chains import Chains
 from kcons.solvers.cluster_solver import ClusterSolver
 from kcons.solvers.distance_clusters import DistanceClusters
-from kcons.solvers.fused_distances import MORE, Packed, packed, packed_positions, packed_tangents, set_lattice
+from kcons.solvers.fused_distances import MORE, packed, packed_positions, packed_tangents, set_lattice
 from kcons.solvers.kernels.array_views import integers, piece
 from kcons.solvers.rigid_triangles import RigidTriangles
 from kcons.solvers.single_rows import SingleRows
@@ -54,7 +54,7 @@ END, FLY, BOTH = 1, 2, 3
 UNENDED, _FORCE, _ENGINE = -1, -2, -3
 #: No number of iterations.
 _UNKNOWN = 1000
-#: Types of the arguments of `one_flight` and `many_flights`, the last three apart.
+#: Types of the arguments of `one_flight` and `many_flights`.
 _POINTS = numba.float64[:, ::1]
 _ONE = (
     *(numba.int64, numba.float64, _POINTS, _POINTS, _POINTS, numba.float64, numba.float64, _POINTS, _POINTS),
@@ -88,7 +88,7 @@ class Tables:
         self._made_of = made_of
         self._cell = motion.cell
         self._lattice = motion.lattice
-        set_lattice(self._tables[0], self._lattice)
+        set_lattice(self._tables, self._lattice)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).of, self._made_of  # addresses are of no use elsewhere
@@ -103,12 +103,12 @@ class Tables:
         """For all that is held, or None where that is not for compiled stages."""
         raise NotImplementedError
 
-    def tables(self) -> Packed:
+    def tables(self) -> FloatArray:
         """What the kernels need to know, for one step: the rows, and the cell as it is now."""
         lattice = self._cell()
         if lattice is not self._lattice:
             self._lattice = lattice
-            set_lattice(self._tables[0], lattice)
+            set_lattice(self._tables, lattice)
         return self._tables
 
 
@@ -166,12 +166,18 @@ class Flights(Tables):
     def _kernel(self, function: Any, types: tuple[Any, ...]) -> Any:
         found = self._kernels.get(function)
         if found is None:
-            flags = [numba.types.none if kind is None else numba.int64 for kind in self._tables[1:]]
-            found = self._kernels[function] = function.compile((*types, *flags))
+            found = self._kernels[function] = function.compile(types)
         return found
 
     def move(
-        self, point: Point, fractions: FloatArray, dt: float, out: FloatArray, time: float, number: int, tables: Packed
+        self,
+        point: Point,
+        fractions: FloatArray,
+        dt: float,
+        out: FloatArray,
+        time: float,
+        number: int,
+        tables: FloatArray,
     ) -> None:
         """A stage from a point, with the kick that it has not taken yet; `out` becomes point.x.
 
@@ -189,9 +195,9 @@ class Flights(Tables):
             point.fresh = False
         v, work = point.v, point.work
         if len(work):
-            found = self.many(FLY, fractions, dt, 0, x, before, v, work, 0.0, kick, force, fresh, out, *tables)
+            found = self.many(FLY, fractions, dt, 0, x, before, v, work, 0.0, kick, force, fresh, out, tables)
         else:
-            found = self.one(FLY, dt, x, before, v, 0.0, kick, force, out, *tables)
+            found = self.one(FLY, dt, x, before, v, 0.0, kick, force, out, tables)
         if found != self.took:
             point.sound = found != _FORCE
             self.landed(found, fractions, dt, x, v, work, force, out, time, number, tables)
@@ -209,7 +215,7 @@ class Flights(Tables):
         out: FloatArray,
         time: float,
         number: int,
-        tables: Packed,
+        tables: FloatArray,
     ) -> int:
         """What `one_flight` or `many_flights` left to do, from what it reports and the rest of what it was given.
 
@@ -244,13 +250,13 @@ class Flights(Tables):
             self.motion.project_positions(ends, start, time=time, velocities=push, dt=h, flight=h, out=ends)
             if at + 1 == len(fractions):
                 return self.took
-            found = self.many(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, *tables)
+            found = self.many(FLY, fractions, dt, at + 1, x, v, v, work, 0.0, 0.0, force, False, out, tables)
         if found != self.took:
             self.took = found
             self.motion.took(found)
         return found
 
-    def end(self, point: Point, dt: float, time: float, number: int, tables: Packed) -> None:
+    def end(self, point: Point, dt: float, time: float, number: int, tables: FloatArray) -> None:
         """The last kick of a step, which the point has not taken yet, and its velocities projected.
 
         Raises
@@ -261,15 +267,15 @@ class Flights(Tables):
         kick, force = point.take_kick()
         x, v, work = point.x, point.v, point.work
         if len(work):
-            found = self.many(END, NO_FRACTIONS, dt, 0, x, v, v, work, kick, 0.0, force, False, x, *tables)
+            found = self.many(END, NO_FRACTIONS, dt, 0, x, v, v, work, kick, 0.0, force, False, x, tables)
         else:
-            found = self.one(END, dt, x, v, v, kick, 0.0, force, x, *tables)
+            found = self.one(END, dt, x, v, v, kick, 0.0, force, x, tables)
         if found:
             point.sound = found != _BAD_FORCE
             self.ended(found, x, v, force, time, number, tables)
 
     def ended(
-        self, found: int, x: FloatArray, v: FloatArray, force: FloatArray, time: float, number: int, tables: Packed
+        self, found: int, x: FloatArray, v: FloatArray, force: FloatArray, time: float, number: int, tables: FloatArray
     ) -> bool:
         """What an `END` left to do, from what it reports and what it was given.
 
@@ -288,7 +294,7 @@ class Flights(Tables):
         if found < 0:
             self.refuse()
             self.motion.project_velocities(x, v, time=time, out=v)
-            found = _after(x, v, tables[0])
+            found = _after(x, v, tables)
         if _BAD_FORCE <= found <= _BAD_VELOCITY:
             values, item = ((force, "force"), (x, "position"), (v, "velocity"))[found - _BAD_FORCE]
             check_finite(values, item, number)
@@ -298,7 +304,7 @@ class Flights(Tables):
 class PackedRows(NamedTuple):
     """The tables of all rows, and whom the kernels call by what stands there: to be kept as long as these."""
 
-    tables: Packed
+    tables: FloatArray
     called: list[CalledSolver]
 
 
@@ -363,19 +369,17 @@ def _worth_it(chains: Chains, others: int) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
+def _flight(x, v0, v, work, kick, force, weights, fresh, h, out, tables):  # type: ignore[no-untyped-def]
     """Fly into `out` and land there; iterations, -1 if it did not land, -2 if the force is not finite."""
     if fresh:
         sound = fly_first(x, work[0], v0, v, work[1], kick, force, weights, h, out)
     else:
         sound = fly(x, work[0], v, work[1], kick, force, weights, h, out)
-    return packed_positions(out, x, work[1], 1.0 / h, tables, triangles, others, chains, called) if sound else -2
+    return packed_positions(out, x, work[1], 1.0 / h, tables) if sound else -2
 
 
 @numba.njit(cache=True, nogil=True)
-def one_flight(  # type: ignore[no-untyped-def]
-    what, h, x, v0, v, last_kick, kick, force, out, tables, triangles, others, chains, called
-):
+def one_flight(what, h, x, v0, v, last_kick, kick, force, out, tables):  # type: ignore[no-untyped-def]
     """The end of a step, the first stage of the next, or both, where nothing adds up remainders.
 
     Parameters
@@ -385,7 +389,7 @@ def one_flight(  # type: ignore[no-untyped-def]
         a flight of `h` from `x` to `out`. `BOTH`: one after the other.
     v : ndarray, shape (n_atoms, 3)
         The velocities after the flight; may be `v0`.
-    tables, triangles, others, chains, called
+    tables
         From `Flights.tables`, in this step.
 
     Returns
@@ -396,12 +400,12 @@ def one_flight(  # type: ignore[no-untyped-def]
     """
     weights = piece(tables, integers(tables), MORE)
     if what != FLY:
-        found = _ended(add_kick(v0, last_kick, force, weights), x, v0, tables, triangles, others, chains, called)
+        found = _ended(add_kick(v0, last_kick, force, weights), x, v0, tables)
         if what == END or found != 0:
             return found if what == END else UNENDED
     if not fly_once(x, v0, kick, force, weights, h, v, out):
         return _FORCE
-    took = packed_positions(out, x, v, 1.0 / h, tables, triangles, others, chains, called)
+    took = packed_positions(out, x, v, 1.0 / h, tables)
     return took if 0 <= took <= MANY_ITERATIONS else _ENGINE
 
 
@@ -421,10 +425,6 @@ def many_flights(  # type: ignore[no-untyped-def]
     fresh,
     out,
     tables,
-    triangles,
-    others,
-    chains,
-    called,
 ):
     """The same with a stage of flights of `fractions` of `dt`, from number `first` on; the last one ends in `out`.
 
@@ -432,7 +432,7 @@ def many_flights(  # type: ignore[no-untyped-def]
     """
     weights = piece(tables, integers(tables), MORE)
     if what != FLY:
-        found = _ended(land(v0, work[1], last_kick, force, weights), x, v0, tables, triangles, others, chains, called)
+        found = _ended(land(v0, work[1], last_kick, force, weights), x, v0, tables)
         if what == END or found != 0:
             return found if what == END else UNENDED
         fresh = True
@@ -457,10 +457,6 @@ def many_flights(  # type: ignore[no-untyped-def]
             fractions[i] * dt,
             end,
             tables,
-            triangles,
-            others,
-            chains,
-            called,
         )
         if not 0 <= took <= MANY_ITERATIONS:
             return _FORCE if took == -2 else _ENGINE - i
@@ -468,13 +464,13 @@ def many_flights(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _ended(sound, x, v, tables, triangles, others, chains, called):  # type: ignore[no-untyped-def]
+def _ended(sound, x, v, tables):  # type: ignore[no-untyped-def]
     """Velocities projected after a kick, sound or not; 0, or what `Flights.ended` has to do."""
     if not sound:
         return _BAD_FORCE
     if not all_finite(x):
         return _BAD_POSITION
-    return _after(x, v, tables) if packed_tangents(x, v, tables, triangles, others, chains, called) else -1
+    return _after(x, v, tables) if packed_tangents(x, v, tables) else -1
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

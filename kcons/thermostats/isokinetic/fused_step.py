@@ -14,7 +14,7 @@ import numpy as np
 
 from kcons.constraints.target import FloatArray
 from kcons.motion.local_projections import MANY_ITERATIONS
-from kcons.solvers.fused_distances import MORE, Packed, packed_positions, packed_tangents
+from kcons.solvers.fused_distances import MORE, packed_positions, packed_tangents
 from kcons.solvers.kernels.array_views import integers, piece
 from kcons.steppers import System
 from kcons.steppers.stages.compensated_steps import all_finite
@@ -72,7 +72,7 @@ class IsokineticStages(Tables):
         twice: float,
         t: float,
         h: float,
-        tables: Packed,
+        tables: FloatArray,
     ) -> tuple[int, FloatArray, FloatArray, float]:
         """The kick over t before a flight over h, and the flight, which ends on the constraints.
 
@@ -82,7 +82,7 @@ class IsokineticStages(Tables):
             Positions, velocities on the constraints, forces.
         square, twice : float
             f.M_par^+ f and 2K.
-        tables : tuple
+        tables : ndarray of float64
             From `tables`, in this step.
 
         Returns
@@ -96,14 +96,14 @@ class IsokineticStages(Tables):
             The integral of alpha over the kick.
         """
         place, speed = np.empty(self._shape), np.empty(self._shape)
-        status, log_growth, iterations = kick_and_fly(x, u, f, square, twice, t, h, speed, place, *tables)
+        status, log_growth, iterations = kick_and_fly(x, u, f, square, twice, t, h, speed, place, tables)
         if status == DONE:
             self.motion.took(iterations)
         self.refuse()
         return status, place, speed, log_growth
 
     def after(
-        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float, tables: Packed
+        self, x: FloatArray, u: FloatArray, f: FloatArray, twice: float, t: float, tables: FloatArray
     ) -> tuple[int, FloatArray, FloatArray, float, float, float]:
         """Velocities and forces projected at x, and the kick over t.
 
@@ -113,7 +113,7 @@ class IsokineticStages(Tables):
             Positions; velocities, which are projected in place; forces.
         twice, t : float
             2K, and the time.
-        tables : tuple
+        tables : ndarray of float64
             From `tables`, in this step.
 
         Returns
@@ -127,7 +127,7 @@ class IsokineticStages(Tables):
             f.M_par^+ f, by what u is brought to its length, and the integral of alpha.
         """
         speed, pace = np.empty(self._shape), np.empty(self._shape)
-        status, square, factor, log_growth = project_and_kick(x, u, f, twice, t, speed, pace, *tables)
+        status, square, factor, log_growth = project_and_kick(x, u, f, twice, t, speed, pace, tables)
         self.refuse()
         return status, speed, pace, square, factor, log_growth
 
@@ -156,7 +156,7 @@ def _accelerations(f, weights, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest, chains, called):  # type: ignore[no-untyped-def]
+def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables):  # type: ignore[no-untyped-def]
     """`IsokineticStages.before`; status, log of the growth, and iterations."""
     header = integers(tables)
     weights, masses, apart = (
@@ -171,14 +171,14 @@ def kick_and_fly(x, u0, f, square, twice, t, h, u, out, tables, triangles, rest,
         _accelerations(f, weights, out)
         _push_others(u0, out, t, weights, masses, u)
     _fly(x, u, h, out)
-    iterations = packed_positions(out, x, u, 1.0 / h, tables, triangles, rest, chains, called)
+    iterations = packed_positions(out, x, u, 1.0 / h, tables)
     if not all_finite(out):
         return POSITION, log_growth, 0
     return (DONE if 0 <= iterations <= MANY_ITERATIONS else ENGINE), log_growth, iterations
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chains, called):  # type: ignore[no-untyped-def]
+def project_and_kick(x, u, f, twice, t, out, pace, tables):  # type: ignore[no-untyped-def]
     """`IsokineticStages.after`; status, f.M_par^+ f, factor, and log of the growth."""
     header = integers(tables)
     weights, masses, apart = (
@@ -193,7 +193,7 @@ def project_and_kick(x, u, f, twice, t, out, pace, tables, triangles, rest, chai
     _accelerations(f, weights, pace)
     # One call site, which is compiled once.
     for y in (u, pace):
-        if not packed_tangents(x, y, tables, triangles, rest, chains, called):
+        if not packed_tangents(x, y, tables):
             return ENGINE, 0.0, 0.0, 0.0
     square, factor, log_growth, done = after_drift(u, pace, masses, twice, t, out)
     if not done:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -155,7 +154,7 @@ class IsokineticStep(ArrayStep):
         assert start.thermostat is not None
         self.share = share
         self.stages = share.stages if system.force is not None else None
-        self.tables: tuple[Any, ...] = () if self.stages is None else self.stages.tables()
+        self.tables = np.empty(0) if self.stages is None else self.stages.tables()
         self.twice, self.integral, self.push_square, self.count = start.thermostat.tolist()
         self.drive: FloatArray | None = None
         #: How long v must be, squared.

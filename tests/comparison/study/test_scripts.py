@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 from io import StringIO
@@ -13,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from kcons.comparison.study import scripts
+from kcons.errors import InputError
 
 
 def test_calls_are_made_in_turn_and_timed_alone() -> None:
@@ -109,3 +111,29 @@ def test_a_script_of_parts_measures_shows_and_draws(tmp_path: Path, monkeypatch:
     command("--show", out, "--draw", "P")
     assert shown[0] == ({"quick": False}, 77)
     assert [result["parts"] for result, _ in shown[1:3]] == 2 * [{"one": 1}] and shown[3:] == [({"one": 1}, "P")]
+
+
+def test_a_script_of_runs_keeps_each_with_its_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, done, shown = tmp_path / "results.json", [], []
+
+    def run(name: str) -> dict:
+        done.append(name)
+        return {"value": len(done)}
+
+    def command(*words: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["script", *map(str, words)])
+        runs = {name: functools.partial(run, name) for name in ("one", "two")}
+        scripts.script_of_runs("What it does.", runs, lambda: shown.append("short"), shown.append, out)
+
+    command()
+    assert shown == ["short"] and not out.exists()
+    command("--full")
+    command("--full", "two")
+    with pytest.raises(InputError, match="there is no run 'three'"):
+        command("--full", "one", "three")
+    assert done == ["one", "two", "two"]
+    command("--show", out)
+    result = shown[-1]
+    assert {name: one["value"] for name, one in result["runs"].items()} == {"one": 1, "two": 3}
+    assert all({"commit", "date", "cpu", "simd"} == set(one["environment"]) for one in result["runs"].values())
+    assert result["environment"]["versions"]["numpy"]
