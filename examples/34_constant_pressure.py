@@ -425,12 +425,16 @@ RUNS: dict[str, Any] = {
     },
     **{
         f"dumbbells, {b}, {kind}, Langevin": partial(
-            compared, partial(run_fluid, "dumbbells", b, "Langevin", 240_000, kind)
+            compared, partial(run_fluid, "dumbbells", b, "Langevin", steps, kind)
         )
-        for b, kind in (("Monte Carlo", "flexible"), ("rescaling", "flexible"), ("rescaling", "anisotropic"))
+        for b, kind, steps in (
+            ("Monte Carlo", "flexible", 240_000),
+            ("rescaling", "flexible", 120_000),
+            ("rescaling", "anisotropic", 120_000),
+        )
     },
     **{
-        f"OpenMM, {b}, {e}": partial(compared, partial(run_in_openmm, e, b, 600_000 if b == "flexible" else 60_000))
+        f"OpenMM, {b}, {e}": partial(compared, partial(run_in_openmm, e, b, 360_000 if b == "flexible" else 60_000))
         for b, e in BESIDE
     },
     **{f"cost, rescaling, {n}": partial(cost, n, turns) for n, turns in ((108, 60), (500, 20))},

@@ -1,8 +1,8 @@
 """OpenMM's barostats beside our integrators: volumes of rigid ideal gases have their exact distribution.
 
 N is the number of molecules as OpenMM counts them: joined by constraints of the System, by bonds, and by the bonds of
-no strength of `hold(..., join=True)`. The validation runs write what they find into the file that KCONS_BAROSTATS names, if
-any; see docs/constant_pressure.md.
+no strength of `hold(..., join=True)`. KCONS_BAROSTATS names a file, if any, into which the validation runs write what
+they find; see docs/constant_pressure.md.
 """
 
 from __future__ import annotations
