@@ -12,28 +12,48 @@
 - `comparison`, `cli`: which method and which step; the command
 """
 
-import gc
 import sys
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-# Nothing that is imported is garbage. To look for it among all that Numba makes takes a tenth of the import's time.
-_COLLECTING = gc.isenabled()
-gc.disable()
-try:
-    from kcons import constraints, errors
-    from kcons.constraints.constraint_set import ConstraintSet
-    from kcons.motion.motion import Motion
-    from kcons.steppers import Rattle, State, System, run
-finally:
-    if _COLLECTING:
-        gc.enable()
+if TYPE_CHECKING:
+    from kcons import constraints as constraints
+    from kcons import errors as errors
+    from kcons.constraints.constraint_set import ConstraintSet as ConstraintSet
+    from kcons.motion.motion import Motion as Motion
+    from kcons.steppers import Rattle as Rattle
+    from kcons.steppers import State as State
+    from kcons.steppers import System as System
+    from kcons.steppers import run as run
 
 __version__ = "0.1.0"
 
 __all__ = ["ConstraintSet", "Motion", "Rattle", "State", "System", "__version__", "constraints", "errors", "run"]
+
+#: What is imported when it is first asked for, and where it is: the command needs none of it to print its help.
+_LATE = {
+    "ConstraintSet": "kcons.constraints.constraint_set",
+    "Motion": "kcons.motion.motion",
+    **dict.fromkeys(("Rattle", "State", "System", "run"), "kcons.steppers"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Of modules: PEP 562."""
+    if name in ("constraints", "errors"):
+        return import_module(f"{__name__}.{name}")
+    if name not in _LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(_LATE[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 #: Where modules are that scripts may still import by the names they had at the top of the package.
 MOVED = {

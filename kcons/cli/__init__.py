@@ -3,6 +3,7 @@
 - `terminal`, `progress`: what is written to the terminal
 - `parser`: what is said of names that are not known
 - `check`, `completion`, `doctor`, `freeenergy`, `scan`, `warmup`: the commands of these names
+- `compiled_systems`: what `kcons warmup` runs
 - `studies`: `kcons hardcases`, `kcons stability`
 - `main`: all others
 """

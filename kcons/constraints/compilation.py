@@ -13,6 +13,7 @@ processor has results of its own in the same folder, and several processes may u
 from __future__ import annotations
 
 import atexit
+import gc
 import logging
 import shutil
 import tempfile
@@ -20,10 +21,17 @@ import threading
 import time
 from typing import Any
 
-import numba
-from numba.core import event
-
 from kcons.errors import UnsupportedError
+
+# Nothing that Numba imports is garbage. To look for it among all that it makes takes a tenth of the time.
+_collecting = gc.isenabled()
+gc.disable()
+try:
+    import numba
+    from numba.core import event
+finally:
+    if _collecting:
+        gc.enable()
 
 logger = logging.getLogger("kcons")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import kcons
-from kcons.cli import main, warmup
+from kcons.cli import compiled_systems, main, warmup
 from kcons.constraints.compilation import announcer
 
 #: A small molecule with angles, as a user's first script has it; says what it compiled.
@@ -64,7 +64,7 @@ def test_it_says_what_was_compiled(monkeypatch, capsys):
         """A kind."""
         announcer.seconds += left.pop(0)
 
-    monkeypatch.setattr(warmup, "KINDS", {"slow": slow})
+    monkeypatch.setattr(compiled_systems, "KINDS", {"slow": slow})
     monkeypatch.setattr(announcer, "seconds", 0.0)
     monkeypatch.setattr(announcer, "announced", True)
     assert [main.main(["warmup"]) for _ in range(2)] == [0, 0]
@@ -72,22 +72,10 @@ def test_it_says_what_was_compiled(monkeypatch, capsys):
     assert first == "slow: compiled in 1.0 s" and second.startswith("slow: is there")
 
 
-def test_all_kinds_can_be_had(capsys):
-    """With kernels of other tests, in most cases: nothing is compiled a second time."""
-    said = announcer.announced
-    for _ in range(2):
-        before = announcer.seconds
-        assert main.main(["warmup"]) == 0
-        printed = capsys.readouterr().out
-    assert announcer.seconds == before
-    assert [line.split(":")[0] for line in printed.splitlines()] == list(warmup.KINDS)
-    announcer.announced = said
-
-
 def test_list_and_unknown_kinds(capsys):
     assert main.main(["warmup", "--list"]) == 0
     printed = capsys.readouterr().out
-    assert all(name in printed for name in warmup.KINDS)
+    assert all(name in printed for name in compiled_systems.KINDS)
     assert main.main(["warmup", "glue"]) == 2
     assert "nothing here is called 'glue'; choose of molecules" in capsys.readouterr().err
 
