@@ -424,13 +424,10 @@ RUNS: dict[str, Any] = {
         )
     },
     **{
-        f"dumbbells, {b}, {kind}, Langevin": partial(
-            compared, partial(run_fluid, "dumbbells", b, "Langevin", steps, kind)
-        )
-        for b, kind, steps in (
+        f"dumbbells, {b}, {kind}, Langevin": partial(compared, partial(run_fluid, "dumbbells", b, "Langevin", n, kind))
+        for b, kind, n in (
             ("Monte Carlo", "flexible", 240_000),
-            ("rescaling", "flexible", 120_000),
-            ("rescaling", "anisotropic", 120_000),
+            *(("rescaling", kind, 120_000) for kind in ("flexible", "anisotropic")),
         )
     },
     **{
@@ -485,9 +482,8 @@ def short_runs() -> None:
     for barostat in ("Monte Carlo", "rescaling"):
         one = run_fluid("dumbbells", barostat, "Langevin", 600)
         volume, error = volumes.mean_and_error(one["volumes"])
-        print(
-            f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {one['acceptance']:.0%} of trials accepted"
-        )
+        accepted = f"{one['acceptance']:.0%} of trials accepted"
+        print(f"  {barostat:<12} V/N = {volume / 32:.2f} +- {error / 32:.2f}, {accepted}")
     short = crystal(100, 1)
     print("A crystal of rigid diatomics: sides", ", ".join(f"{side:.4f}" for side, _ in short["sides"]))
     short = slab(60)
