@@ -273,7 +273,17 @@ class ConstrainedDynamics(MolecularDynamics):
         return self._state
 
     def _resume(self, state: State) -> None:
-        """Go on from `state` exactly; the atoms are changed only if it fits them."""
+        """Go on from `state` exactly, in the cell that a barostat left; the atoms are changed only if it fits them."""
+        before = self.atoms.cell.array.copy()
+        if state.cell is not None:
+            self.atoms.cell[...] = state.cell
+        try:
+            self._take(state)
+        except BaseException:
+            self.atoms.cell[...] = before
+            raise
+
+    def _take(self, state: State) -> None:
         system = self._systems()
         n = len(self.atoms)
         x, v = _array(state.positions, n, "positions"), _array(state.velocities, n, "velocities")
