@@ -196,9 +196,9 @@ def _compare(chosen: argparse.Namespace) -> int:
         return _compare_averages(chosen, budget, folder, asked)
     if chosen.criterion == "temperature":
         raise InputError(
-            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}, whose averages are known. Is a step "
-            "right for averages of your own system? Run it, and ask kcons check TRAJECTORY --topology FILE --forces ..., "
-            "or compare steps by kcons compare FILE --slow FORCES --fast FORCES",
+            f"--criterion temperature is for {', '.join(test_systems.FLUIDS)}, whose averages are known. Whether a "
+            "step is right for averages of your own system: run it, and ask kcons check TRAJECTORY --topology FILE "
+            "--forces ..., or kcons compare FILE --slow FORCES --fast FORCES",
             item="criterion",
         )
     if chosen.criterion == "drift" and target is not None:
