@@ -2,10 +2,14 @@
 
     python examples/26_own_constraints.py           a few seconds
     python examples/26_own_constraints.py --full    a minute: longer blocks, 100,000 particles
+    python examples/26_own_constraints.py --car     seconds: the car axis, beside SciPy's DOP853 on equations of index 1
 
 One particle or body, a step of RATTLE without forces; then many particles, the projection of positions and velocities,
 for each row.
 Processor time of blocks that are taken in turn in one process; medians, and ratios to the sphere.
+
+The car axis (two wheels on a road that moves one of them) has the parameters and the solution at t = 3 of Mazzia and
+Magherini, Test Set for Initial Value Problem Solvers, release 2.4 (2008), II-1.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from collections.abc import Callable
 
 import numba
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from kcons import ConstraintSet, Motion, State, System, run
 from kcons.constraints import (
@@ -33,6 +38,7 @@ from kcons.constraints import (
     Torus,
     VelocityFormula,
 )
+from kcons.steppers import BlanesMoan6, Extrapolation, Multistep
 
 AXES = np.array([1.0, 2.0, 3.0])
 TORUS = "sqrt((sqrt(x1**2 + y1**2) - R)**2 + z1**2)"
@@ -152,7 +158,116 @@ def show(title: str, unit: str, found: dict[str, float]) -> None:
     print()
 
 
+# -- the car axis -------------------------------------------------------------------------------
+
+LENGTH, SPRING, MASS, HEIGHT, FREQUENCY, END = 1.0, 0.5, 5e-4, 0.1, 10.0, 3.0
+START = np.array([0.0, 0.5, 1.0, 0.5]), np.array([-0.5, 0.0, -0.5, 0.0])
+PLACES = [0.0493455784275402809, 0.496989460230171154, 1.04174252488542151681, 0.373911027265361256927]
+MULTIPLIERS = [-0.00473688659084893325, -0.00110468033125734369]
+
+
+def road(t: float) -> tuple[float, float]:
+    up = HEIGHT * np.sin(FREQUENCY * t)
+    return np.sqrt(LENGTH**2 - up**2), up
+
+
+def springs(q: np.ndarray, t: float) -> np.ndarray:
+    """Of (x_l, y_l, x_r, y_r), and the weight."""
+    left, right = q[:2], q[2:] - road(t)
+    a, b = np.hypot(left[0], left[1]), np.hypot(right[0], right[1])
+    f = np.concatenate([(SPRING / a - 1.0) * left, (SPRING / b - 1.0) * right])
+    f[1::2] -= MASS
+    return f
+
+
+def index_one(t: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Accelerations and multipliers: both constraints differentiated twice, and two equations solved."""
+    q, v = y[:4], y[4:]
+    x, up = road(t)
+    rise = HEIGHT * FREQUENCY * np.cos(FREQUENCY * t)
+    bend = -(FREQUENCY**2) * up
+    run = -up * rise / x
+    run_bend = -(rise**2 + up * bend + run**2) / x
+    rod, speed = q[:2] - q[2:], v[:2] - v[2:]
+    G = np.array([[x, up, 0.0, 0.0], [*(2 * rod), *(-2 * rod)]])
+    b = -np.array([2 * (v[0] * run + v[1] * rise) + q[0] * run_bend + q[1] * bend, 2 * (speed @ speed)])
+    f = springs(q, t)
+    found = np.linalg.solve(G @ G.T, MASS * b - G @ f)
+    return (f + G.T @ found) / MASS, found
+
+
+Car = tuple[np.ndarray, np.ndarray, int]
+
+
+def car_by_dop853(tolerance: float) -> Car:
+    """Places and multipliers at the end, and evaluations."""
+
+    def slope(t: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[4:], index_one(t, y)[0]])
+
+    found = solve_ivp(slope, (0.0, END), np.concatenate(START), "DOP853", rtol=tolerance, atol=tolerance)
+    return found.y[:4, -1], index_one(END, found.y[:, -1])[1], found.nfev
+
+
+def car_by_kcons(scheme: Multistep | Extrapolation | int) -> Car:
+    """The same; a number is that of steps of BlanesMoan6."""
+    times: list[float] = []
+
+    def force(x: np.ndarray, t: float) -> np.ndarray:
+        times.append(t)
+        f = np.zeros((2, 3))
+        f[:, :2] = springs(x[:, :2].ravel(), t).reshape(2, 2)
+        return f
+
+    upright = Formula("x1*sqrt(L**2 - (h*sin(w*t))**2) + y1*h*sin(w*t)", 0, {"h": HEIGHT, "w": FREQUENCY, "L": LENGTH})
+    x, v = (np.pad(each.reshape(2, 2), ((0, 0), (0, 1))) for each in START)
+    motion = Motion(ConstraintSet([upright, Distance([[0, 1]], LENGTH)], x, [MASS, MASS]), x)
+    system = System(motion, force)
+    start = system.initial_state(x, v)
+    times.clear()
+    if isinstance(scheme, int):
+        end = run(system, start, END / scheme, scheme, stepper=BlanesMoan6())
+    else:
+        *_, end = scheme.states(system, start, END)
+    taken = len(times)
+    found = motion.multipliers(end.positions, end.velocities, force(end.positions, END), END)
+    # The published second row is the square of the length: its gradient is twice as long.
+    return end.positions[:, :2].ravel(), found / [1.0, 2.0 * LENGTH], taken
+
+
+def car_error(found: Car) -> float:
+    """The largest, of places and multipliers."""
+    return float(max(np.abs(found[0] - PLACES).max(), np.abs(found[1] - MULTIPLIERS).max()))
+
+
+#: Name -> how, each at the loosest setting with an error below 1e-7.
+CAR: dict[str, Callable[[], Car]] = {
+    "SciPy alone, DOP853": lambda: car_by_dop853(1e-7),
+    "Multistep": lambda: car_by_kcons(Multistep(1e-6)),
+    "Extrapolation": lambda: car_by_kcons(Extrapolation(2e-8)),
+    "BlanesMoan6": lambda: car_by_kcons(145),
+}
+
+
+def car_axis(turns: int = 9) -> None:
+    found = {name: way() for name, way in CAR.items()}
+    spent: dict[str, list[float]] = {name: [] for name in CAR}
+    for _ in range(turns):
+        for name, way in CAR.items():
+            begin = time.process_time()
+            way()
+            spent[name].append(time.process_time() - begin)
+    print(f"{'Car axis, t = 3':22}{'error':>10}{'evaluations':>13}{'ms':>8}{'DOP853 = 1':>12}")
+    first = np.array(next(iter(spent.values())))
+    for name, each in found.items():
+        ms, ratio = 1e3 * np.median(spent[name]), np.median(np.array(spent[name]) / first)
+        print(f"{name:22}{car_error(each):10.1e}{each[2]:13,}{ms:8.0f}{ratio:12.2f}")
+
+
 def main() -> None:
+    if "--car" in sys.argv[1:]:
+        car_axis()
+        return
     full = "--full" in sys.argv[1:]
     n, turns = (100_000, 7) if full else (1_000, 3)
     one = {name: one_particle(name) for name in (*HELD, *BODIES)}

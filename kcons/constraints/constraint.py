@@ -146,6 +146,11 @@ class Constraint(ABC):
         zero = np.zeros(self.n_rows)
         return zero, zero
 
+    def acceleration_terms(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        """`curvature` and the second of `time_terms` together, shape (n_rows,); of position rows."""
+        curvature = self.curvature(r, v, time)
+        return curvature + self.time_terms(r, v, time)[1] if self.moving else curvature
+
     def scale(self, time: float = 0.0) -> FloatArray:
         """Natural size of each row, shape (n_rows,): the length held, or 1 radian for angles.
 

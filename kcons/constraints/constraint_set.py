@@ -231,11 +231,10 @@ class ConstraintSet(InCell):
 
         def b_of(c: Constraint, r: FloatArray) -> FloatArray:
             u = velocities[c.atoms]
-            curvature = c.curvature(r, u, time)
             if not c.holonomic:
-                return _rate_at(c, time) - curvature
+                return _rate_at(c, time) - c.curvature(r, u, time)
             second = c.target.acceleration_at(time, c.n_rows) if isinstance(c.target, MovingTarget) else 0.0
-            return second - curvature - (c.time_terms(r, u, time)[1] if c.moving else 0.0)
+            return second - c.acceleration_terms(r, u, time)
 
         return self._of_rows(x, b_of)
 

@@ -135,7 +135,7 @@ class Motion(Projector):
 
         `feedback`, shape (n_rows,), is added to b (Baumgarte's stabilisation).
         """
-        return self.respond(x, v, f, time, feedback=feedback)[0]
+        return self._accelerated(x, v, f, time, feedback)[0]
 
     def multipliers(self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0) -> FloatArray:
         """lambda of z = A^T lambda, shape (n_rows,) (notes eqs. 103-104).
@@ -156,6 +156,29 @@ class Motion(Projector):
         self, x: ArrayLike, v: ArrayLike, f: ArrayLike, time: float = 0.0, *, feedback: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """`acceleration` and `multipliers` of one solve."""
+        mu = np.zeros(self._local.n_rows)
+        a, local_a, local_x, force = self._accelerated(x, v, f, time, feedback, mu)
+        lam = self.plan.least_norm(local_x, -mu, time)
+        if len(self.plan.pinned):
+            # What the fixed atoms' rows supply: M a - f less the other rows' forces.
+            lam[self.plan.pinned_rows] = 0.0
+            others = np.asarray(self._local.jacobian(local_x, time).T @ lam).reshape(-1, 3)
+            pinned = self.plan.pinned
+            numbers = pinned if self._atoms is None else self._atoms[pinned]
+            reaction = self.masses[numbers, None] * local_a[pinned] - force[numbers] - others[pinned]
+            lam[self.plan.pinned_rows] = reaction.ravel()
+        return a, lam
+
+    def _accelerated(
+        self,
+        x: ArrayLike,
+        v: ArrayLike,
+        f: ArrayLike,
+        time: float,
+        feedback: FloatArray | None,
+        mu: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Accelerations, those of local atoms, local positions, forces; `mu` receives the solvers' multipliers."""
         here = as_array(x, self._shape, "positions")
         speed = as_array(v, self._shape, "velocities")
         force = as_array(f, self._shape, "forces")
@@ -171,20 +194,10 @@ class Motion(Projector):
         if not np.all(np.isfinite(b)):
             arrays = {"velocity": local_v, "position": local_x}
             raise failures.undefined_row(self._local, self._atoms, arrays, int(np.argmin(np.isfinite(b))))
-        mu = np.zeros(self._local.n_rows)
         self._solve.tangents(local_x, local_a, b, time, mu, "force")
         if self._atoms is not None:
             a[self._atoms] = local_a
-        lam = self.plan.least_norm(local_x, -mu, time)
-        if len(self.plan.pinned):
-            # What the fixed atoms' rows supply: M a - f less the other rows' forces.
-            lam[self.plan.pinned_rows] = 0.0
-            others = np.asarray(self._local.jacobian(local_x, time).T @ lam).reshape(-1, 3)
-            pinned = self.plan.pinned
-            numbers = pinned if self._atoms is None else self._atoms[pinned]
-            reaction = self.masses[numbers, None] * local_a[pinned] - force[numbers] - others[pinned]
-            lam[self.plan.pinned_rows] = reaction.ravel()
-        return a, lam
+        return a, local_a, local_x, force
 
     def project_forces(
         self, x: ArrayLike, f: ArrayLike, *, time: float = 0.0, out: FloatArray | None = None

@@ -9,13 +9,14 @@ A stepper never changes its input. Where it raises, nothing has happened.
 - `executors`: who makes the operations
 - `splitting`: kicks and drifts in turn
 - `rattle`, `geodesic`, `compositions`, `runge_kutta_nystrom`: orders 2, 4 and 6
-- `extrapolation`: steps that choose their own size
+- `adaptive`: steps that choose their own size
 - `projected_ode`: the projected equation of motion, for comparison
 - `running`, `reversibility_check`: steps one after another, and taken back
 """
 
+from kcons.steppers.adaptive.extrapolation import Extrapolation
+from kcons.steppers.adaptive.multistep import Multistep
 from kcons.steppers.compositions import Composition, KahanLi6, Suzuki4, Yoshida4
-from kcons.steppers.extrapolation import Extrapolation
 from kcons.steppers.geodesic import Geodesic
 from kcons.steppers.projected_ode import Baumgarte, ProjectedRungeKutta4, ProjectedVerlet
 from kcons.steppers.rattle import Rattle
@@ -35,6 +36,7 @@ __all__ = [
     "Extrapolation",
     "Geodesic",
     "KahanLi6",
+    "Multistep",
     "Observer",
     "ProjectedRungeKutta4",
     "ProjectedVerlet",

@@ -138,30 +138,7 @@ def test_bases_that_can() -> None:
         assert np.abs(end_of(Extrapolation(1e-10, base=base), system, state, 1.0).positions - known).max() < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("options", "item"),
-    [
-        *(({"tolerance": bad}, "tolerance") for bad in (0.0, -1e-3, 9e-15, np.nan, np.inf)),
-        *(({item: bad}, item) for item in ("length", "speed") for bad in (0.0, -1.0, np.nan, np.inf)),
-    ],
-)
-def test_bad_numbers(options, item) -> None:
-    with pytest.raises(InputError, match=f"{item} is .*; give a") as raised:
-        Extrapolation(**options)
-    assert raised.value.item == item
-
-
-def test_what_is_refused_before_any_step() -> None:
-    """Where `states` is called, not where its first state is asked for."""
-    system, state = spherical_pendulum()
-    for until in (np.nan, np.inf):
-        with pytest.raises(InputError, match="until is"):
-            Extrapolation().states(system, state, until)
-    for first in (0.0, -0.1, np.nan):
-        with pytest.raises(InputError, match="first_step is"):
-            Extrapolation().states(system, state, 1.0, first_step=first)
-    with pytest.raises(UnsupportedError, match="no thermostats"):
-        Extrapolation().states(system, replace(state, thermostat=np.zeros(3)), 1.0)
+def test_what_the_base_refuses_is_refused_before_any_step() -> None:
     swinging, start = rotor()
     with pytest.raises(UnsupportedError, match="great circles"):
         Extrapolation(base=Geodesic(great_circles=True)).states(swinging, start, 1.0)

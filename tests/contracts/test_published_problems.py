@@ -6,6 +6,10 @@ Mazzia and Magherini, Test Set for Initial Value Problem Solvers, release 2.4 (2
 
 from __future__ import annotations
 
+import re
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -14,6 +18,7 @@ from kcons.constraints import Distance, Formula
 from kcons.models import Multibody
 from kcons.steppers import BlanesMoan6, Extrapolation
 
+ROOT = Path(__file__).parents[2]
 LENGTH, SPRING, EPSILON, MASS, HEIGHT, FREQUENCY = 1.0, 0.5, 1e-2, 10.0, 0.1, 10.0
 WEIGHT = EPSILON**2 * MASS / 2
 POSITIONS = [[0.0493455784275402809, 0.496989460230171154], [1.04174252488542151681, 0.373911027265361256927]]
@@ -58,6 +63,19 @@ def test_car_axis_by_extrapolation(car):
     system, start = car
     *_, end = Extrapolation(1e-9).states(system, start, 3.0)
     np.testing.assert_allclose(end.positions[:, :2], POSITIONS, rtol=0, atol=1e-7)
+
+
+def test_car_axis_by_a_third_of_the_evaluations_of_dop853():
+    """As the page says, of what the example measures."""
+    script = runpy.run_path(str(ROOT / "examples" / "26_own_constraints.py"))
+    found = {name: way() for name, way in script["CAR"].items() if name != "BlanesMoan6"}
+    errors = {name: script["car_error"](each) for name, each in found.items()}
+    assert max(errors.values()) < 1e-7 and errors["Multistep"] < errors["SciPy alone, DOP853"]
+    assert 3 * found["Multistep"][2] < found["SciPy alone, DOP853"][2]
+    page = (ROOT / "docs" / "own_constraints.md").read_text(encoding="utf-8")
+    for name, (_, _, evaluations) in found.items():
+        row = re.search(rf"^\| `?{name}.*\| ([\d,]+) \| [\d.]+ \|$", page, re.MULTILINE)
+        assert row is not None and int(row[1].replace(",", "")) == pytest.approx(evaluations, rel=0.02)
 
 
 def test_car_axis_in_published_coordinates():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from keyword import iskeyword
 from typing import Any, ClassVar, Self
 
@@ -114,8 +114,21 @@ class Formula(Constraint):
         columns = [column for array in arrays for column in array.reshape(self.n_rows, -1).T]
         return [*columns, time, *self.values.T]
 
+    def _plain(self, function: Callable[..., tuple[float, ...]], time: float, *arrays: FloatArray) -> FloatArray | None:
+        """What a function of plain numbers gives for a single row, a row each; None where it is undefined."""
+        numbers = [number for array in arrays for number in array.ravel().tolist()]
+        try:
+            found = np.array(function(*numbers, float(time), *self.values[0].tolist()))
+        except (ValueError, ArithmeticError):
+            return None
+        return None if found.dtype.kind == "c" else found[:, None]
+
     def _first(self, r: FloatArray, time: float) -> FloatArray:
         """Value and gradient, shape (1 + 3 width, n_rows)."""
+        if self.n_rows == 1:
+            plain = self._plain(self.code().plain_first, time, r)
+            if plain is not None:
+                return plain
         with np.errstate(all="ignore"):
             found = self.code().first(*self._arguments(time, r))
         return np.array(np.broadcast_arrays(*found, np.zeros(self.n_rows))[:-1], dtype=np.float64)
@@ -126,13 +139,21 @@ class Formula(Constraint):
     def gradient(self, r: FloatArray, time: float) -> FloatArray:
         return np.ascontiguousarray(self._first(r, time)[1:].T).reshape(r.shape)
 
-    def _second(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, ...]:
+    def _second(self, r: FloatArray, v: FloatArray, time: float) -> Sequence[FloatArray]:
+        if self.n_rows == 1:
+            plain = self._plain(self.code().plain_second, time, r, v)
+            if plain is not None:
+                return list(plain)
         with np.errstate(all="ignore"):
             found = self.code().second(*self._arguments(time, r, v))
         return tuple(np.broadcast_to(np.asarray(part, dtype=np.float64), (self.n_rows,)) for part in found)
 
     def curvature(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
         return self._second(r, v, time)[0]
+
+    def acceleration_terms(self, r: FloatArray, v: FloatArray, time: float) -> FloatArray:
+        curvature, _, mixed = self._second(r, v, time)
+        return curvature + mixed
 
     def time_terms(self, r: FloatArray, v: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
         _, rate, mixed = self._second(r, v, time)
