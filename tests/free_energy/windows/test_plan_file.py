@@ -126,7 +126,7 @@ def test_a_plan_for_openmm(folder):
     ("old", "new", "match"),
     [
         ("[sampling]", "[samplings]", r"unknown key 'samplings'; did you mean 'sampling'\?"),
-        ("timestep = 0.5", "time_step = 0.5", r"\[sampling\] has an unknown key 'time_step'; did you mean 'timestep'"),
+        ("timestep = 0.5", "time_step = 0.5", r"\[sampling\] has an unknown key 'time_step' \(did you mean 'timestep'\?\)"),
         ("temperature = 310", "temperature = -310", "temperature is -310"),
         ('calculator = "lj"', 'calculator = "no such"', "no calculator 'no such'"),
         ('file = "methanol.xyz"', 'file = "nothing.xyz"', "there is no file .*nothing.xyz"),
